@@ -1,0 +1,40 @@
+"""The errors a caller of vnet can meet, rooted at `VnetError`.
+
+Each message is one line that names the thing, the value and what is allowed. Mistakes of vnet's own are
+assertions, not members of this family.
+"""
+
+
+class VnetError(Exception):
+    """Anything that vnet refuses or cannot do, said in one line."""
+
+
+class ScenarioError(VnetError):
+    """A scenario, an override or an input file that cannot be used. Commands end with status 2."""
+
+
+class WireError(VnetError):
+    """A message on a Zenoh key that does not decode into what the key carries."""
+
+
+class LinkError(VnetError):
+    """A Zenoh session that could not be opened, was refused, or was lost."""
+
+
+class PayloadTooLargeError(VnetError):
+    """A broadcast above the radio's limit."""
+
+    def __init__(self, size_bytes: int, max_payload_bytes: int) -> None:
+        super().__init__(
+            f"payload of {size_bytes} bytes exceeds radio.max_payload_bytes = {max_payload_bytes}"
+        )
+        self.size_bytes = size_bytes
+        self.max_payload_bytes = max_payload_bytes
+
+
+class VirtualTimeError(VnetError):
+    """Something that a program may not do in lockstep, because it would wait on the real world."""
+
+
+class ProgramError(VnetError):
+    """A vehicle program that cannot be imported or has the wrong shape."""

@@ -1,0 +1,226 @@
+"""The scenario file: what a run is made of, read from TOML, checked by pydantic.
+
+One frozen model a section. Whatever is wrong with a file or an override becomes one `ScenarioError` of one
+line that names the file, the key, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vnet.errors import ScenarioError
+
+NS_PER_S = 1_000_000_000
+
+
+class Section(BaseModel):
+    """Common behaviour of all sections: immutable, and no key is ignored in silence."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Run(Section):
+    """`[run]`: what the run is called, how long it takes and how patient it is."""
+
+    name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    seed: int = Field(1, ge=0, lt=2**63)
+    duration_s: float = Field(30.0, gt=0, le=86_400)
+    pacing: Literal["lockstep", "realtime"] = "lockstep"
+    nodes_per_process: int = Field(1, ge=1, le=1000)
+    join_timeout_s: float = Field(60.0, gt=0)
+    stall_timeout_s: float = Field(30.0, gt=0)
+    orphan_timeout_s: float = Field(5.0, gt=0)
+    spin_limit: int = Field(100_000, ge=100)
+
+
+class Network(Section):
+    """`[network]`: which vehicles there are and where, either generated or from a CSV file.
+
+    `file` reads `path` (columns id, x_m, y_m, heading_rad; relative to the scenario file). `generated` draws
+    `vehicles` of them: `layout = "urban"` has the degree histogram and components of the published networks,
+    `layout = "dense"` packs them so that degrees exceed 30.
+    """
+
+    kind: Literal["generated", "file"] = "generated"
+    path: Path | None = None
+    vehicles: int = Field(38, ge=1, le=10_000)
+    layout: Literal["urban", "dense"] = "urban"
+
+    @model_validator(mode="after")
+    def _path_goes_with_file(self) -> Network:
+        if (self.kind == "file") != (self.path is not None):
+            raise ValueError('path is required with kind = "file", and only then')
+        return self
+
+
+class CommonError(Section):
+    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process (MODEL 1)."""
+
+    sigma_m: float = Field(3.0, ge=0)
+    tau_s: float = Field(600.0, gt=0)
+
+
+class Gnss(Section):
+    """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
+
+    rate_hz: float = Field(10.0, gt=0, le=1000)
+    sigma_m: float = Field(1.0, ge=0)
+    heading: bool = True
+    heading_sigma_rad: float = Field(0.01, ge=0, le=1)
+
+
+class Lateral(Section):
+    """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
+
+    half_width_m: float = Field(0.85, gt=0)
+    sigma_m: float = Field(0.4, ge=0)
+    tau_s: float = Field(20.0, gt=0)
+
+
+class WorldSection(Section):
+    """`[world]`: the truth that the vehicles never see."""
+
+    common_error: CommonError = CommonError()
+    gnss: Gnss = Gnss()
+    lateral: Lateral = Lateral()
+
+
+class Radio(Section):
+    """`[radio]`: what stands between one vehicle's broadcast and another's reception."""
+
+    range_m: float = Field(3000.0, gt=0)
+    max_peers: int = Field(30, ge=1)
+    loss: float = Field(0.0, ge=0, le=1)
+    latency_ms: float = Field(2.0, ge=0.001)
+    jitter_ms: float = Field(1.0, ge=0)
+    access_jitter_ms: float = Field(1.0, ge=0)
+    delivery_tick_us: int = Field(0, ge=0)
+    max_payload_bytes: int = Field(1400, ge=1, le=65_000)
+    bitrate_mbps: float = Field(6.0, gt=0)
+    queue_frames: int = Field(64, ge=1)
+
+
+class Program(Section):
+    """`[program]`: what every vehicle runs, as `package.module:function`, and the options it is given."""
+
+    entry: str = Field("agents.beacon:main", pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
+    options: dict[str, Any] = {}
+
+
+class Scenario(Section):
+    """A whole scenario. All sections have defaults, so that an empty file is a valid run."""
+
+    run: Run = Run()
+    network: Network = Network()
+    world: WorldSection = WorldSection()
+    radio: Radio = Radio()
+    program: Program = Program()
+
+    @property
+    def duration_ns(self) -> int:
+        """Length of the run in nanoseconds."""
+        return round(self.run.duration_s * NS_PER_S)
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two GNSS fixes in nanoseconds: the period in which programs are thought to work."""
+        return round(NS_PER_S / self.world.gnss.rate_hz)
+
+
+def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario and apply `section.key=value` overrides (values in TOML syntax; bare words are strings).
+
+    A relative `network.path` is taken from the scenario's own folder. Raises `ScenarioError`.
+    """
+    try:
+        data = tomllib.loads(path.read_bytes().decode())
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
+    recorded_digests = data.pop("inputs", {})
+    for override in overrides:
+        _apply_override(data, override)
+    try:
+        scenario = Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(f"{path}: {_first_problem(error)}") from None
+    scenario = _with_absolute_network_path(scenario, path)
+    for name, digest in input_digests(scenario).items():
+        if recorded_digests.get(name, digest) != digest:
+            raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
+    return scenario
+
+
+def dump_scenario(scenario: Scenario) -> str:
+    """The scenario as TOML with every default spelled out and the digests of its input files."""
+    data = scenario.model_dump(mode="json", exclude_none=True)
+    data["inputs"] = input_digests(scenario)
+    return tomli_w.dumps(data)
+
+
+def input_digests(scenario: Scenario) -> dict[str, str]:
+    """SHA-256 of each file that the scenario reads, by path."""
+    if scenario.network.path is None:
+        return {}
+    path = scenario.network.path
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def _with_absolute_network_path(scenario: Scenario, scenario_path: Path) -> Scenario:
+    network = scenario.network
+    if network.path is None:
+        return scenario
+    path = (scenario_path.parent / network.path).resolve()
+    if not path.is_file():
+        raise ScenarioError(f"{scenario_path}: network.path = {str(network.path)!r}: no such file: {path}")
+    if not os.access(path, os.R_OK):
+        raise ScenarioError(f"{scenario_path}: network.path = {str(network.path)!r}: not readable: {path}")
+    return scenario.model_copy(update={"network": network.model_copy(update={"path": path})})
+
+
+def _apply_override(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or len(parts) < 2 or not all(parts):
+        raise ScenarioError(f"--set {override}: write it as section.key=value, for example radio.loss=0.3")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    table = data
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"--set {override}: {part} is not a section")
+    table[parts[-1]] = value
+
+
+def _first_problem(error: ValidationError) -> str:
+    """The first of pydantic's complaints as `key = value: what is allowed`."""
+    problem = error.errors()[0]
+    key = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        return f"{key}: unknown key; allowed here: {', '.join(_allowed_keys(problem['loc'][:-1]))}"
+    message = problem["msg"].removeprefix("Value error, ")
+    message = message[0].lower() + message[1:]
+    if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
+        return f"{key}: {message}"
+    return f"{key} = {problem['input']!r}: {message}"
+
+
+def _allowed_keys(section: tuple[int | str, ...]) -> list[str]:
+    model: type[BaseModel] = Scenario
+    for name in section:
+        annotation = model.model_fields[str(name)].annotation
+        assert isinstance(annotation, type)
+        model = annotation
+    return sorted(model.model_fields)
