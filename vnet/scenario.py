@@ -136,9 +136,10 @@ class Scenario(Section):
 
 
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Read a scenario and apply `section.key=value` overrides (values in TOML syntax; bare words are strings).
+    """Read a scenario and apply `section.key=value` overrides.
 
-    A relative `network.path` is taken from the scenario's own folder. Raises `ScenarioError`.
+    Values are in TOML syntax; bare words are strings. A relative `network.path` is taken from the
+    scenario's own folder. Raises `ScenarioError`.
     """
     try:
         data = tomllib.loads(path.read_bytes().decode())

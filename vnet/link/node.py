@@ -37,7 +37,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """One GNSS fix: position (2,) in metres east-north with covariance (2, 2) in m², heading in radians or None.
+    """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 
     The covariance is that of the receiver's own noise; the error common to the area is not in it.
     """
@@ -127,7 +127,7 @@ class Radio:
         self._link = link
 
     async def broadcast(self, payload: bytes) -> None:
-        """Send one frame to every vehicle in range. Raises `PayloadTooLargeError` above `max_payload` bytes."""
+        """Send one frame to all in range. Raises `PayloadTooLargeError` above `max_payload` bytes."""
         if len(payload) > self.max_payload:
             raise PayloadTooLargeError(len(payload), self.max_payload)
         self._link.send_frame(self._node_id, bytes(payload))

@@ -37,12 +37,12 @@ class LaneMap:
     @property
     def offset_m(self) -> Array:
         """n·p of each centre line (L,), so that the signed offset of a point q is n·q - offset."""
-        return np.einsum("ij,ij->i", self.normal, self.point_m)
+        return np.asarray(np.einsum("ij,ij->i", self.normal, self.point_m))
 
     def signed_offset_m(self, position_m: Array, lane: NDArray[np.intp] | int) -> Array:
         """Signed distance of positions (..., 2) from the centre lines of `lane`, positive to the right."""
-        offset: Array = np.sum(position_m * self.normal[lane], axis=-1) - self.offset_m[lane]
-        return offset
+        across_m = np.sum(position_m * self.normal[lane], axis=-1)
+        return np.asarray(across_m - self.offset_m[lane])
 
     def to_wire(self) -> list[float | list[float]]:
         """A plain form for a message; `from_wire` restores it bit by bit."""

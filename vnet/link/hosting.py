@@ -1,0 +1,198 @@
+"""Hosting: running the programs of one process's nodes on one event loop.
+
+A `Host` builds the nodes from their welcomes, starts their programs, collects what they send and feeds them
+what arrives. It knows no transport: agents put its traffic on Zenoh, `vnet simulate` hands it to the engine.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import importlib
+import traceback
+import weakref
+from collections.abc import Awaitable, Callable, Generator, Iterable, Sequence
+from typing import Any
+
+from vnet.errors import ProgramError
+from vnet.link import wire
+from vnet.link.node import Node, Report
+from vnet.link.virtual_time import LoopAbandonedError, SpinError, VirtualTimeLoop
+from vnet.roads.lanes import LaneMap
+
+Program = Callable[[Node], Awaitable[None]]
+
+_current_node: contextvars.ContextVar[str | None] = contextvars.ContextVar("vnet_node", default=None)
+
+
+def load_program(entry: str) -> Program:
+    """Import `package.module:function`. Raises ProgramError with the reason in one line."""
+    module_name, _, name = entry.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise ProgramError(f"program.entry = {entry!r}: cannot import: {_one_line(error)}") from error
+    program = getattr(module, name, None)
+    if program is None:
+        raise ProgramError(f"program.entry = {entry!r}: module {module_name} has no {name!r}")
+    if not asyncio.iscoroutinefunction(program):
+        raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
+    return program  # type: ignore[no-any-return]
+
+
+class Host:
+    """The nodes of one process and their programs; see the module's text.
+
+    `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
+    puts it at once; lockstep takes it at the next yield).
+    """
+
+    def __init__(
+        self,
+        welcomes: Sequence[wire.Welcome],
+        clock: Callable[[], int],
+        on_traffic: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._clock = clock
+        self._on_traffic = on_traffic
+        self._frames: list[wire.Frame] = []
+        self._reports: list[Report] = []
+        self._endings: list[wire.Ending] = []
+        self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], str | None] = weakref.WeakKeyDictionary()
+        self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
+        self._active = dict.fromkeys(self.nodes, True)
+
+    def _node(self, welcome: wire.Welcome) -> Node:
+        return Node(
+            welcome.node,
+            self,
+            lane_map=LaneMap.from_wire(welcome.lane_map),
+            seed=welcome.seed,
+            options=welcome.options,
+            period_ns=welcome.period_ns,
+            max_payload=welcome.max_payload,
+            incarnation=welcome.incarnation,
+        )
+
+    # What nodes ask of their link.
+
+    @property
+    def now_ns(self) -> int:
+        """Emulated time in nanoseconds."""
+        return self._clock()
+
+    def send_frame(self, node: str, payload: bytes) -> None:
+        """Take a frame for the radio; a node that has ended is silent."""
+        if self._active[node]:
+            self._frames.append(wire.Frame(node, payload))
+            self._on_traffic()
+
+    def send_report(self, report: Report) -> None:
+        """Take a report."""
+        if self._active[report.node]:
+            self._reports.append(report)
+            self._on_traffic()
+
+    # What the transport asks of the host.
+
+    def start(self, loop: asyncio.AbstractEventLoop, program: Program) -> None:
+        """Schedule every node's program on `loop`."""
+        loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
+        for node in self.nodes.values():
+            context = contextvars.copy_context()
+            context.run(_current_node.set, node.id)
+            loop.create_task(self._run(node, program), name=f"{node.id} main", context=context)
+
+    def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
+        """Put packets, then fixes, into the mailboxes."""
+        for packet in packets:
+            self.nodes[packet.node].radio.inbox.deliver((packet.packet(),))
+        for fix in fixes:
+            self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
+
+    def take_traffic(self) -> wire.Traffic:
+        """Everything that the nodes have handed over since the last call."""
+        traffic = wire.Traffic(self._frames, self._reports, self._endings)
+        self._frames, self._reports, self._endings = [], [], []
+        return traffic
+
+    def waiting(self) -> tuple[list[str], list[str]]:
+        """Which nodes have a task that waits on the radio, and which on a fix."""
+        nodes = self.nodes.values()
+        return [n.id for n in nodes if n.radio.inbox.waiting], [n.id for n in nodes if n.gnss.inbox.waiting]
+
+    def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
+        """Record that a node's program is over, and cancel what it left running."""
+        if not self._active[node]:
+            return
+        self._active[node] = False
+        self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        for task, owner in list(self._tasks.items()):
+            if owner == node and task is not asyncio.current_task():
+                task.cancel()
+        self._on_traffic()
+
+    def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
+        """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand."""
+        ready: Iterable[asyncio.Handle] = loop._ready  # type: ignore[attr-defined]
+        owners = dict.fromkeys(handle._context.get(_current_node) for handle in ready)  # type: ignore[attr-defined]
+        for node in [owner for owner in owners if owner is not None] or list(self.nodes):
+            self.end(node, "spun", str(spin), self.stacks(node))
+
+    def stacks(self, node: str) -> str:
+        """Where the tasks of a node stand, as text."""
+        lines = []
+        for task, owner in list(self._tasks.items()):
+            if owner == node and not task.done():
+                lines.append(f"task {task.get_name()}:")
+                lines += [
+                    f"  {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
+                    for frame in task.get_stack()
+                ]
+        return "\n".join(lines)
+
+    def close(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Cancel all programs and let their `finally` blocks run, without waiting for anything."""
+        tasks = [task for task in self._tasks if not task.done()]
+        for task in tasks:
+            task.cancel()
+        gathering = asyncio.gather(*tasks, return_exceptions=True) if tasks else None
+        if gathering is None:
+            return
+        if isinstance(loop, VirtualTimeLoop):
+            try:
+                loop.finish(gathering)
+            except (LoopAbandonedError, SpinError):
+                gathering.cancel()
+        else:
+            loop.run_until_complete(asyncio.wait(tasks, timeout=1.0))
+
+    async def _run(self, node: Node, program: Program) -> None:
+        try:
+            await program(node)
+        except asyncio.CancelledError:
+            raise
+        except BaseException as error:
+            if isinstance(error, SystemExit) and not error.code:
+                self.end(node.id, "finished")
+                return
+            self.end(node.id, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
+            traceback.print_exception(error)
+        else:
+            self.end(node.id, "finished")
+
+    def _new_task(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        coroutine: Generator[Any, None, Any],
+        context: contextvars.Context | None = None,
+    ) -> asyncio.Task[Any]:
+        task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context)
+        owner = _current_node.get() if context is None else context.get(_current_node)
+        self._tasks[task] = owner
+        return task
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

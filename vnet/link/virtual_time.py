@@ -1,0 +1,161 @@
+"""The asyncio event loop whose clock the emulator grants.
+
+An ordinary loop asks its selector to wait until something happens. Here, when no callback is ready, waiting
+means *yielding*: the loop hands its next timer to `exchange`, which comes back with the new time in
+nanoseconds once something is due, having put packets and fixes into the nodes' mailboxes. Between two
+exchanges no time passes, however long the program computes.
+
+Earlier loops of this kind, for one process and without an outside clock: async-solipsism, looptime, aiotools.
+Loop time starts near 0: at epoch-sized values float timers and the clock's resolution no longer agree, and a
+virtual loop spins for ever (cpython#116342).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import selectors
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any, NoReturn
+
+from vnet.errors import VirtualTimeError
+
+NS_PER_S = 1_000_000_000
+
+Exchange = Callable[[int | None], int]
+"""Yield: takes the next timer (ns, or None), blocks for the grant, returns the granted time (ns)."""
+
+
+class SpinError(VirtualTimeError):
+    """A program that goes on for ever at one instant."""
+
+
+class LoopAbandonedError(VirtualTimeError):
+    """A loop that was told to end, but whose tasks still wait for something."""
+
+
+class VirtualTimeLoop(asyncio.SelectorEventLoop):
+    """An event loop in virtual time; see the module's text.
+
+    `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.
+    """
+
+    def __init__(self, exchange: Exchange, spin_limit: int = 100_000) -> None:
+        self._exchange = exchange
+        self._spin_limit = spin_limit
+        self._rounds = 0
+        self._now_ns = 0
+        self._ending = False
+        self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
+        super().__init__(_YieldingSelector(self._wait))
+
+    @property
+    def now_ns(self) -> int:
+        """The granted time in nanoseconds."""
+        return self._now_ns
+
+    def time(self) -> float:
+        """The granted time in seconds, as asyncio counts."""
+        return self._now_ns / NS_PER_S
+
+    def finish(self, main: asyncio.Future[Any]) -> None:
+        """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
+        self._ending = True
+        self._rounds = 0
+        self.run_until_complete(main)
+
+    def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
+        """What the selector does instead of sleeping."""
+        if timeout is not None and timeout <= 0:
+            self._rounds += 1
+            if self._rounds > self._spin_limit:
+                raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
+            return poll(0)
+        if self._jobs:
+            return self._wait_for_jobs(poll)
+        if self._ending:
+            raise LoopAbandonedError("a task still waits after the run has ended")
+        self._rounds = 0
+        self._now_ns = self._exchange(self._next_timer_ns())
+        return []
+
+    def _next_timer_ns(self) -> int | None:
+        # asyncio has just dropped cancelled timers from the head of its heap.
+        scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
+        if not scheduled:
+            return None
+        return max(round(scheduled[0].when() * NS_PER_S), self._now_ns)
+
+    # Executors: while a job is pending the loop does not yield (computing costs no virtual time), and results
+    # appear in the order in which the jobs were submitted, when all are there: no race decides anything.
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Executor | None, func: Callable[..., Any], *args: Any
+    ) -> asyncio.Future[Any]:
+        """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
+        if executor is None:
+            executor = self._own_executor()
+        job = executor.submit(func, *args)
+        outer: asyncio.Future[Any] = self.create_future()
+        self._jobs.append((job, outer))
+        job.add_done_callback(lambda _: self.call_soon_threadsafe(_nothing))
+        return outer
+
+    def _own_executor(self) -> Executor:
+        if self._default_executor is None:  # type: ignore[has-type]
+            self._default_executor = ThreadPoolExecutor(thread_name_prefix="vnet")
+        executor: Executor = self._default_executor
+        return executor
+
+    def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
+        if not all(job.done() for job, _ in self._jobs):
+            return poll(None)  # a finished job, or a call from a job's thread, wakes the self-pipe
+        jobs, self._jobs = self._jobs, []
+        for job, outer in jobs:
+            if not outer.done():
+                _copy_result(job, outer)
+        return []
+
+    # Sockets and subprocesses would wait on the real world, whose time has no place here.
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise VirtualTimeError(
+            "sockets, pipes and subprocesses are not available to programs in lockstep; use node.radio, or "
+            "run the scenario with run.pacing = realtime"
+        )
+
+    create_connection = create_server = create_datagram_endpoint = _refuse
+    create_unix_connection = create_unix_server = _refuse
+    subprocess_exec = subprocess_shell = _refuse
+    connect_read_pipe = connect_write_pipe = _refuse
+    connect_accepted_socket = start_tls = sendfile = _refuse
+    add_reader = add_writer = _refuse  # type: ignore[assignment]
+    getaddrinfo = getnameinfo = _refuse
+    sock_recv = sock_recv_into = sock_recvfrom = sock_recvfrom_into = _refuse
+    sock_sendall = sock_sendto = sock_connect = sock_accept = sock_sendfile = _refuse
+
+
+class _YieldingSelector(selectors.DefaultSelector):
+    """The real selector for the loop's own self-pipe, with the waiting handed to `wait`."""
+
+    def __init__(
+        self, wait: Callable[[float | None, Callable[[float | None], list[Any]]], list[Any]]
+    ) -> None:
+        super().__init__()
+        self._wait = wait
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        return self._wait(timeout, super().select)
+
+
+def _copy_result(job: Future[Any], outer: asyncio.Future[Any]) -> None:
+    if job.cancelled():
+        outer.cancel()
+    elif (error := job.exception()) is not None:
+        outer.set_exception(error)
+    else:
+        outer.set_result(job.result())
+
+
+def _nothing() -> None:
+    """Scheduled only to wake the loop."""

@@ -1,0 +1,226 @@
+"""The messages on the keys of a node: typed records <-> msgpack, without any I/O.
+
+`tx` carries what an agent says (`Hello`, `Yield`, `Frames`, `Standing`), `rx` what the emulator says
+(`Welcome`, `Grant`, `Batch`, `Where`, `End`). Decoding checks every type and bound; what does not fit is a
+`WireError`. All times are integer nanoseconds from the start of the run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from vnet.errors import WireError
+from vnet.link.node import Fix, Packet, Report
+
+TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class Message(msgspec.Struct, frozen=True, array_like=True, tag=True):
+    """Common form: an array whose first element names the kind of message."""
+
+
+class WirePacket(msgspec.Struct, frozen=True, array_like=True):
+    """A `Packet` for `node`."""
+
+    node: str
+    sender: str
+    sent_ns: TimeNs
+    received_ns: TimeNs
+    payload: bytes
+
+    def packet(self) -> Packet:
+        """The packet as the program sees it."""
+        return Packet(self.sender, self.sent_ns, self.received_ns, self.payload)
+
+
+class WireFix(msgspec.Struct, frozen=True, array_like=True):
+    """A `Fix` for `node`; the covariance is row by row."""
+
+    node: str
+    time_ns: TimeNs
+    position_m: tuple[float, float]
+    covariance_m2: tuple[float, float, float, float]
+    heading_rad: float | None
+
+    @classmethod
+    def of(cls, node: str, fix: Fix) -> WireFix:
+        """The fix in its form on the wire."""
+        x, y = fix.position_m.tolist()
+        a, b, c, d = fix.covariance_m2.ravel().tolist()
+        return cls(node, fix.time_ns, (x, y), (a, b, c, d), fix.heading_rad)
+
+    def fix(self) -> Fix:
+        """The fix as the program sees it."""
+        covariance = np.array(self.covariance_m2).reshape(2, 2)
+        return Fix(self.time_ns, np.array(self.position_m), covariance, self.heading_rad)
+
+
+class Frame(msgspec.Struct, frozen=True, array_like=True):
+    """One broadcast that `node` hands to the radio."""
+
+    node: str
+    payload: bytes
+
+
+class Ending(msgspec.Struct, frozen=True, array_like=True):
+    """A node's program is over: it returned, raised, or span at one instant (`details` says where)."""
+
+    node: str
+    kind: Literal["finished", "crashed", "spun"]
+    error: str = ""
+    details: str = ""
+
+
+class Traffic(msgspec.Struct, frozen=True, array_like=True):
+    """What the nodes of one process hand over at once: frames and reports in the order they were made."""
+
+    frames: Sequence[Frame] = ()
+    reports: Sequence[Report] = ()
+    endings: Sequence[Ending] = ()
+
+
+class Hello(Message, frozen=True):
+    """A node asks to join. `lead` is the first node of its process, whose keys carry the process's traffic.
+
+    `nonce` is a secret of the process: later messages bear it, so that nobody else can speak for the node.
+    """
+
+    node: str
+    lead: str
+    nonce: bytes
+    pid: int
+    host: str
+
+
+class Yield(Message, frozen=True):
+    """Lockstep: the process has nothing left to do at the instant of grant `seq`."""
+
+    nonce: bytes
+    seq: Count
+    next_timer_ns: TimeNs | None
+    waiting_radio: Sequence[str]
+    waiting_gnss: Sequence[str]
+    traffic: Traffic
+
+
+class Lateness(msgspec.Struct, frozen=True, array_like=True):
+    """Real time: how late packets reached their process, as counts by delay in powers of √2 from 10 µs."""
+
+    counts: Sequence[Count] = ()
+
+
+class Frames(Message, frozen=True):
+    """Real time: traffic since the last message; acknowledges batches up to `received_seq`, less the gaps."""
+
+    nonce: bytes
+    seq: Count
+    received_seq: Count
+    missed: Sequence[tuple[Count, Count]]
+    traffic: Traffic
+    lateness: Lateness | None = None
+
+
+class Standing(Message, frozen=True):
+    """The answer to `Where`: the stacks of the process's program threads."""
+
+    nonce: bytes
+    text: str
+
+
+class Welcome(Message, frozen=True):
+    """A node is taken in: all it needs to run its program. The scenario itself never travels."""
+
+    node: str
+    nonce: bytes
+    incarnation: Count
+    pacing: Literal["lockstep", "realtime"]
+    entry: str
+    options: dict[str, Any]
+    lane_map: list[Any]
+    seed: int
+    period_ns: Annotated[int, msgspec.Meta(gt=0)]
+    max_payload: Annotated[int, msgspec.Meta(gt=0)]
+    orphan_timeout_s: float
+    spin_limit: Count
+
+
+class Grant(Message, frozen=True):
+    """Lockstep: it is now `time_ns`; here is what is due. Grant 0 starts the run."""
+
+    seq: Count
+    time_ns: TimeNs
+    packets: Sequence[WirePacket] = ()
+    fixes: Sequence[WireFix] = ()
+
+
+class Batch(Message, frozen=True):
+    """Real time: what is due by `time_ns` on the emulator's clock."""
+
+    seq: Count
+    time_ns: TimeNs
+    packets: Sequence[WirePacket] = ()
+    fixes: Sequence[WireFix] = ()
+
+
+class Where(Message, frozen=True):
+    """The emulator waits too long for this process: where does it stand?"""
+
+
+class End(Message, frozen=True):
+    """The run is over, or this node is refused."""
+
+    nonce: bytes | None
+    reason: str
+    refused: bool = False
+
+
+AgentMessage = Hello | Yield | Frames | Standing
+EmulatorMessage = Welcome | Grant | Batch | Where | End
+
+_M = TypeVar("_M")
+_encoder = msgspec.msgpack.Encoder()
+_agent_decoder: msgspec.msgpack.Decoder[AgentMessage] = msgspec.msgpack.Decoder(AgentMessage)
+_emulator_decoder: msgspec.msgpack.Decoder[EmulatorMessage] = msgspec.msgpack.Decoder(EmulatorMessage)
+_report_decoder: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Report)
+
+
+def encode(message: AgentMessage | EmulatorMessage | Report) -> bytes:
+    """Any message as bytes."""
+    return _encoder.encode(message)
+
+
+def decode_tx(data: bytes) -> AgentMessage:
+    """What an agent said. Raises WireError."""
+    return _decode(_agent_decoder, data)
+
+
+def decode_rx(data: bytes) -> EmulatorMessage:
+    """What the emulator said. Raises WireError."""
+    return _decode(_emulator_decoder, data)
+
+
+def decode_report(data: bytes) -> Report:
+    """A copy of a report. Raises WireError."""
+    return _decode(_report_decoder, data)
+
+
+def encode_observation(message: dict[str, Any]) -> bytes:
+    """A message for observers: numbers, text, bytes, lists and tables of these."""
+    return _encoder.encode(message)
+
+
+def decode_observation(data: bytes) -> dict[str, Any]:
+    """Restore `encode_observation`. Raises WireError."""
+    return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
+
+
+def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
+    try:
+        return decoder.decode(data)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise WireError(f"{len(data)} bytes that are no message: {error}") from None
