@@ -7,6 +7,7 @@ what arrives. It knows no transport: agents put its traffic on Zenoh, `vnet simu
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import contextvars
 import importlib
 import traceback
@@ -116,10 +117,17 @@ class Host:
         self._frames, self._reports, self._endings = [], [], []
         return traffic
 
-    def waiting(self) -> tuple[list[str], list[str]]:
-        """Which nodes have a task that waits on the radio, and which on a fix."""
+    def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
+        """What the process has to say when nothing is left to do at this instant (lockstep)."""
         nodes = self.nodes.values()
-        return [n.id for n in nodes if n.radio.inbox.waiting], [n.id for n in nodes if n.gnss.inbox.waiting]
+        return wire.Yield(
+            nonce,
+            seq,
+            next_timer_ns,
+            waiting_radio=[node.id for node in nodes if node.radio.inbox.waiting],
+            waiting_gnss=[node.id for node in nodes if node.gnss.inbox.waiting],
+            traffic=self.take_traffic(),
+        )
 
     def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
         """Record that a node's program is over, and cancel what it left running."""
@@ -151,21 +159,21 @@ class Host:
                 ]
         return "\n".join(lines)
 
-    def close(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Cancel all programs and let their `finally` blocks run, without waiting for anything."""
-        tasks = [task for task in self._tasks if not task.done()]
+    def _cancel_all(self) -> list[asyncio.Task[Any]]:
+        tasks = [task for task, owner in self._tasks.items() if owner is not None and not task.done()]
         for task in tasks:
             task.cancel()
-        gathering = asyncio.gather(*tasks, return_exceptions=True) if tasks else None
-        if gathering is None:
-            return
-        if isinstance(loop, VirtualTimeLoop):
-            try:
-                loop.finish(gathering)
-            except (LoopAbandonedError, SpinError):
-                gathering.cancel()
-        else:
-            loop.run_until_complete(asyncio.wait(tasks, timeout=1.0))
+        return tasks
+
+    def close(self, loop: VirtualTimeLoop) -> None:
+        """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep)."""
+        with contextlib.suppress(LoopAbandonedError, SpinError):
+            loop.finish(_all_done(self._cancel_all()))
+
+    async def cancel(self) -> None:
+        """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""
+        if tasks := self._cancel_all():
+            await asyncio.wait(tasks, timeout=1.0)
 
     async def _run(self, node: Node, program: Program) -> None:
         try:
@@ -191,6 +199,10 @@ class Host:
         owner = _current_node.get() if context is None else context.get(_current_node)
         self._tasks[task] = owner
         return task
+
+
+async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def _one_line(error: BaseException) -> str:

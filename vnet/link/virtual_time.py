@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import selectors
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, NoReturn
 
@@ -58,7 +58,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         """The granted time in seconds, as asyncio counts."""
         return self._now_ns / NS_PER_S
 
-    def finish(self, main: asyncio.Future[Any]) -> None:
+    def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
         self._ending = True
         self._rounds = 0
@@ -67,17 +67,24 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
         """What the selector does instead of sleeping."""
         if timeout is not None and timeout <= 0:
-            self._rounds += 1
-            if self._rounds > self._spin_limit:
-                raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
+            self._count_round()
             return poll(0)
         if self._jobs:
             return self._wait_for_jobs(poll)
         if self._ending:
             raise LoopAbandonedError("a task still waits after the run has ended")
+        next_timer_ns = self._next_timer_ns()
+        if next_timer_ns == self._now_ns:  # a timer closer than the clock's resolution: due already
+            self._count_round()
+            return []
         self._rounds = 0
-        self._now_ns = self._exchange(self._next_timer_ns())
+        self._now_ns = self._exchange(next_timer_ns)
         return []
+
+    def _count_round(self) -> None:
+        self._rounds += 1
+        if self._rounds > self._spin_limit:
+            raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
 
     def _next_timer_ns(self) -> int | None:
         # asyncio has just dropped cancelled timers from the head of its heap.

@@ -7,7 +7,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -88,6 +90,7 @@ class Hello(Message, frozen=True):
     """A node asks to join. `lead` is the first node of its process, whose keys carry the process's traffic.
 
     `nonce` is a secret of the process: later messages bear it, so that nobody else can speak for the node.
+    Said again with `ready` once the welcome has come and the program is loaded, or with the `failure` to.
     """
 
     node: str
@@ -95,6 +98,8 @@ class Hello(Message, frozen=True):
     nonce: bytes
     pid: int
     host: str
+    ready: bool = False
+    failure: str | None = None
 
 
 class Yield(Message, frozen=True):
@@ -109,7 +114,7 @@ class Yield(Message, frozen=True):
 
 
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
-    """Real time: how late packets reached their process, as counts by delay in powers of √2 from 10 µs."""
+    """Real time: how late packets reached their process, as counts in the bins of `lateness_bin`."""
 
     counts: Sequence[Count] = ()
 
@@ -123,6 +128,7 @@ class Frames(Message, frozen=True):
     missed: Sequence[tuple[Count, Count]]
     traffic: Traffic
     lateness: Lateness | None = None
+    final: bool = False
 
 
 class Standing(Message, frozen=True):
@@ -147,6 +153,7 @@ class Welcome(Message, frozen=True):
     max_payload: Annotated[int, msgspec.Meta(gt=0)]
     orphan_timeout_s: float
     spin_limit: Count
+    boot_id: str
 
 
 class Grant(Message, frozen=True):
@@ -159,12 +166,14 @@ class Grant(Message, frozen=True):
 
 
 class Batch(Message, frozen=True):
-    """Real time: what is due by `time_ns` on the emulator's clock."""
+    """Real time: what is due by now. Batch 0 starts the run: time 0 is `origin_ns` on the monotonic clock of
+    the machine whose boot the welcome names; on other machines, its arrival.
+    """
 
     seq: Count
-    time_ns: TimeNs
     packets: Sequence[WirePacket] = ()
     fixes: Sequence[WireFix] = ()
+    origin_ns: int | None = None
 
 
 class Where(Message, frozen=True):
@@ -224,3 +233,30 @@ def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
         return decoder.decode(data)
     except (msgspec.DecodeError, RecursionError) as error:
         raise WireError(f"{len(data)} bytes that are no message: {error}") from None
+
+
+LATENESS_LIMIT_NS = 20_000_000
+"""Deliveries later than this count against a real-time run."""
+LATENESS_BINS = 80
+_LATENESS_LIMIT_BIN = 44
+
+
+def lateness_bin(late_ns: int) -> int:
+    """The bin of a delay: four a factor of two, so that bin 44 starts just at the limit of 20 ms."""
+    if late_ns <= 0:
+        return 0
+    position = _LATENESS_LIMIT_BIN + math.floor(4 * math.log2(late_ns / LATENESS_LIMIT_NS))
+    return min(max(position, 0), LATENESS_BINS - 1)
+
+
+def lateness_edge_ms(index: int) -> float:
+    """The upper edge of a lateness bin in milliseconds."""
+    return LATENESS_LIMIT_NS / 1e6 * float(2 ** ((index + 1 - _LATENESS_LIMIT_BIN) / 4))
+
+
+def boot_id() -> str:
+    """Names this boot of this machine: processes with the same one share a monotonic clock."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,58 @@
+"""`vnet-agent`: one vehicle process, with one or more nodes, attached to an emulator over Zenoh."""
+
+from __future__ import annotations
+
+import faulthandler
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from agents.host import run_agent
+from vnet.errors import ProgramError, VnetError
+from vnet.link.access import Credentials
+from vnet.link.keys import is_segment
+from vnet.link.session import quiet_zenoh
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def agent(
+    connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint, tcp/HOST:PORT.")],
+    run: Annotated[str, typer.Option(help="The name of the run: run.name of the scenario.")],
+    node: Annotated[list[str], typer.Option(help="A node of this process; give it once a node.")],
+    credentials: Annotated[
+        Path | None, typer.Option(help="Credentials file of this process's user, as vnet access writes it.")
+    ] = None,
+    join_timeout_s: Annotated[
+        float, typer.Option(help="How long to wait for the emulator's welcome.")
+    ] = 60.0,
+) -> None:
+    """Join a run as one or more vehicles and run the scenario's program until the run ends."""
+    faulthandler.register(signal.SIGUSR1)
+    sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    quiet_zenoh()
+    try:
+        for name in [run, *node]:
+            if not is_segment(name):
+                raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
+        login = None if credentials is None else Credentials.load(credentials)
+        run_agent(connect, run, node, login, join_timeout_s)
+    except VnetError as error:
+        print(f"vnet-agent: {error}", file=sys.stderr)
+        sys.exit(2 if isinstance(error, ProgramError) else 3)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def main() -> None:
+    """The console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,366 @@
+"""An agent process: it attaches its nodes to Zenoh and runs their program, in either pacing.
+
+Joining, losing the emulator and ending are the same for both; `_run_lockstep` and `_run_realtime` differ in
+who owns the clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import queue
+import secrets
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import ExitStack
+
+import zenoh
+
+from vnet.errors import LinkError, ProgramError, VnetError
+from vnet.link import keys, wire
+from vnet.link.access import Credentials
+from vnet.link.hosting import Host, Program, load_program
+from vnet.link.session import open_client
+from vnet.link.virtual_time import SpinError, VirtualTimeLoop
+
+HELLO_PERIOD_S = 0.5
+LEASE_MS = 60_000
+"""Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
+
+_WHERE = wire.encode(wire.Where())
+
+
+class _RunOverError(Exception):
+    """The emulator has said that the run is over."""
+
+
+class _Lost:
+    """Stands in the message queue for: the emulator is gone."""
+
+
+class _Found:
+    """Stands in the message queue for: the emulator is there (again)."""
+
+
+def run_agent(
+    endpoint: str, run: str, nodes: Sequence[str], credentials: Credentials | None, join_timeout_s: float
+) -> None:
+    """Join `run` at `endpoint` as `nodes` and run their program to the end of the run.
+
+    Raises LinkError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
+    """
+    with ExitStack() as stack:
+        session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
+        attachment = _Attachment(session, run, nodes, stack)
+        welcomes = attachment.join(join_timeout_s)
+        try:
+            program = load_program(welcomes[0].entry)
+        except ProgramError as error:
+            attachment.say_hello(failure=str(error))
+            raise
+        attachment.say_hello(ready=True)
+        if welcomes[0].pacing == "lockstep":
+            _run_lockstep(attachment, welcomes, program)
+        else:
+            _run_realtime(attachment, welcomes, program)
+
+
+class _Attachment:
+    """The process's keys: what it says goes out on its lead's `tx`, what it is told comes in one queue."""
+
+    def __init__(self, session: zenoh.Session, run: str, nodes: Sequence[str], stack: ExitStack) -> None:
+        self.nodes = list(nodes)
+        self.nonce = secrets.token_bytes(16)
+        self.inbox: queue.SimpleQueue[bytes | type[_Lost] | type[_Found]] = queue.SimpleQueue()
+        self.on_message = _no_wake
+        self.orphan_timeout_s = 5.0
+        self._host = socket.gethostname()
+        self._main_thread = threading.main_thread().ident
+        self._publishers = {
+            node: stack.enter_context(
+                session.declare_publisher(
+                    keys.node_tx(run, node), congestion_control=zenoh.CongestionControl.BLOCK, express=True
+                )
+            )
+            for node in nodes
+        }
+        self._reports = {
+            node: stack.enter_context(
+                session.declare_publisher(
+                    keys.node_report(run, node), congestion_control=zenoh.CongestionControl.DROP
+                )
+            )
+            for node in nodes
+        }
+        for node in nodes:
+            stack.enter_context(session.declare_subscriber(keys.node_rx(run, node), self._on_rx))
+            stack.enter_context(session.liveliness().declare_token(keys.node_alive(run, node)))
+        stack.enter_context(
+            session.liveliness().declare_subscriber(keys.emulator_alive(run), self._on_emulator, history=True)
+        )
+
+    # Zenoh's thread: pass on and return.
+
+    def _on_rx(self, sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        if payload == _WHERE:  # the program's thread may be stuck: this one answers
+            self.say(wire.Standing(self.nonce, self._stack()))
+            return
+        self.inbox.put(payload)
+        self.on_message()
+
+    def _on_emulator(self, sample: zenoh.Sample) -> None:
+        self.inbox.put(_Found if sample.kind == zenoh.SampleKind.PUT else _Lost)
+        self.on_message()
+
+    def _stack(self) -> str:
+        frame = sys._current_frames().get(self._main_thread or 0)
+        return "".join(traceback.format_stack(frame)[-12:]) if frame else ""
+
+    # The program's thread.
+
+    def say(self, message: wire.AgentMessage) -> None:
+        """Put a message on the process's own `tx`."""
+        self._publishers[self.nodes[0]].put(wire.encode(message))
+
+    def copy_reports(self, traffic: wire.Traffic) -> None:
+        """Put a copy of each report on its key, where somebody listens."""
+        for report in traffic.reports:
+            publisher = self._reports[report.node]
+            if publisher.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
+                publisher.put(wire.encode(report))
+
+    def say_hello(self, ready: bool = False, failure: str | None = None) -> None:
+        """Say hello for each node on its own `tx`."""
+        for node, publisher in self._publishers.items():
+            hello = wire.Hello(
+                node, self.nodes[0], self.nonce, os.getpid(), self._host, ready=ready, failure=failure
+            )
+            publisher.put(wire.encode(hello))
+
+    def join(self, timeout_s: float) -> list[wire.Welcome]:
+        """Repeat hello until every node is welcome. Raises LinkError on refusal and after `timeout_s`."""
+        welcomes: dict[str, wire.Welcome] = {}
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self.say_hello()
+            next_hello = time.monotonic() + HELLO_PERIOD_S
+            while (wait_s := next_hello - time.monotonic()) > 0:
+                message = self._next(wait_s)
+                if isinstance(message, wire.Welcome) and message.nonce == self.nonce:
+                    welcomes[message.node] = message
+                if len(welcomes) == len(self.nodes):
+                    self.orphan_timeout_s = message.orphan_timeout_s  # type: ignore[union-attr]
+                    return [welcomes[node] for node in self.nodes]
+            if time.monotonic() > deadline:
+                missing = ", ".join(node for node in self.nodes if node not in welcomes)
+                raise LinkError(f"no welcome for {missing} within {timeout_s:g} s: is the emulator running?")
+
+    def next_message(self) -> wire.EmulatorMessage:
+        """The next message, waiting for as long as the emulator is there.
+
+        Raises _RunOverError at the end of the run, LinkError once the emulator has been gone for
+        `orphan_timeout_s`.
+        """
+        message = None
+        while message is None:
+            message = self._next(None)
+        return message
+
+    def _next(self, timeout_s: float | None) -> wire.EmulatorMessage | None:
+        try:
+            item = self.inbox.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+        if item is _Lost:
+            self._wait_as_orphan()
+            return None
+        return self.decode(item)
+
+    def decode(self, item: bytes | type[_Lost] | type[_Found]) -> wire.EmulatorMessage | None:
+        """A queued item as a message for this process; raises _RunOverError and LinkError when told to go."""
+        if not isinstance(item, bytes):
+            return None
+        message = wire.decode_rx(item)
+        if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
+            if message.refused:
+                raise LinkError(f"refused: {message.reason}")
+            raise _RunOverError(message.reason)
+        return message
+
+    def _wait_as_orphan(self) -> None:
+        deadline = time.monotonic() + self.orphan_timeout_s
+        while (wait_s := deadline - time.monotonic()) > 0:
+            try:
+                if self.inbox.get(timeout=wait_s) is _Found:
+                    return
+            except queue.Empty:
+                break
+        raise LinkError(self.orphaned())
+
+    def orphaned(self) -> str:
+        """The one line of an agent that has lost its emulator."""
+        return f"{self.nodes[0]}: the emulator has been gone for {self.orphan_timeout_s:g} s; ending"
+
+
+def _no_wake() -> None:
+    """In lockstep the program's thread waits on the queue itself."""
+
+
+def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+    """Run the programs on a virtual-time loop until the emulator ends the run."""
+    seq = 0
+
+    def exchange(next_timer_ns: int | None) -> int:
+        message = host.make_yield(attachment.nonce, seq, next_timer_ns)
+        attachment.say(message)
+        attachment.copy_reports(message.traffic)
+        return next_grant()
+
+    def next_grant() -> int:
+        nonlocal seq
+        message = attachment.next_message()
+        while not isinstance(message, wire.Grant):
+            message = attachment.next_message()
+        seq = message.seq
+        host.deliver(message.packets, message.fixes)
+        return message.time_ns
+
+    loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
+    host = Host(welcomes, lambda: loop.now_ns)
+    asyncio.set_event_loop(loop)
+    try:
+        next_grant()
+        host.start(loop, program)
+        while True:
+            try:
+                loop.run_forever()
+            except SpinError as spin:
+                host.end_spinning(loop, spin)
+    except _RunOverError:
+        host.close(loop)
+    finally:
+        loop.close()
+
+
+def _run_realtime(attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+    """Run the programs on an ordinary loop, on the wall clock."""
+    with asyncio.Runner() as runner:
+        runner.run(_RealTimeAgent(attachment, welcomes, program).main())
+
+
+class _RealTimeAgent:
+    """Real time: frames go out as they are sent, batches come in when they are due."""
+
+    def __init__(self, attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+        self._attachment = attachment
+        self._program = program
+        self._boot_id = welcomes[0].boot_id
+        self._origin_ns = time.monotonic_ns()
+        self._host = Host(welcomes, self._now_ns, self._schedule_flush)
+        self._wake_pending = False
+        self._flush_pending = False
+        self._started = False
+        self._seq = 0
+        self._expected = 0
+        self._missed: list[tuple[int, int]] = []
+        self._lateness = [0] * wire.LATENESS_BINS
+        self._orphan_timer: asyncio.TimerHandle | None = None
+
+    def _now_ns(self) -> int:
+        return max(time.monotonic_ns() - self._origin_ns, 0)
+
+    async def main(self) -> None:
+        """From the start of the run to its end."""
+        self._loop = asyncio.get_running_loop()
+        self._over: asyncio.Future[None] = self._loop.create_future()
+        self._attachment.on_message = self._wake
+        self._wake()
+        acknowledging = self._loop.create_task(self._acknowledge())
+        try:
+            await self._over
+        except _RunOverError:
+            await self._host.cancel()
+            self._flush(final=True)
+        finally:
+            acknowledging.cancel()
+            self._attachment.on_message = _no_wake
+
+    def _wake(self) -> None:
+        # Zenoh's thread; one wake-up for however many messages come before it is answered.
+        if not self._wake_pending:
+            self._wake_pending = True
+            self._loop.call_soon_threadsafe(self._drain)
+
+    def _drain(self) -> None:
+        self._wake_pending = False
+        try:
+            while True:
+                item = self._attachment.inbox.get_nowait()
+                if not isinstance(item, bytes):
+                    self._emulator_present(item is _Found)
+                elif isinstance(message := self._attachment.decode(item), wire.Batch):
+                    self._take(message)
+        except queue.Empty:
+            pass
+        except (_RunOverError, VnetError) as end:
+            if not self._over.done():
+                self._over.set_exception(end)
+
+    def _emulator_present(self, present: bool) -> None:
+        if self._orphan_timer is not None:
+            self._orphan_timer.cancel()
+            self._orphan_timer = None
+        if not present:
+            self._orphan_timer = self._loop.call_later(self._attachment.orphan_timeout_s, self._orphaned)
+
+    def _orphaned(self) -> None:
+        if not self._over.done():
+            self._over.set_exception(LinkError(self._attachment.orphaned()))
+
+    def _take(self, batch: wire.Batch) -> None:
+        if batch.seq > self._expected:
+            self._missed.append((self._expected, batch.seq - 1))
+        self._expected = batch.seq + 1
+        if batch.origin_ns is not None and not self._started:
+            same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
+            self._origin_ns = batch.origin_ns if same_machine else time.monotonic_ns()
+            self._started = True
+            self._host.start(self._loop, self._program)
+        now_ns = self._now_ns()
+        for packet in batch.packets:
+            self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
+        self._host.deliver(batch.packets, batch.fixes)
+
+    def _schedule_flush(self) -> None:
+        if not self._flush_pending:
+            self._flush_pending = True
+            self._loop.call_soon(self._flush)
+
+    def _flush(self, final: bool = False) -> None:
+        self._flush_pending = False
+        traffic = self._host.take_traffic()
+        self._attachment.say(
+            wire.Frames(
+                self._attachment.nonce,
+                self._seq,
+                self._expected,
+                self._missed,
+                traffic,
+                wire.Lateness(self._lateness),
+                final,
+            )
+        )
+        self._seq += 1
+        self._missed = []
+        self._attachment.copy_reports(traffic)
+
+    async def _acknowledge(self) -> None:
+        """A sign of life once a second, also from programs that never send."""
+        while True:
+            await asyncio.sleep(1.0)
+            self._flush()

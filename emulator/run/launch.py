@@ -1,0 +1,143 @@
+"""Starting agent processes, watching them, and ending every one of them.
+
+Each process gets a log, a session of its own (so that Ctrl-C in the terminal reaches only the emulator), a
+fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vnet.errors import VnetError
+from vnet.link.access import Access, Credentials, node_user
+from vnet.link.session import AGENT_RUNTIME
+
+LOG_TAIL_LINES = 12
+
+AGENT_ENVIRONMENT = {
+    "PYTHONHASHSEED": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "ZENOH_RUNTIME": AGENT_RUNTIME,
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+@dataclass(frozen=True)
+class Exit:
+    """How a process ended."""
+
+    status: int
+    log_tail: str
+
+    @property
+    def how(self) -> str:
+        """In words: an exit status, or the signal that ended it."""
+        if self.status >= 0:
+            return f"exit status {self.status}"
+        try:
+            return signal.Signals(-self.status).name
+        except ValueError:
+            return f"signal {-self.status}"
+
+
+class Launcher:
+    """The processes that a run has started. `stop` ends all that are left, whatever happened before."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str]) -> None:
+        """Start the process of `nodes`; its name here is that of its lead, the first node."""
+        arguments = ["-P", "-m", "agents.cli", "--connect", endpoint, "--run", access.run]
+        for node in nodes:
+            arguments += ["--node", node]
+        self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
+
+    def start(
+        self, name: str, arguments: Sequence[str], credentials: Credentials, environment: Mapping[str, str]
+    ) -> None:
+        """Start `python ARGUMENTS --credentials …` with its output in `logs/{name}.log`."""
+        read_end, write_end = os.pipe()
+        os.write(write_end, credentials.dumps().encode())
+        os.close(write_end)
+        command = [sys.executable, *arguments, "--credentials", f"/dev/fd/{read_end}"]
+        try:
+            with (self._logs / f"{name}.log").open("wb") as log:
+                self._processes[name] = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    pass_fds=[read_end],
+                    start_new_session=True,
+                    env={**os.environ, **environment},
+                )
+        except OSError as error:
+            raise VnetError(f"cannot start the process of {name}: {error.strerror}") from None
+        finally:
+            os.close(read_end)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by name."""
+        return {name: process.pid for name, process in self._processes.items()}
+
+    def ended(self) -> dict[str, Exit]:
+        """The processes that have ended since the last call; they are forgotten."""
+        done = {}
+        for name, process in list(self._processes.items()):
+            status = process.poll()
+            if status is not None:
+                del self._processes[name]
+                done[name] = Exit(status, self.log_tail(name))
+        return done
+
+    def log_tail(self, name: str) -> str:
+        """The last lines of a process's log."""
+        try:
+            text = (self._logs / f"{name}.log").read_text(errors="replace")
+        except OSError:
+            return ""
+        return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])
+
+    def ask_where(self, name: str) -> None:
+        """Have a process write its stacks to its log (its faulthandler answers SIGUSR1)."""
+        if name in self._processes:
+            self._processes[name].send_signal(signal.SIGUSR1)
+
+    def wait_for(self, name: str, timeout_s: float) -> None:
+        """Wait for one process to end by itself."""
+        with contextlib.suppress(KeyError, subprocess.TimeoutExpired):
+            self._processes[name].wait(timeout_s)
+
+    def stop(self, patience_s: float = 1.0) -> None:
+        """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL."""
+        self._wait(patience_s)
+        for process in self._processes.values():
+            process.terminate()
+        self._wait(0.5)
+        for process in self._processes.values():
+            process.kill()
+        for process in self._processes.values():
+            process.wait()
+        self._processes.clear()
+
+    def _wait(self, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while self._processes and time.monotonic() < deadline:
+            for name, process in list(self._processes.items()):
+                if process.poll() is not None:
+                    del self._processes[name]
+            if self._processes:
+                time.sleep(0.01)

@@ -1,0 +1,427 @@
+"""The live driver: real processes over Zenoh, in lockstep or real time.
+
+`run_live` opens the emulator's session (an embedded router, or a client of a separate one), starts the agents
+or waits for those started by hand, runs the pacing to the end, and leaves no process behind.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from emulator.observe.observation import period_message, scene_message
+from emulator.run.emulation import Emulation, PeriodView
+from emulator.run.join import Membership, split_into_processes
+from emulator.run.launch import Exit, Launcher
+from emulator.run.pacing import Lockstep, ProtocolError, RealTime
+from vnet.errors import LinkError, ProgramError, VnetError, WireError
+from vnet.link import keys, wire
+from vnet.link.access import EMULATOR, OBSERVER, Access
+from vnet.link.session import open_client, open_router, router_endpoint
+
+LEASE_MS = 60_000
+"""Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
+REALTIME_LEASE_MS = 2_000
+DEATH_GRACE_S = 0.3
+"""How long the last words of a process that has ended may still be on their way."""
+STANDING_WAIT_S = 1.0
+FAREWELL_S = 1.0
+RECORDER_WAIT_S = 20.0
+RECORDER = "recorder"
+SCENE_EVERY_PERIODS = 50
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How a live run is attached.
+
+    `listen` (embedded router) or `connect` (client of a separate one); `launch` starts the agents; `record`
+    is where a recorder process writes its recording, or None.
+    """
+
+    access: Access
+    listen: str = "tcp/127.0.0.1:0"
+    connect: str | None = None
+    launch: bool = True
+    record: Path | None = None
+
+
+class Stalled(Exception):
+    """The run cannot go on: it ends with verdict unknown."""
+
+
+@asynccontextmanager
+async def _interruptible() -> AsyncIterator[None]:
+    """Ctrl-C and SIGTERM cancel the block, once; asyncio's own handling would do so less cleanly."""
+    loop = asyncio.get_running_loop()
+    task = asyncio.current_task()
+    assert task is not None
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, task.cancel)
+    try:
+        yield
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)  # a second Ctrl-C must not lose the records
+
+
+async def run_live(
+    emulation: Emulation,
+    options: LiveOptions,
+    on_state: Callable[[str], None] = lambda text: None,
+) -> float:
+    """Run `emulation` to its end over Zenoh; returns the wall-clock seconds from time 0 to the end.
+
+    Raises VnetError if the run cannot start, and asyncio.CancelledError (after a clean end, with the event
+    `interrupted`) if it was interrupted.
+    """
+    realtime = emulation.scenario.run.pacing == "realtime"
+    lease_ms = REALTIME_LEASE_MS if realtime else LEASE_MS
+    access = options.access
+    with ExitStack() as stack:
+        launcher = Launcher(emulation.folder.logs)
+        stack.callback(launcher.stop)
+        async with _interruptible():
+            if options.connect is None:
+                session = stack.enter_context(open_router(options.listen, access, lease_ms))
+                endpoint = router_endpoint(session)
+            else:
+                endpoint = options.connect
+                session = stack.enter_context(open_client(endpoint, access.credentials(EMULATOR), lease_ms))
+            run = LiveRun(emulation, options, session, launcher, stack)
+            return await run.run(endpoint, on_state)
+
+
+class LiveRun:
+    """One live run: its session, its processes and its pacing."""
+
+    def __init__(
+        self,
+        emulation: Emulation,
+        options: LiveOptions,
+        session: zenoh.Session,
+        launcher: Launcher,
+        stack: ExitStack,
+    ) -> None:
+        self._emulation = emulation
+        self._options = options
+        self._launcher = launcher
+        self._loop = asyncio.get_running_loop()
+        self._name = options.access.run
+        self._members = Membership(emulation.world.node_ids)
+        self._pacing: Lockstep | RealTime | None = None
+        self._origin_ns = 0
+        self._incoming: deque[tuple[str, bytes | bool]] = deque()
+        self._wake_pending = False
+        self._changed = asyncio.Event()
+        self._dead: dict[str, dict[str, Any]] = {}
+        self._join_failure: VnetError | None = None
+        self._standing: dict[str, str] = {}
+        self._refused: dict[str, int] = {}
+        self._open(session, stack)
+
+    def _open(self, session: zenoh.Session, stack: ExitStack) -> None:
+        name = self._name
+        realtime = self._emulation.scenario.run.pacing == "realtime"
+        # Lockstep has one message outstanding per agent, so BLOCK is safe; in real time one frozen agent
+        # must not stall all others.
+        control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
+        self._rx = {
+            node: stack.enter_context(
+                session.declare_publisher(keys.node_rx(name, node), congestion_control=control, express=True)
+            )
+            for node in self._emulation.world.node_ids
+        }
+        self._observers = {
+            stream: stack.enter_context(
+                session.declare_publisher(
+                    keys.observe(name, stream), congestion_control=zenoh.CongestionControl.DROP
+                )
+            )
+            for stream in ("scene", "period", "end")
+        }
+        liveliness = session.liveliness()
+        stack.enter_context(session.declare_subscriber(keys.node_tx(name, "*"), self._on_tx))
+        stack.enter_context(
+            liveliness.declare_subscriber(keys.node_alive(name, "*"), self._on_alive, history=True)
+        )
+        stack.enter_context(liveliness.declare_token(keys.emulator_alive(name)))
+
+    # Zenoh's threads: append, and wake the loop once.
+
+    def _on_tx(self, sample: zenoh.Sample) -> None:
+        self._intake(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+
+    def _on_alive(self, sample: zenoh.Sample) -> None:
+        self._intake(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
+    def _intake(self, node: str, item: bytes | bool) -> None:
+        self._incoming.append((node, item))
+        if not self._wake_pending:
+            self._wake_pending = True
+            self._loop.call_soon_threadsafe(self._drain)
+
+    # The loop.
+
+    def _drain(self) -> None:
+        self._wake_pending = False
+        while self._incoming:
+            node, item = self._incoming.popleft()
+            if isinstance(item, bool):
+                if not item:
+                    self._token_lost(node)
+                continue
+            try:
+                self._take(node, wire.decode_tx(item))
+            except (WireError, ProtocolError) as error:
+                self._refuse(node, str(error))
+
+    def _take(self, node: str, message: wire.AgentMessage) -> None:
+        if isinstance(message, wire.Hello):
+            self._hello(node, message)
+        elif not self._members.speaks_for(node, message.nonce):
+            self._refuse(node, "a message without the nonce of its process")
+        elif isinstance(message, wire.Standing):
+            self._standing[node] = message.text
+        elif isinstance(message, wire.Yield) and isinstance(self._pacing, Lockstep):
+            self._pacing.receive(node, message)
+            if not self._pacing.owed:
+                self._changed.set()
+        elif isinstance(message, wire.Frames) and isinstance(self._pacing, RealTime):
+            self._pacing.receive(self._now_ns(), node, message)
+            self._changed.set()
+        else:
+            self._refuse(node, f"an unexpected {type(message).__name__}")
+
+    def _refuse(self, node: str, reason: str) -> None:
+        """Count what is not understood, and log its first appearance with its key."""
+        key = keys.node_tx(self._name, node)
+        if key not in self._refused:
+            self._emulation.folder.event(self._time_ns(), "refused", node, key=key, reason=reason)
+        self._refused[key] = self._refused.get(key, 0) + 1
+
+    def _hello(self, node: str, hello: wire.Hello) -> None:
+        refusal = self._members.hello(node, hello)
+        if refusal is not None:
+            self._refuse(node, refusal)
+            if node in self._rx:
+                self._send(node, wire.End(hello.nonce, refusal, refused=True))
+            return
+        if hello.failure is not None:
+            self._join_failure = ProgramError(f"{node}: {hello.failure}")
+        elif not hello.ready:
+            self._send(node, self._emulation.welcome(node, hello.nonce))
+        self._changed.set()
+
+    def _send(self, node: str, message: wire.EmulatorMessage) -> None:
+        self._rx[node].put(wire.encode(message))
+
+    def _time_ns(self) -> int:
+        """Emulated time for the event log."""
+        if isinstance(self._pacing, Lockstep):
+            return self._pacing.now_ns
+        return self._now_ns() if self._pacing is not None else 0
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() - self._origin_ns
+
+    # Processes that end, or whose connection does.
+
+    def _children_ended(self) -> None:
+        for name, how in self._launcher.ended().items():
+            self._loop.call_later(DEATH_GRACE_S, self._process_ended, name, how)
+
+    def _process_ended(self, name: str, how: Exit) -> None:
+        if name not in self._rx:
+            self._emulation.folder.event(self._time_ns(), "observer_ended", name, how=how.how)
+        elif self._pacing is None:
+            last = how.log_tail.splitlines()[-1:] or ["its log is empty"]
+            self._join_failure = VnetError(f"agent {name} ended before the start ({how.how}): {last[0]}")
+            self._changed.set()
+        else:
+            self._process_dead(name, how=how.how, log_tail=how.log_tail)
+
+    def _token_lost(self, node: str) -> None:
+        if node not in self._members.joined or node in self._launcher.pids:
+            return
+        if self._pacing is None:
+            self._members.leave(node)
+        elif not self._options.launch and self._members.lead_of(node) == node:
+            details = {"how": "its connection closed", "process": self._members.describe(node)}
+            self._loop.call_later(DEATH_GRACE_S, lambda: self._process_dead(node, **details))
+
+    def _process_dead(self, lead: str, **details: Any) -> None:
+        self._dead[lead] = details
+        if isinstance(self._pacing, RealTime):
+            self._pacing.died(self._now_ns(), lead, **self._dead.pop(lead))
+        self._changed.set()
+
+    # The course of a run.
+
+    async def run(self, endpoint: str, on_state: Callable[[str], None]) -> float:
+        """Join, run, end. Returns the wall-clock seconds between time 0 and the end."""
+        self._loop.add_signal_handler(signal.SIGCHLD, self._children_ended)
+        folder = self._emulation.folder
+        started = time.monotonic()
+        patience_s = 0.5
+        try:
+            await self._join(endpoint, on_state)
+            folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
+            self._emulation.watch(self._publish_period)
+            started = time.monotonic()
+            await self._course()
+            patience_s = FAREWELL_S * 5
+        except Stalled:
+            self._emulation.finish(self._time_ns())
+        except asyncio.CancelledError:
+            folder.event(self._time_ns(), "interrupted")
+            self._emulation.finish(self._time_ns())
+            raise
+        finally:
+            wall_s = time.monotonic() - started
+            await self._farewell(patience_s)
+            for key, count in self._refused.items():
+                folder.event(self._time_ns(), "refused_total", key=key, count=count)
+            self._loop.remove_signal_handler(signal.SIGCHLD)
+        return wall_s
+
+    async def _join(self, endpoint: str, on_state: Callable[[str], None]) -> None:
+        """Start what is to be started and wait until every node is ready."""
+        run = self._emulation.scenario.run
+        node_ids = self._emulation.world.node_ids
+        groups = split_into_processes(node_ids, run.nodes_per_process)
+        deadline = time.monotonic() + run.join_timeout_s
+        if self._options.record is not None:
+            self._start_recorder(endpoint, self._options.record)
+        if self._options.launch:
+            on_state(f"starting {len(groups)} agent processes for {len(node_ids)} vehicles")
+            for nodes in groups:
+                self._launcher.start_agent(endpoint, self._options.access, nodes)
+        else:
+            on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
+        while self._members.missing or not self._recorder_listens():
+            if self._join_failure is not None:
+                raise self._join_failure
+            if time.monotonic() > deadline:
+                raise LinkError(self._who_is_missing(run.join_timeout_s))
+            await self._change(0.05 if self._options.record else deadline - time.monotonic())
+        self._members.closed = True
+
+    def _start_recorder(self, endpoint: str, path: Path) -> None:
+        arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
+        arguments += ["--out", str(path)]
+        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
+
+    def _recorder_listens(self) -> bool:
+        return self._options.record is None or self._is_watched("period")
+
+    def _who_is_missing(self, timeout_s: float) -> str:
+        missing = self._members.missing or ["the recorder"]
+        shown = ", ".join(missing[:8]) + (", …" if len(missing) > 8 else "")
+        total = len(self._emulation.world.node_ids)
+        return f"{len(missing)} of {total} nodes have not joined within {timeout_s:g} s: {shown}"
+
+    async def _change(self, timeout_s: float) -> bool:
+        """Wait for a change of state; False if none came in time."""
+        self._changed.clear()
+        try:
+            async with asyncio.timeout(max(timeout_s, 0)):
+                await self._changed.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    async def _course(self) -> None:
+        processes = self._members.processes()
+        self._publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        if self._emulation.scenario.run.pacing == "lockstep":
+            self._pacing = lockstep = Lockstep(self._emulation, processes)
+            await self._run_lockstep(lockstep)
+        else:
+            self._pacing = realtime = RealTime(self._emulation, processes)
+            await self._run_realtime(realtime)
+
+    async def _run_lockstep(self, lockstep: Lockstep) -> None:
+        grants = lockstep.start()
+        while grants:
+            for lead, grant in grants.items():
+                self._send(lead, grant)
+            await self._all_yielded(lockstep)
+            grants = lockstep.step()
+        for lead in sorted(self._dead):
+            lockstep.died(lead, **self._dead[lead])
+
+    async def _all_yielded(self, lockstep: Lockstep) -> None:
+        stall_timeout_s = self._emulation.scenario.run.stall_timeout_s
+        while lockstep.owed:
+            for lead in sorted(self._dead.keys() & lockstep.owed):
+                lockstep.died(lead, **self._dead.pop(lead))
+            if lockstep.owed and not await self._change(stall_timeout_s):
+                await self._stall(sorted(lockstep.owed), stall_timeout_s)
+
+    async def _stall(self, leads: list[str], timeout_s: float) -> None:
+        """Ask those who do not yield where they stand, write it down and give up."""
+        for lead in leads:
+            self._send(lead, wire.Where())
+            self._launcher.ask_where(lead)
+        await asyncio.sleep(STANDING_WAIT_S)
+        for lead in leads:
+            where = self._standing.get(lead) or self._launcher.log_tail(lead)
+            self._emulation.folder.event(
+                self._time_ns(),
+                "stalled",
+                lead,
+                error=f"no yield within {timeout_s:g} s of wall clock; {self._members.describe(lead)}",
+                where=where,
+            )
+        raise Stalled
+
+    async def _run_realtime(self, realtime: RealTime) -> None:
+        self._origin_ns = time.monotonic_ns()
+        duration_ns = self._emulation.duration_ns
+        for lead, batch in realtime.start(self._origin_ns).items():
+            self._send(lead, batch)
+        while (now_ns := self._now_ns()) < duration_ns:
+            for lead, batch in realtime.due(now_ns).items():
+                self._send(lead, batch)
+            next_ns = min(realtime.next_time_ns() or duration_ns, duration_ns)
+            await self._change((next_ns - self._now_ns()) / 1e9)
+
+    async def _farewell(self, patience_s: float) -> None:
+        """Tell everybody that it is over, hear last words, and see every process off."""
+        for node in self._members.joined:
+            self._send(node, wire.End(None, "the run is over"))
+        if isinstance(self._pacing, RealTime):
+            deadline = time.monotonic() + FAREWELL_S
+            while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
+                pass
+            self._pacing.finish()
+        self._publish("end", {})
+        if self._options.record is not None:
+            self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
+        self._launcher.stop(patience_s)
+
+    # Those who watch.
+
+    def _is_watched(self, stream: str) -> bool:
+        return bool(self._observers[stream].matching_status.matching)  # type: ignore[attr-defined]
+
+    def _publish(self, stream: str, message: dict[str, Any]) -> None:
+        self._observers[stream].put(wire.encode_observation(message))
+
+    def _publish_period(self, view: PeriodView) -> None:
+        if not self._is_watched("period"):
+            return
+        if view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
+            self._publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        self._publish("period", period_message(view))

@@ -1,0 +1,290 @@
+"""The two pacings of a run, lockstep and real time, without any transport.
+
+Lockstep is a conservative discrete-event simulation whose entities are event loops: it is told what each
+process yields and says whom to grant what. The live driver moves these messages over Zenoh, `vnet simulate`
+by calling; so both give the same trace. Real time runs the same engine on a clock that the driver reads.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+from emulator.engine import Delivery
+from emulator.run.emulation import Emulation
+from vnet.errors import VnetError
+from vnet.link import wire
+from vnet.link.node import INBOX_LIMIT, Packet
+
+
+class ProtocolError(VnetError):
+    """A message that does not fit what its process was told, or speaks for others."""
+
+
+class _Process:
+    """One event loop: its nodes, what they last said, and what waits for its next wake-up."""
+
+    def __init__(self, nodes: Sequence[str]) -> None:
+        self.nodes = tuple(nodes)
+        self.seq = 0
+        self.next_timer_ns: int | None = None
+        self.waiting_radio: Sequence[str] = ()
+        self.waiting_gnss: Sequence[str] = ()
+        self.traffic: wire.Traffic | None = None
+        self.packets: dict[str, deque[wire.WirePacket]] = {
+            node: deque(maxlen=INBOX_LIMIT) for node in self.nodes
+        }
+        self.next_fix = dict.fromkeys(self.nodes, 0)
+
+    def take_packets(self) -> list[wire.WirePacket]:
+        due = [packet for node in self.nodes for packet in self.packets[node]]
+        for queue in self.packets.values():
+            queue.clear()
+        return due
+
+
+class Lockstep:
+    """The barrier of a run. `processes` are the node ids of each event loop, the lead first.
+
+    Use: grants = start(); then, until `step` returns none: give each grant to its process and `receive` its
+    yield (or say that it `died`); when nothing is `owed`, call `step`.
+    """
+
+    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
+        self._emulation = emulation
+        self._processes = {nodes[0]: _Process(nodes) for nodes in processes}
+        self.owed: dict[str, int] = {}
+        self.now_ns = 0
+
+    def start(self) -> dict[str, wire.Grant]:
+        """The first grants, to all, at time 0."""
+        return self._grant(list(self._processes))
+
+    def receive(self, lead: str, message: wire.Yield) -> None:
+        """A process has yielded. Raises ProtocolError if it was not owed or speaks for others' nodes."""
+        process = self._processes[lead]
+        if self.owed.get(lead) != message.seq:
+            raise ProtocolError(f"yield {message.seq} of {lead}: expected {self.owed.get(lead)}")
+        waiting = [*message.waiting_radio, *message.waiting_gnss]
+        _check_ownership(process.nodes, message.traffic, waiting)
+        del self.owed[lead]
+        process.next_timer_ns = message.next_timer_ns
+        process.waiting_radio = message.waiting_radio
+        process.waiting_gnss = message.waiting_gnss
+        process.traffic = message.traffic
+
+    def died(self, lead: str, **details: Any) -> None:
+        """A process has ended: its nodes are down from this instant on, and nothing is owed by it."""
+        process = self._processes.pop(lead)
+        self.owed.pop(lead, None)
+        for node in process.nodes:
+            self._emulation.died(self.now_ns, node, **details)
+
+    def step(self) -> dict[str, wire.Grant]:
+        """Do what was yielded, go to the next instant, and say who is granted it; none at the end."""
+        assert not self.owed, self.owed
+        self._emulation.take(
+            self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None]
+        )
+        for process in self._processes.values():
+            process.traffic = None
+        wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
+        due = [wake for wake in wakes.values() if wake is not None]
+        if not due or min(due) >= self._emulation.duration_ns:
+            self._emulation.finish(self._emulation.duration_ns)
+            return {}
+        self.now_ns = min(due)
+        self._collect_packets()
+        return self._grant([lead for lead, wake in wakes.items() if wake == self.now_ns])
+
+    def _wake_ns(self, process: _Process) -> int | None:
+        """When a process must run next: its next timer, or what its nodes' tasks wait for."""
+        emulation = self._emulation
+        candidates = [process.next_timer_ns]
+        candidates += [emulation.engine.next_arrival_ns(emulation.number[n]) for n in process.waiting_radio]
+        candidates += [emulation.fix_time_ns(process.next_fix[n]) for n in process.waiting_gnss]
+        due = [time_ns for time_ns in candidates if time_ns is not None]
+        return min(due) if due else None
+
+    def _collect_packets(self) -> None:
+        """Put what has arrived where its receiver will find it at its next wake-up."""
+        node_ids = self._emulation.world.node_ids
+        queues = {node: queue for p in self._processes.values() for node, queue in p.packets.items()}
+        for delivery in self._emulation.advance(self.now_ns):
+            node = node_ids[delivery.receiver]
+            queues[node].append(_wire_packet(node, delivery.packet))
+
+    def _grant(self, leads: Sequence[str]) -> dict[str, wire.Grant]:
+        grants = {}
+        for lead in leads:
+            process = self._processes[lead]
+            fixes = [fix for node in process.nodes for fix in self._take_fixes(process, node)]
+            grants[lead] = wire.Grant(process.seq, self.now_ns, process.take_packets(), fixes)
+            self.owed[lead] = process.seq
+            process.seq += 1
+        return grants
+
+    def _take_fixes(self, process: _Process, node: str) -> list[wire.WireFix]:
+        world = self._emulation.world
+        last = self.now_ns // world.period_ns
+        first = max(process.next_fix[node], last - INBOX_LIMIT + 1)
+        process.next_fix[node] = last + 1
+        if not self._emulation.up[node]:
+            return []
+        number = self._emulation.number[node]
+        return [wire.WireFix.of(node, world.fix(period, number)) for period in range(first, last + 1)]
+
+
+class RealTime:
+    """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
+
+    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`.
+    """
+
+    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
+        self._emulation = emulation
+        self._nodes = {nodes[0]: tuple(nodes) for nodes in processes}
+        self._lead = {node: nodes[0] for nodes in processes for node in nodes}
+        self._batch_seq = dict.fromkeys(self._nodes, 0)
+        self._frames_seq = dict.fromkeys(self._nodes, 0)
+        self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
+        self._lateness: dict[str, Sequence[int]] = {}
+        self._awaited = set(self._nodes)
+        self._next_period = 0
+        self.gaps = 0
+
+    def start(self, origin_ns: int) -> dict[str, wire.Batch]:
+        """The batches that start every process; time 0 is `origin_ns` on the machine's monotonic clock."""
+        return {lead: self._batch(lead, [], [], origin_ns) for lead in self._nodes}
+
+    def next_time_ns(self) -> int | None:
+        """When `due` must be called next: the next arrival or the next fix."""
+        candidates = [
+            self._emulation.engine.next_time(),
+            self._emulation.fix_time_ns(self._next_period),
+        ]
+        due = [time_ns for time_ns in candidates if time_ns is not None]
+        return min(due) if due else None
+
+    def receive(self, now_ns: int, lead: str, message: wire.Frames) -> None:
+        """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
+        _check_ownership(self._nodes[lead], message.traffic, ())
+        if message.seq != self._frames_seq[lead]:
+            self.gaps += 1
+        self._frames_seq[lead] = message.seq + 1
+        self._acknowledge(lead, message)
+        if message.lateness is not None:
+            self._lateness[lead] = message.lateness.counts
+        if message.final:
+            self._awaited.discard(lead)
+        if now_ns < self._emulation.duration_ns:
+            self._emulation.take(now_ns, [message.traffic])
+
+    @property
+    def all_final(self) -> bool:
+        """Whether every process that lives has said its last words."""
+        return not self._awaited
+
+    def _acknowledge(self, lead: str, message: wire.Frames) -> None:
+        waiting = self._unacknowledged[lead]
+        for first, last in message.missed:
+            self.gaps += 1
+            for seq in [seq for seq in waiting if first <= seq <= last]:
+                self._lose(waiting.pop(seq))
+        for seq in [seq for seq in waiting if seq < message.received_seq]:
+            del waiting[seq]
+
+    def _lose(self, deliveries: Sequence[Delivery]) -> None:
+        for delivery in deliveries:
+            self._emulation.engine.lose(delivery)
+
+    def due(self, now_ns: int) -> dict[str, wire.Batch]:
+        """What has become due by `now_ns`, by process."""
+        emulation = self._emulation
+        node_ids = emulation.world.node_ids
+        packets: dict[str, list[Delivery]] = {}
+        for delivery in emulation.advance(now_ns):
+            packets.setdefault(self._lead[node_ids[delivery.receiver]], []).append(delivery)
+        fixes = self._due_fixes(now_ns)
+        return {
+            lead: self._batch(lead, packets.get(lead, []), fixes.get(lead, []))
+            for lead in self._nodes
+            if lead in packets or lead in fixes
+        }
+
+    def _due_fixes(self, now_ns: int) -> dict[str, list[wire.WireFix]]:
+        world = self._emulation.world
+        fixes: dict[str, list[wire.WireFix]] = {}
+        while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= now_ns:
+            for number, node in enumerate(world.node_ids):
+                if self._emulation.up[node]:
+                    fix = wire.WireFix.of(node, world.fix(self._next_period, number))
+                    fixes.setdefault(self._lead[node], []).append(fix)
+            self._next_period += 1
+        return fixes
+
+    def _batch(
+        self,
+        lead: str,
+        deliveries: list[Delivery],
+        fixes: list[wire.WireFix],
+        origin_ns: int | None = None,
+    ) -> wire.Batch:
+        seq = self._batch_seq[lead]
+        self._batch_seq[lead] = seq + 1
+        self._unacknowledged[lead][seq] = deliveries
+        node_ids = self._emulation.world.node_ids
+        packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
+        return wire.Batch(seq, packets, fixes, origin_ns)
+
+    def died(self, now_ns: int, lead: str, **details: Any) -> None:
+        """A process has ended: its nodes are down from now on."""
+        for node in self._nodes[lead]:
+            self._emulation.died(now_ns, node, **details)
+        self._unacknowledged[lead].clear()
+        self._awaited.discard(lead)
+
+    def finish(self) -> None:
+        """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
+        self._emulation.finish(self._emulation.duration_ns)
+        for waiting in self._unacknowledged.values():
+            for deliveries in waiting.values():
+                self._lose(deliveries)
+        if self.gaps:
+            self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
+        counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
+        if sum(counts):
+            self._emulation.folder.event(
+                self._emulation.duration_ns, "late_deliveries", **lateness_figures(counts)
+            )
+
+
+def lateness_figures(counts: Sequence[int]) -> dict[str, float]:
+    """Figures of a lateness histogram: deliveries, how many over the limit, percentiles in ms."""
+    total = sum(counts)
+    limit_bin = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
+    cumulative = list(accumulate(counts))
+
+    def percentile_ms(share: float) -> float:
+        return wire.lateness_edge_ms(next(i for i, c in enumerate(cumulative) if c >= share * total))
+
+    return {
+        "total": total,
+        "count": sum(counts[limit_bin:]),
+        "p50_ms": percentile_ms(0.5),
+        "p99_ms": percentile_ms(0.99),
+        "max_ms": percentile_ms(1.0),
+    }
+
+
+def _wire_packet(node: str, packet: Packet) -> wire.WirePacket:
+    return wire.WirePacket(node, packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
+
+
+def _check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str]) -> None:
+    named = [part.node for parts in (traffic.frames, traffic.reports, traffic.endings) for part in parts]
+    for node in [*named, *waiting]:
+        if node not in nodes:
+            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")

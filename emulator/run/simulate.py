@@ -1,0 +1,83 @@
+"""The simulated driver: the same programs and the same engine in one process, without Zenoh.
+
+One virtual-time loop hosts all nodes; its yields go straight to the barrier. In lockstep a live run and its
+simulation give the same trace, and a test holds them to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from emulator.run.emulation import Emulation
+from emulator.run.pacing import Lockstep
+from vnet.link import wire
+from vnet.link.hosting import Host, Program, load_program
+from vnet.link.virtual_time import SpinError, VirtualTimeLoop
+
+_NONCE = b""
+
+
+class _RunOverError(Exception):
+    """The barrier has granted nothing more."""
+
+
+def simulate(emulation: Emulation) -> float:
+    """Run `emulation` to its end in this process; returns the wall-clock seconds it took.
+
+    Raises ProgramError if the program cannot be loaded, and KeyboardInterrupt (with the event `interrupted`
+    recorded) when interrupted.
+    """
+    program = load_program(emulation.scenario.program.entry)
+    simulation = _Simulation(emulation)
+    emulation.folder.event(0, "started", start_up_s=0.0)
+    started = time.monotonic()
+    try:
+        simulation.run(program)
+    except KeyboardInterrupt:
+        emulation.folder.event(simulation.loop.now_ns, "interrupted")
+        emulation.finish(simulation.loop.now_ns)
+        raise
+    return time.monotonic() - started
+
+
+class _Simulation:
+    """All nodes on one loop, and the barrier that this loop yields to."""
+
+    def __init__(self, emulation: Emulation) -> None:
+        node_ids = emulation.world.node_ids
+        self._lead = node_ids[0]
+        self._lockstep = Lockstep(emulation, [node_ids])
+        self._seq = 0
+        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
+        welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
+        self._host = Host(welcomes, lambda: self.loop.now_ns)
+
+    def run(self, program: Program) -> None:
+        """From the first grant to the last."""
+        asyncio.set_event_loop(self.loop)
+        try:
+            self._take(self._lockstep.start())
+            self._host.start(self.loop, program)
+            while True:
+                try:
+                    self.loop.run_forever()
+                except SpinError as spin:
+                    self._host.end_spinning(self.loop, spin)
+        except _RunOverError:
+            self._host.close(self.loop)
+        finally:
+            asyncio.set_event_loop(None)
+            self.loop.close()
+
+    def _exchange(self, next_timer_ns: int | None) -> int:
+        self._lockstep.receive(self._lead, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
+        return self._take(self._lockstep.step())
+
+    def _take(self, grants: dict[str, wire.Grant]) -> int:
+        if not grants:
+            raise _RunOverError
+        grant = grants[self._lead]
+        self._seq = grant.seq
+        self._host.deliver(grant.packets, grant.fixes)
+        return grant.time_ns
