@@ -34,7 +34,7 @@ def agent(
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     faulthandler.register(signal.SIGUSR1)
     sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     quiet_zenoh()
     try:
         for name in [run, *node]:

@@ -12,7 +12,8 @@ import contextvars
 import importlib
 import traceback
 import weakref
-from collections.abc import Awaitable, Callable, Generator, Iterable, Sequence
+from collections import deque
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Sequence
 from typing import Any
 
 from vnet.errors import ProgramError
@@ -98,6 +99,7 @@ class Host:
 
     def start(self, loop: asyncio.AbstractEventLoop, program: Program) -> None:
         """Schedule every node's program on `loop`."""
+        self._loop = loop
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
             context = contextvars.copy_context()
@@ -135,16 +137,25 @@ class Host:
             return
         self._active[node] = False
         self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        running = asyncio.current_task(self._loop)
         for task, owner in list(self._tasks.items()):
-            if owner == node and task is not asyncio.current_task():
+            if owner == node and task is not running:
                 task.cancel()
         self._on_traffic()
 
     def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
-        """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand."""
-        ready: Iterable[asyncio.Handle] = loop._ready  # type: ignore[attr-defined]
-        owners = dict.fromkeys(handle._context.get(_current_node) for handle in ready)  # type: ignore[attr-defined]
-        for node in [owner for owner in owners if owner is not None] or list(self.nodes):
+        """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
+
+        What spins on although it was cancelled loses its callbacks.
+        """
+        ready: deque[asyncio.Handle] = loop._ready  # type: ignore[attr-defined]
+        owners = dict.fromkeys(_owner(handle) for handle in ready)
+        spinning = [owner for owner in owners if owner is not None] or list(self.nodes)
+        if not any(self._active[node] for node in spinning):
+            kept = [handle for handle in ready if _owner(handle) not in spinning]
+            ready.clear()
+            ready.extend(kept)
+        for node in spinning:
             self.end(node, "spun", str(spin), self.stacks(node))
 
     def stacks(self, node: str) -> str:
@@ -153,10 +164,7 @@ class Host:
         for task, owner in list(self._tasks.items()):
             if owner == node and not task.done():
                 lines.append(f"task {task.get_name()}:")
-                lines += [
-                    f"  {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
-                    for frame in task.get_stack()
-                ]
+                lines += [f"  {place}" for place in _standing(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
@@ -178,9 +186,9 @@ class Host:
     async def _run(self, node: Node, program: Program) -> None:
         try:
             await program(node)
-        except asyncio.CancelledError:
+        except (asyncio.CancelledError, GeneratorExit):
             raise
-        except BaseException as error:
+        except (Exception, SystemExit) as error:
             if isinstance(error, SystemExit) and not error.code:
                 self.end(node.id, "finished")
                 return
@@ -199,6 +207,19 @@ class Host:
         owner = _current_node.get() if context is None else context.get(_current_node)
         self._tasks[task] = owner
         return task
+
+
+def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
+    """Where a suspended task stands, from its outermost coroutine inwards."""
+    coroutine: Any = task.get_coro()
+    while (frame := getattr(coroutine, "cr_frame", None)) is not None:
+        yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
+        coroutine = coroutine.cr_await
+
+
+def _owner(handle: asyncio.Handle) -> str | None:
+    """The node on whose behalf a callback is scheduled."""
+    return handle._context.get(_current_node)  # type: ignore[attr-defined, no-any-return]
 
 
 async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:

@@ -84,6 +84,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def _count_round(self) -> None:
         self._rounds += 1
         if self._rounds > self._spin_limit:
+            self._rounds = 0
             raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
 
     def _next_timer_ns(self) -> int | None:

@@ -231,7 +231,7 @@ def decode_observation(data: bytes) -> dict[str, Any]:
 def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
     try:
         return decoder.decode(data)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise WireError(f"{len(data)} bytes that are no message: {error}") from None
 
 
