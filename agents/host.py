@@ -363,4 +363,5 @@ class _RealTimeAgent:
         """A sign of life once a second, also from programs that never send."""
         while True:
             await asyncio.sleep(1.0)
-            self._flush()
+            if self._started:
+                self._flush()

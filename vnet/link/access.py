@@ -204,7 +204,8 @@ def _node_rules(run: str, nodes: Sequence[str]) -> list[Rule]:
         _rule(f"{lead}-token", ["ingress"], ["liveliness_token"], alive),
         _rule(f"{lead}-subscribe", ["ingress"], SUBSCRIBE, rx),
         _rule(f"{lead}-receive", ["egress"], ["put"], rx),
-        _rule(f"{lead}-matching", ["egress"], SUBSCRIBE, report),
+        # That the emulator and observers listen (they do so to all nodes at once) is what opens a publisher.
+        _rule(f"{lead}-matching", ["egress"], SUBSCRIBE, [keys.node_tx(run, "*"), keys.node_report(run, "*")]),
         _rule(f"{lead}-watch", ["ingress"], WATCH_TOKENS, emulator),
         _rule(f"{lead}-watched", ["egress"], ["liveliness_token"], emulator),
     ]
