@@ -27,9 +27,7 @@ def agent(
     credentials: Annotated[
         Path | None, typer.Option(help="Credentials file of this process's user, as vnet access writes it.")
     ] = None,
-    join_timeout_s: Annotated[
-        float, typer.Option(help="How long to wait for the emulator's welcome.")
-    ] = 60.0,
+    join_timeout_s: Annotated[float, typer.Option(help="How long to wait for the emulator's welcome.")] = 60.0,
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     faulthandler.register(signal.SIGUSR1)

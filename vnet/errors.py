@@ -25,9 +25,7 @@ class PayloadTooLargeError(VnetError):
     """A broadcast above the radio's limit."""
 
     def __init__(self, size_bytes: int, max_payload_bytes: int) -> None:
-        super().__init__(
-            f"payload of {size_bytes} bytes exceeds radio.max_payload_bytes = {max_payload_bytes}"
-        )
+        super().__init__(f"payload of {size_bytes} bytes exceeds radio.max_payload_bytes = {max_payload_bytes}")
         self.size_bytes = size_bytes
         self.max_payload_bytes = max_payload_bytes
 

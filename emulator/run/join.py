@@ -94,6 +94,5 @@ class Membership:
 def split_into_processes(node_ids: Sequence[str], nodes_per_process: int) -> list[list[str]]:
     """Consecutive nodes, `nodes_per_process` at a time: how the launcher and access rules group them."""
     return [
-        list(node_ids[start : start + nodes_per_process])
-        for start in range(0, len(node_ids), nodes_per_process)
+        list(node_ids[start : start + nodes_per_process]) for start in range(0, len(node_ids), nodes_per_process)
     ]

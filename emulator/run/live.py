@@ -152,9 +152,7 @@ class LiveRun:
         }
         liveliness = session.liveliness()
         stack.enter_context(session.declare_subscriber(keys.node_tx(name, "*"), self._on_tx))
-        stack.enter_context(
-            liveliness.declare_subscriber(keys.node_alive(name, "*"), self._on_alive, history=True)
-        )
+        stack.enter_context(liveliness.declare_subscriber(keys.node_alive(name, "*"), self._on_alive, history=True))
         stack.enter_context(liveliness.declare_token(keys.emulator_alive(name)))
 
     # Zenoh's threads: append, and wake the loop once.

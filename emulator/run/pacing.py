@@ -33,9 +33,7 @@ class _Process:
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
         self.traffic: wire.Traffic | None = None
-        self.packets: dict[str, deque[wire.WirePacket]] = {
-            node: deque(maxlen=INBOX_LIMIT) for node in self.nodes
-        }
+        self.packets: dict[str, deque[wire.WirePacket]] = {node: deque(maxlen=INBOX_LIMIT) for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
 
     def take_packets(self) -> list[wire.WirePacket]:
@@ -85,9 +83,7 @@ class Lockstep:
     def step(self) -> dict[str, wire.Grant]:
         """Do what was yielded, go to the next instant, and say who is granted it; none at the end."""
         assert not self.owed, self.owed
-        self._emulation.take(
-            self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None]
-        )
+        self._emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
         for process in self._processes.values():
             process.traffic = None
         wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
@@ -256,9 +252,7 @@ class RealTime:
             self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
-            self._emulation.folder.event(
-                self._emulation.duration_ns, "late_deliveries", **lateness_figures(counts)
-            )
+            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", **lateness_figures(counts))
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, float]:

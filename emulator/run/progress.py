@@ -75,7 +75,5 @@ def _figures(view: PeriodView) -> str:
     delivered = view.counts.get("delivered", 0)
     rmse_m = view.figures.common_error_rmse_m
     rmse = "" if rmse_m is None else f"RMSE {rmse_m:.2f} m  "
-    lost = sum(
-        count for name, count in view.counts.items() if name not in ("delivered", "out_of_range", "pending")
-    )
+    lost = sum(count for name, count in view.counts.items() if name not in ("delivered", "out_of_range", "pending"))
     return f"{rmse}delivered {delivered:,}  not {lost:,}"

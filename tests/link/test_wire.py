@@ -38,9 +38,7 @@ traffic = st.builds(
     st.lists(endings, max_size=2),
 )
 agent_messages = st.one_of(
-    st.builds(
-        wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names
-    ),
+    st.builds(wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names),
     st.builds(wire.Yield, st.binary(), times, st.none() | times, st.lists(names), st.lists(names), traffic),
     st.builds(
         wire.Frames,
@@ -56,9 +54,7 @@ agent_messages = st.one_of(
 )
 emulator_messages = st.one_of(
     st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3)),
-    st.builds(
-        wire.Batch, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), st.none() | times
-    ),
+    st.builds(wire.Batch, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), st.none() | times),
     st.just(wire.Where()),
     st.builds(wire.End, st.none() | st.binary(), names, st.booleans()),
 )

@@ -146,9 +146,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 class _YieldingSelector(selectors.DefaultSelector):
     """The real selector for the loop's own self-pipe, with the waiting handed to `wait`."""
 
-    def __init__(
-        self, wait: Callable[[float | None, Callable[[float | None], list[Any]]], list[Any]]
-    ) -> None:
+    def __init__(self, wait: Callable[[float | None, Callable[[float | None], list[Any]]], list[Any]]) -> None:
         super().__init__()
         self._wait = wait
 

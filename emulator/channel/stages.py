@@ -1,0 +1,209 @@
+"""The stages of the channel: small objects with one method over all receivers of a frame.
+
+Stages run in the order of the chain; each looks only at the pairs that are still pending, and the first that
+decides a pair has decided it. Whatever is random comes from `Draws`, indexed by receiver number. No stage needs
+state of two receivers, so that the engine can be split by receiver; the transmit queue has state of one sender.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.channel.draws import Draws
+from emulator.channel.outcomes import Outcome
+from vnet.scenario import Radio
+
+NS_PER_MS = 1_000_000
+MIN_LATENCY_NS = 1_000
+"""No exchange without time passing: every pair's latency is at least a microsecond."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One broadcast as the channel sees it; `sender` is a receiver number, `seq` counts the sender's frames."""
+
+    sender: int
+    seq: int
+    sent_ns: int
+    size_bytes: int
+
+
+@dataclass(slots=True)
+class Pairs:
+    """The pairs of one frame with every receiver: arrays indexed by receiver number.
+
+    `outcome` (N,) of `Outcome`; `arrival_ns` (N,) is when the frame arrives where it does; `cause` names the
+    fault behind an outcome `fault`.
+    """
+
+    outcome: NDArray[np.uint8]
+    arrival_ns: NDArray[np.int64]
+    cause: str = ""
+
+    def decide(self, which: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
+        """Give `outcome` to those of `which` that are still pending."""
+        self.outcome[(self.outcome == Outcome.pending) & which] = outcome
+
+
+class Stage(Protocol):
+    """One step of the channel."""
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide pairs, or change when they arrive."""
+        ...
+
+
+class Topology:
+    """Who is in range of whom, and whom each receiver's peer cap admits; rows are senders.
+
+    Recomputed only when vehicles move or go up or down. Positions are (N, 2) in metres.
+    """
+
+    def __init__(self, position_m: NDArray[np.float64], range_m: float, max_peers: int) -> None:
+        self._range_m = range_m
+        self._max_peers = max_peers
+        self._up = np.ones(len(position_m), dtype=bool)
+        self.move(position_m)
+
+    def move(self, position_m: NDArray[np.float64]) -> None:
+        """Take new positions."""
+        offset_m = position_m[:, None, :] - position_m[None, :, :]
+        self._distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
+        self.in_range = self._distance_m <= self._range_m
+        np.fill_diagonal(self.in_range, False)
+        self._rank()
+
+    def set_up(self, node: int, up: bool) -> None:
+        """A node that is down is nobody's peer."""
+        self._up[node] = up
+        self._rank()
+
+    def is_up(self, node: int) -> bool:
+        """Whether a node is up."""
+        return bool(self._up[node])
+
+    def _rank(self) -> None:
+        """`admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
+        candidate = self.in_range & self._up[:, None]
+        distance_m = np.where(candidate, self._distance_m, np.inf)
+        order = np.argsort(distance_m, axis=0, kind="stable")  # ties go to the lower number
+        rank = np.empty_like(order)
+        np.put_along_axis(rank, order, np.arange(len(order))[:, None], axis=0)
+        self.admitted = candidate & (rank < self._max_peers)
+
+
+class DiscRange:
+    """Everybody within `radio.range_m` hears, nobody else."""
+
+    def __init__(self, topology: Topology) -> None:
+        self._topology = topology
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide `out_of_range`."""
+        pairs.decide(~self._topology.in_range[frame.sender], Outcome.out_of_range)
+
+
+class PayloadLimit:
+    """A frame above `radio.max_payload_bytes` reaches nobody."""
+
+    def __init__(self, max_payload_bytes: int) -> None:
+        self._max_payload_bytes = max_payload_bytes
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide `oversize`."""
+        if frame.size_bytes > self._max_payload_bytes:
+            pairs.decide(True, Outcome.oversize)
+
+
+class TransmitQueue:
+    """The sender's own queue: random access delay, airtime at `radio.bitrate_mbps`, at most `queue_frames` waiting.
+
+    Sets the arrival to the end of the transmission.
+    """
+
+    def __init__(self, seed: int, radio: Radio) -> None:
+        self._draws = Draws(seed, "access")
+        self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
+        self._ns_per_byte = 8_000 / radio.bitrate_mbps
+        self._max_payload_bytes = radio.max_payload_bytes
+        self._limit = radio.queue_frames
+        self._starts_ns: dict[int, deque[int]] = {}
+        self._busy_until_ns: dict[int, int] = {}
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide `queue_full`, or when the frame has left the sender."""
+        if frame.size_bytes > self._max_payload_bytes:  # never got as far as the queue
+            return
+        waiting = self._starts_ns.setdefault(frame.sender, deque())
+        while waiting and waiting[0] <= frame.sent_ns:
+            waiting.popleft()
+        if len(waiting) >= self._limit:
+            pairs.decide(True, Outcome.queue_full)
+            return
+        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1)[0])
+        start_ns = max(frame.sent_ns + jitter_ns, self._busy_until_ns.get(frame.sender, 0))
+        end_ns = start_ns + round(frame.size_bytes * self._ns_per_byte)
+        waiting.append(start_ns)
+        self._busy_until_ns[frame.sender] = end_ns
+        pairs.arrival_ns[:] = end_ns
+
+
+class PeerCap:
+    """Each receiver hears its nearest `radio.max_peers` live senders in range, ties by number."""
+
+    def __init__(self, topology: Topology) -> None:
+        self._topology = topology
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide `peer_cap`."""
+        pairs.decide(~self._topology.admitted[frame.sender], Outcome.peer_cap)
+
+
+class Loss:
+    """Every pair is lost independently with probability `radio.loss`."""
+
+    def __init__(self, seed: int, loss: float) -> None:
+        self._draws = Draws(seed, "loss")
+        self._loss = loss
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Decide `lost`."""
+        if self._loss > 0:
+            draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome))
+            pairs.decide(draws < self._loss, Outcome.lost)
+
+
+class Latency:
+    """Propagation and processing: `latency_ms` plus uniform `jitter_ms`, rounded up to the delivery tick."""
+
+    def __init__(self, seed: int, radio: Radio) -> None:
+        self._draws = Draws(seed, "latency")
+        self._latency_ns = radio.latency_ms * NS_PER_MS
+        self._jitter_ns = radio.jitter_ms * NS_PER_MS
+        self._tick_ns = radio.delivery_tick_us * 1_000
+
+    def apply(self, frame: Frame, pairs: Pairs) -> None:
+        """Set when each pair arrives."""
+        draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome))
+        latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
+        arrival_ns = pairs.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
+        if self._tick_ns:
+            arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
+        pairs.arrival_ns = arrival_ns
+
+
+def default_chain(radio: Radio, seed: int, topology: Topology) -> list[Stage]:
+    """The paper's radio, as DESIGN 5 has it."""
+    return [
+        DiscRange(topology),
+        PayloadLimit(radio.max_payload_bytes),
+        TransmitQueue(seed, radio),
+        PeerCap(topology),
+        Loss(seed, radio.loss),
+        Latency(seed, radio),
+    ]

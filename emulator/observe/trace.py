@@ -1,0 +1,165 @@
+"""The trace of a run: one row per frame and receiver in range, and its hash.
+
+Rows are appended as frames are sent and completed when they arrive. The hash is over the content in canonical
+order, so that neither the order of appending nor the file format can change it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from emulator.channel.outcomes import Outcome
+
+NOT_ARRIVING = -1
+
+_ROW = np.dtype(
+    [
+        ("sent_ns", "<i8"),
+        ("sender", "<i4"),
+        ("seq", "<i8"),
+        ("receiver", "<i4"),
+        ("size_bytes", "<i4"),
+        ("payload_digest", "<u8"),
+        ("outcome", "u1"),
+        ("cause", "<i2"),
+        ("arrival_ns", "<i8"),
+        ("copy", "<i2"),
+    ]
+)
+_PLAIN = ("sent_ns", "seq", "size_bytes", "payload_digest", "arrival_ns", "copy")
+_NAMED = ("sender", "receiver", "outcome", "cause")
+
+
+class Trace:
+    """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`."""
+
+    def __init__(self, node_ids: Sequence[str]) -> None:
+        self._node_ids = list(node_ids)
+        self._causes = [""]
+        self._rows = np.zeros(4096, dtype=_ROW)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def append(
+        self,
+        sent_ns: int,
+        sender: int,
+        seq: int,
+        receivers: NDArray[np.intp],
+        size_bytes: int,
+        payload_digest: int,
+        outcome: NDArray[np.uint8],
+        arrival_ns: NDArray[np.int64],
+        cause: str = "",
+        copy: int = 0,
+    ) -> int:
+        """Add the rows of one frame, one a receiver; returns the number of the first."""
+        first, end = self._count, self._count + len(receivers)
+        if end > len(self._rows):
+            grown = np.zeros(max(2 * len(self._rows), end), dtype=_ROW)
+            grown[:first] = self._rows[:first]
+            self._rows = grown
+        rows = self._rows[first:end]
+        rows["sent_ns"] = sent_ns
+        rows["sender"] = sender
+        rows["seq"] = seq
+        rows["receiver"] = receivers
+        rows["size_bytes"] = size_bytes
+        rows["payload_digest"] = payload_digest
+        rows["outcome"] = outcome
+        rows["cause"] = self._cause_number(cause)
+        rows["arrival_ns"] = np.where(outcome == Outcome.pending, arrival_ns, NOT_ARRIVING)
+        rows["copy"] = copy
+        self._count = end
+        return first
+
+    def _cause_number(self, cause: str) -> int:
+        if cause not in self._causes:
+            self._causes.append(cause)
+        return self._causes.index(cause)
+
+    def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
+        """Give rows their outcome."""
+        self._rows["outcome"][rows] = outcome
+
+    def to_table(self) -> pa.Table:
+        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy)."""
+        rows = self._rows[: self._count]
+        order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
+        rows = rows[order]
+        outcome_names = [outcome.name for outcome in Outcome]
+
+        def named(column: str, names: Sequence[str]) -> pa.DictionaryArray:
+            return pa.DictionaryArray.from_arrays(
+                pa.array(rows[column].astype(np.int32)), pa.array(list(names), pa.string())
+            )
+
+        arrival = pa.array(rows["arrival_ns"], mask=rows["arrival_ns"] == NOT_ARRIVING)
+        return pa.table(
+            {
+                "sent_ns": pa.array(rows["sent_ns"]),
+                "sender": named("sender", self._node_ids),
+                "seq": pa.array(rows["seq"]),
+                "receiver": named("receiver", self._node_ids),
+                "size_bytes": pa.array(rows["size_bytes"]),
+                "payload_digest": pa.array(rows["payload_digest"]),
+                "outcome": named("outcome", outcome_names),
+                "cause": named("cause", self._causes).cast(pa.string()),
+                "arrival_ns": arrival,
+                "copy": pa.array(rows["copy"]),
+            }
+        )
+
+    def sha256(self) -> str:
+        """The hash of the content; see `sha256_of_table`."""
+        return sha256_of_table(self.to_table())
+
+    def write(self, path: Path) -> None:
+        """Write the trace as Parquet. Raises OSError."""
+        pq.write_table(self.to_table(), path, compression="zstd")
+
+
+def read_trace(path: Path) -> pa.Table:
+    """A trace as `Trace.write` wrote it. Raises OSError."""
+    return pq.read_table(path)
+
+
+def sha256_of_table(table: pa.Table) -> str:
+    """SHA-256 over a trace's content, in the order of its rows, independent of how it was stored."""
+    digest = hashlib.sha256()
+    for column in table.column_names:
+        array = table.column(column).combine_chunks()
+        if column in _NAMED:
+            codes, names = _canonical_codes(array)
+            digest.update(json.dumps([column, names]).encode())
+        else:
+            filled = pc.fill_null(array, NOT_ARRIVING) if column == "arrival_ns" else array
+            codes = filled.to_numpy(zero_copy_only=False)
+            digest.update(json.dumps([column]).encode())
+        digest.update(np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder("<")).tobytes())
+    return digest.hexdigest()
+
+
+def _canonical_codes(array: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
+    """Names as codes into the sorted list of those that occur."""
+    if not pa.types.is_dictionary(array.type):
+        array = array.dictionary_encode()
+    values = array.dictionary.to_pylist()
+    indices = array.indices.to_numpy(zero_copy_only=False)
+    used = np.unique(indices)
+    names = sorted(values[i] for i in used)
+    code = np.full(len(values), -1, dtype=np.int32)
+    for number in used:
+        code[number] = names.index(values[number])
+    return code[indices], names
