@@ -46,13 +46,14 @@ class Network(Section):
 
     `file` reads `path` (columns id, x_m, y_m, heading_rad; relative to the scenario file). `generated` draws
     `vehicles` of them: `layout = "urban"` has the degree histogram and components of the published networks,
-    `layout = "dense"` packs them so that degrees exceed 30.
+    `layout = "dense"` packs them so that degrees exceed 30. `seed` draws the network, and not the run.
     """
 
     kind: Literal["generated", "file"] = "generated"
     path: Path | None = None
     vehicles: int = Field(38, ge=1, le=10_000)
     layout: Literal["urban", "dense"] = "urban"
+    seed: int = Field(1, ge=0, lt=2**63)
 
     @model_validator(mode="after")
     def _path_goes_with_file(self) -> Network:

@@ -1,0 +1,203 @@
+"""Networks: which vehicles there are, and on which lanes; read from CSV or generated.
+
+The generated ones have the character of the three networks of the paper (Ann Arbor, zhao-lab/network-propagation,
+MIT): their sorted degrees at 3 km range and the sizes of their components are the targets below. Positions are
+drawn and then annealed until the degrees fit; nothing of the published positions is used.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from vnet.errors import ScenarioError
+from vnet.link.keys import is_segment
+from vnet.roads.lanes import Array
+
+COLUMNS = ("id", "x_m", "y_m", "heading_rad")
+REFERENCE_RANGE_M = 3000.0
+
+# Sorted degrees of the published networks at 3 km, as (degree, how many vehicles have it).
+_DEGREES = {
+    50: "2:2 3:1 4:2 5:1 7:3 8:1 9:2 10:4 11:4 12:4 13:3 14:2 15:3 16:6 17:3 18:5 20:1 21:2 22:1",
+    38: "2:2 3:2 4:2 5:3 6:3 7:7 8:2 9:6 10:8 12:3",
+    24: "2:8 3:5 4:2 5:2 7:4 8:2 9:1",
+}
+_COMPONENTS = {50: (50,), 38: (38,), 24: (15, 6, 3)}
+
+# Headings: a grid town. Shares of all vehicles that drive within 4° of an axis; the others go anywhere.
+_AXIS_SHARES = {0.0: 0.24, math.pi / 2: 0.08, math.pi: 0.16, 3 * math.pi / 2: 0.04}
+_AXIS_SPREAD_RAD = math.radians(2.0)
+
+TOWN_SIDE_M = 10_500.0
+"""Side of the square that holds 50 vehicles; others in proportion to their number."""
+_ANNEALING_MOVES = 20_000
+_LARGEST_ANNEALED = 200
+
+
+@dataclass(frozen=True)
+class Network:
+    """Vehicles and their lanes: `position_m` (N, 2) on the centre line, `heading_rad` (N,) in [0, 2π)."""
+
+    node_ids: tuple[str, ...]
+    position_m: Array
+    heading_rad: Array
+
+
+def load_network(path: Path) -> Network:
+    """Read a CSV with the columns id, x_m, y_m, heading_rad. Raises ScenarioError that names the line."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+            if missing:
+                raise ScenarioError(f"{path}: no column {missing[0]!r}; needed are {', '.join(COLUMNS)}")
+            rows = [_read_row(path, reader.line_num, row) for row in reader]
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ScenarioError(f"{path}: not a CSV file: {error}") from None
+    if not rows:
+        raise ScenarioError(f"{path}: no vehicles; at least one row is needed")
+    ids = tuple(name for name, _ in rows)
+    for line, name in enumerate(ids, start=2):
+        if name in ids[: line - 2]:
+            raise ScenarioError(f"{path}: line {line}: id = {name!r} appears twice; ids must differ")
+    numbers = np.array([values for _, values in rows])
+    return Network(ids, numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi))
+
+
+def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, tuple[float, float, float]]:
+    name = (row["id"] or "").strip()
+    if not is_segment(name):
+        raise ScenarioError(f"{path}: line {line}: id = {name!r}: letters, digits, '_', '.', '-', at most 64")
+    values = []
+    for column in COLUMNS[1:]:
+        try:
+            value = float(row[column] or "")
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ScenarioError(f"{path}: line {line}: {column} = {row[column]!r}: a finite number is needed")
+        values.append(value)
+    return name, (values[0], values[1], values[2])
+
+
+def generate_network(layout: str, vehicles: int, seed: int) -> Network:
+    """Draw a network of `vehicles`; the same arguments give the same network.
+
+    `urban` has the degrees and components of the published networks for 50, 38 and 24 vehicles, and of the
+    nearest of them, scaled, for other counts. `dense` is a city centre in which everybody is in range of most.
+    """
+    rng = np.random.Generator(np.random.Philox(key=np.array([seed, 0x6E6574], dtype=np.uint64)))
+    width = max(2, len(str(vehicles)))
+    node_ids = tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
+    heading_rad = _draw_headings(rng, vehicles)
+    if layout == "dense":
+        return Network(node_ids, rng.uniform(0, 1.4 * REFERENCE_RANGE_M, (vehicles, 2)), heading_rad)
+    if 1 < vehicles <= _LARGEST_ANNEALED:
+        return Network(node_ids, _Town(rng, vehicles).anneal(), heading_rad)
+    side_m = TOWN_SIDE_M * math.sqrt(vehicles / 50)
+    return Network(node_ids, rng.uniform(0, side_m, (vehicles, 2)), heading_rad)
+
+
+def _draw_headings(rng: np.random.Generator, vehicles: int) -> Array:
+    axes = np.array([*_AXIS_SHARES, np.nan])
+    shares = np.array([*_AXIS_SHARES.values()])
+    axis = rng.choice(axes, size=vehicles, p=[*shares, 1 - shares.sum()])
+    along = axis + rng.normal(0, _AXIS_SPREAD_RAD, vehicles)
+    anywhere = rng.uniform(0, 2 * np.pi, vehicles)
+    return np.asarray(np.mod(np.where(np.isnan(axis), anywhere, along), 2 * np.pi))
+
+
+def _target_degrees(vehicles: int) -> NDArray[np.intp]:
+    """Sorted degrees to aim at: published ones, or the quantiles of the nearest connected published network."""
+    connected = [count for count, sizes in _COMPONENTS.items() if len(sizes) == 1 or count == vehicles]
+    nearest = min(connected, key=lambda count: (abs(count - vehicles), count))
+    pairs = [entry.split(":") for entry in _DEGREES[nearest].split()]
+    published = np.concatenate([np.full(int(count), int(degree)) for degree, count in pairs])
+    if vehicles == nearest:
+        return published
+    quantiles = np.interp(np.linspace(0, 1, vehicles), np.linspace(0, 1, nearest), published)
+    scale = min(1.0, math.sqrt(vehicles / nearest))
+    degrees: NDArray[np.intp] = np.clip(np.round(quantiles * scale), 1, vehicles - 1).astype(np.intp)
+    return degrees
+
+
+class _Town:
+    """Positions under annealing: districts, one a component, that lie further apart than the range.
+
+    Vehicles move within their district. The cost is the L1 distance between the sorted degrees and the target,
+    and `SPLIT_COST` where a district falls apart.
+    """
+
+    SPLIT_COST = 8.0
+
+    def __init__(self, rng: np.random.Generator, vehicles: int) -> None:
+        self._rng = rng
+        self._target = _target_degrees(vehicles)
+        self._components = _COMPONENTS.get(vehicles, (vehicles,))
+        district = np.repeat(np.arange(len(self._components)), self._components)
+        side_m = TOWN_SIDE_M * np.sqrt(np.array(self._components) / 50)
+        left_m = np.concatenate([[0.0], np.cumsum(side_m[:-1] + 1.1 * REFERENCE_RANGE_M)])
+        self._low_m = np.column_stack([left_m, np.zeros(len(side_m))])[district]
+        self._high_m = self._low_m + side_m[district, None]
+        middle_m = (self._low_m + self._high_m) / 2
+        drawn = rng.normal(middle_m, (self._high_m - self._low_m) / 4)
+        self.position_m = np.clip(drawn, self._low_m, self._high_m)
+        offset = self.position_m[:, None] - self.position_m[None]
+        self.linked = np.hypot(offset[..., 0], offset[..., 1]) <= REFERENCE_RANGE_M
+        np.fill_diagonal(self.linked, False)
+        self._degree = self.linked.sum(axis=0)
+        self.cost = self._cost(self._degree)
+
+    def _cost(self, degree: NDArray[np.intp]) -> float:
+        cost = float(np.abs(np.sort(degree) - self._target).sum())
+        if cost <= self.SPLIT_COST and self._is_split():
+            return cost + self.SPLIT_COST
+        return cost
+
+    def _is_split(self) -> bool:
+        _, label = connected_components(self.linked, directed=False)
+        return sorted(np.bincount(label).tolist()) != sorted(self._components)
+
+    def anneal(self) -> Array:
+        """Move vehicles one at a time, by the rule of Metropolis, until the cost is 0; returns the best."""
+        best_m, best_cost = self.position_m.copy(), self.cost
+        for move in range(_ANNEALING_MOVES):
+            if best_cost == self._target.sum() % 2:  # degrees add up to an even number
+                break
+            temperature = 1.5 * (1 - move / _ANNEALING_MOVES) ** 2
+            self._try_move(temperature)
+            if self.cost < best_cost:
+                best_m, best_cost = self.position_m.copy(), self.cost
+        return best_m
+
+    def _try_move(self, temperature: float) -> None:
+        rng = self._rng
+        vehicle = int(rng.integers(len(self.position_m)))
+        step_m = REFERENCE_RANGE_M * (0.1, 0.4, 1.2)[int(rng.integers(3))]
+        new_m = self.position_m[vehicle] + step_m * rng.normal(size=2)
+        luck = rng.random()
+        if np.any(new_m < self._low_m[vehicle]) or np.any(new_m > self._high_m[vehicle]):
+            return
+        old_m, old_links = self.position_m[vehicle].copy(), self.linked[vehicle].copy()
+        offset = self.position_m - new_m
+        links = np.einsum("ij,ij->i", offset, offset) <= REFERENCE_RANGE_M**2
+        links[vehicle] = False
+        degree = self._degree + links - old_links.astype(np.intp)
+        degree[vehicle] = links.sum()
+        self.position_m[vehicle] = new_m
+        self.linked[vehicle] = self.linked[:, vehicle] = links
+        cost = self._cost(degree)
+        if cost > self.cost and luck >= math.exp((self.cost - cost) / max(temperature, 1e-9)):
+            self.position_m[vehicle] = old_m
+            self.linked[vehicle] = self.linked[:, vehicle] = old_links
+        else:
+            self.cost, self._degree = cost, degree
