@@ -13,6 +13,7 @@ import typer
 from agents.host import run_agent
 from vnet.errors import ProgramError, VnetError
 from vnet.link.access import Credentials
+from vnet.link.hosting import fix_hash_seed
 from vnet.link.keys import is_segment
 from vnet.link.session import quiet_zenoh
 
@@ -49,6 +50,7 @@ def agent(
 
 def main() -> None:
     """The console script."""
+    fix_hash_seed("agents.cli")
     app()
 
 

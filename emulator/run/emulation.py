@@ -7,12 +7,13 @@ everything that must be the same in both happens here.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from emulator.engine import Delivery, Engine
 from emulator.observe.metrics import Metrics, PeriodFigures
+from emulator.observe.observation import period_message
 from emulator.observe.run_folder import RunFolder
 from emulator.world.world import Instant, World, components
 from vnet.link import wire
@@ -29,6 +30,10 @@ class PeriodView:
     figures: PeriodFigures
     counts: dict[str, int]
     deliveries: list[Delivery]
+
+    def message(self, node_ids: Sequence[str]) -> dict[str, Any]:
+        """The period as observers are told it."""
+        return period_message(node_ids, self.instant, self.reports, self.figures, self.counts, self.deliveries)
 
 
 class Emulation:

@@ -18,7 +18,7 @@ from typing import Any
 
 import zenoh
 
-from emulator.observe.observation import period_message, scene_message
+from emulator.observe.observation import scene_message
 from emulator.run.emulation import Emulation, PeriodView
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
@@ -79,11 +79,10 @@ async def run_live(
     emulation: Emulation,
     options: LiveOptions,
     on_state: Callable[[str], None] = lambda text: None,
-) -> float:
-    """Run `emulation` to its end over Zenoh; returns the wall-clock seconds from time 0 to the end.
+) -> tuple[float, bool]:
+    """Run `emulation` to its end over Zenoh; returns the wall-clock seconds, and whether it was interrupted.
 
-    Raises VnetError if the run cannot start, and asyncio.CancelledError (after a clean end, with the event
-    `interrupted`) if it was interrupted.
+    Ctrl-C and SIGTERM end the run early, with the event `interrupted`. Raises VnetError if it cannot start.
     """
     realtime = emulation.scenario.run.pacing == "realtime"
     lease_ms = REALTIME_LEASE_MS if realtime else LEASE_MS
@@ -266,12 +265,13 @@ class LiveRun:
 
     # The course of a run.
 
-    async def run(self, endpoint: str, on_state: Callable[[str], None]) -> float:
-        """Join, run, end. Returns the wall-clock seconds between time 0 and the end."""
+    async def run(self, endpoint: str, on_state: Callable[[str], None]) -> tuple[float, bool]:
+        """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
         self._loop.add_signal_handler(signal.SIGCHLD, self._children_ended)
         folder = self._emulation.folder
         started = time.monotonic()
         patience_s = 0.5
+        interrupted = False
         try:
             await self._join(endpoint, on_state)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
@@ -282,16 +282,16 @@ class LiveRun:
         except Stalled:
             self._emulation.finish(self._time_ns())
         except asyncio.CancelledError:
+            interrupted = True
             folder.event(self._time_ns(), "interrupted")
             self._emulation.finish(self._time_ns())
-            raise
         finally:
             wall_s = time.monotonic() - started
             await self._farewell(patience_s)
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
             self._loop.remove_signal_handler(signal.SIGCHLD)
-        return wall_s
+        return wall_s, interrupted
 
     async def _join(self, endpoint: str, on_state: Callable[[str], None]) -> None:
         """Start what is to be started and wait until every node is ready."""
@@ -422,4 +422,4 @@ class LiveRun:
             return
         if view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
             self._publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
-        self._publish("period", period_message(view))
+        self._publish("period", view.message(self._emulation.world.node_ids))

@@ -252,10 +252,12 @@ class RealTime:
             self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
-            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", **lateness_figures(counts))
+            self._emulation.folder.event(
+                self._emulation.duration_ns, "late_deliveries", None, **lateness_figures(counts)
+            )
 
 
-def lateness_figures(counts: Sequence[int]) -> dict[str, float]:
+def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
     """Figures of a lateness histogram: deliveries, how many over the limit, percentiles in ms."""
     total = sum(counts)
     limit_bin = wire.lateness_bin(wire.LATENESS_LIMIT_NS)

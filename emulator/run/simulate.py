@@ -22,23 +22,23 @@ class _RunOverError(Exception):
     """The barrier has granted nothing more."""
 
 
-def simulate(emulation: Emulation) -> float:
-    """Run `emulation` to its end in this process; returns the wall-clock seconds it took.
+def simulate(emulation: Emulation) -> tuple[float, bool]:
+    """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
-    Raises ProgramError if the program cannot be loaded, and KeyboardInterrupt (with the event `interrupted`
-    recorded) when interrupted.
+    Ctrl-C ends the run early, with the event `interrupted`. Raises ProgramError if the program cannot be loaded.
     """
     program = load_program(emulation.scenario.program.entry)
     simulation = _Simulation(emulation)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
+    interrupted = False
     try:
         simulation.run(program)
     except KeyboardInterrupt:
+        interrupted = True
         emulation.folder.event(simulation.loop.now_ns, "interrupted")
         emulation.finish(simulation.loop.now_ns)
-        raise
-    return time.monotonic() - started
+    return time.monotonic() - started, interrupted
 
 
 class _Simulation:

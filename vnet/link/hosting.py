@@ -10,6 +10,8 @@ import asyncio
 import contextlib
 import contextvars
 import importlib
+import os
+import sys
 import traceback
 import weakref
 from collections import deque
@@ -40,6 +42,16 @@ def load_program(entry: str) -> Program:
     if not asyncio.iscoroutinefunction(program):
         raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
     return program  # type: ignore[no-any-return]
+
+
+def fix_hash_seed(module: str) -> None:
+    """Start this command (`python -m module`) again with a fixed hash seed, unless it has one.
+
+    Programs that iterate over sets of strings must come out the same in every process and every run.
+    """
+    if os.environ.get("PYTHONHASHSEED") != "0":
+        arguments = [sys.executable, "-P", "-m", module, *sys.argv[1:]]
+        os.execve(sys.executable, arguments, {**os.environ, "PYTHONHASHSEED": "0"})
 
 
 class Host:

@@ -1,0 +1,273 @@
+"""`vnet`: run, simulate, emulator, access, check, record.
+
+Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from emulator.observe.checks import check_run
+from emulator.observe.observation import scene_message
+from emulator.observe.run_folder import RunFolder
+from emulator.observe.summary import print_checks, print_summary
+from emulator.run.conclude import conclude
+from emulator.run.emulation import Emulation
+from emulator.run.join import split_into_processes
+from emulator.run.live import LiveOptions, run_live
+from emulator.run.progress import ProgressLine
+from emulator.run.simulate import simulate as run_simulation
+from emulator.world.world import World, build_world
+from vnet.errors import LinkError, VnetError
+from vnet.link.access import Access, Credentials
+from vnet.link.hosting import fix_hash_seed
+from vnet.link.session import quiet_zenoh
+from vnet.scenario import Scenario, load_scenario
+
+app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    no_args_is_help=True,
+    help="An asyncio message-passing emulator for connected vehicles over Zenoh.",
+)
+
+
+class Pacing(StrEnum):
+    """The pacings of a run."""
+
+    LOCKSTEP = "lockstep"
+    REALTIME = "realtime"
+
+
+class Rerun(StrEnum):
+    """What is done for the Rerun viewer."""
+
+    OFF = "off"
+    SAVE = "save"
+
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+
+ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
+ProgramOption = Annotated[str | None, typer.Option(help="What every vehicle runs, as package.module:function.")]
+PacingOption = Annotated[Pacing | None, typer.Option(help="Virtual time, or the wall clock.")]
+SeedOption = Annotated[int | None, typer.Option(help="Same seed, same run.")]
+DurationOption = Annotated[float | None, typer.Option(help="Emulated seconds.")]
+OutOption = Annotated[Path | None, typer.Option(help="Folder for the run's files; the default is runs/NAME-SEED.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scenario key.")
+]
+RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
+
+
+@app.command()
+def run(
+    scenario: ScenarioArgument,
+    program: ProgramOption = None,
+    pacing: PacingOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = Rerun.OFF,
+) -> None:
+    """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
+    with _one_line_errors():
+        loaded = _load(scenario, overrides, program, pacing, seed, duration)
+        world = build_world(loaded)
+        options = LiveOptions(_create_access(loaded, world))
+        _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options)
+
+
+@app.command()
+def simulate(
+    scenario: ScenarioArgument,
+    program: ProgramOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = Rerun.OFF,
+) -> None:
+    """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
+    fix_hash_seed("emulator.cli")
+    with _one_line_errors():
+        loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        sys.path.append(str(Path.cwd()))
+        emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
+        with ExitStack() as stack:
+            if rerun is Rerun.SAVE:
+                _record_here(emulation, stack)
+            stack.enter_context(ProgressLine(emulation))
+            wall_s, interrupted = run_simulation(emulation)
+        _finish(emulation, wall_s, interrupted, "simulate")
+
+
+def _record_here(emulation: Emulation, stack: ExitStack) -> None:
+    """Record a simulation from within its own process."""
+    from emulator.observe.recorder import Recorder  # Rerun is slow to import, and only recordings need it
+
+    recorder = stack.enter_context(Recorder(emulation.folder.path / "recording.rrd"))
+    recorder.scene(scene_message(emulation.world, emulation.scenario))
+    emulation.watch(lambda view: recorder.period(view.message(emulation.world.node_ids)))
+
+
+@app.command()
+def emulator(
+    scenario: ScenarioArgument,
+    listen: Annotated[
+        str | None, typer.Option(help="Be the router, and listen at this endpoint (tcp/HOST:PORT).")
+    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Be a client of the zenohd at this endpoint.")] = None,
+    access: Annotated[
+        Path | None,
+        typer.Option(help="Folder written by vnet access; made if it does not exist. Default: OUT/access."),
+    ] = None,
+    program: ProgramOption = None,
+    pacing: PacingOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = Rerun.OFF,
+) -> None:
+    """Run a scenario for agents that are started by hand, here or on other machines."""
+    with _one_line_errors():
+        if listen is not None and connect is not None:
+            raise VnetError("--listen and --connect exclude each other")
+        loaded = _load(scenario, overrides, program, pacing, seed, duration)
+        world = build_world(loaded)
+        folder = RunFolder.create(out, loaded)
+        listen = listen or DEFAULT_LISTEN
+        access = access or folder.path / "access"
+        users = _load_or_create_access(loaded, world, access, listen, connect is not None)
+        print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
+        options = LiveOptions(users, listen, connect, launch=False)
+        _run_live(loaded, world, folder, rerun, options)
+
+
+@app.command("access")
+def write_access(
+    scenario: ScenarioArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("access"),
+    listen: Annotated[str, typer.Option(help="Where the zenohd is to listen.")] = DEFAULT_LISTEN,
+    router_folder: Annotated[
+        Path | None, typer.Option(help="Where the zenohd sees the folder, if elsewhere (a container).")
+    ] = None,
+    overrides: SetOption = None,
+) -> None:
+    """Write a separate zenohd's configuration (zenohd -c OUT/zenohd.json5) and everybody's credentials."""
+    with _one_line_errors():
+        loaded = _load(scenario, overrides)
+        users = _create_access(loaded, build_world(loaded))
+        users.save(out, listen, router_folder or out.resolve())
+        print(f"{len(users.processes)} agent processes, and the emulator, in {out}/credentials")
+        print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
+
+
+@app.command()
+def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]) -> None:
+    """Judge a run again, from its files alone."""
+    with _one_line_errors():
+        judgement = check_run(folder)
+        print_checks(judgement, Console())
+        raise typer.Exit(judgement.exit_status)
+
+
+@app.command()
+def record(
+    connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint.")],
+    run: Annotated[str, typer.Option(help="The name of the run.")],
+    out: Annotated[Path, typer.Option(help="The recording to write.")] = Path("recording.rrd"),
+    credentials: Annotated[Path | None, typer.Option(help="The observer's credentials file.")] = None,
+) -> None:
+    """Watch a run from outside and write a Rerun recording of it."""
+    from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it
+
+    with _one_line_errors():
+        record_run(connect, run, None if credentials is None else Credentials.load(credentials), out)
+
+
+def _load(
+    path: Path,
+    overrides: list[str] | None,
+    program: str | None = None,
+    pacing: Pacing | None = None,
+    seed: int | None = None,
+    duration: float | None = None,
+) -> Scenario:
+    options = {
+        "program.entry": program and f'"{program}"',
+        "run.pacing": pacing and f'"{pacing.value}"',
+        "run.seed": seed,
+        "run.duration_s": duration,
+    }
+    given = [f"{key}={value}" for key, value in options.items() if value is not None]
+    return load_scenario(path, [*(overrides or []), *given])
+
+
+def _create_access(scenario: Scenario, world: World) -> Access:
+    groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
+    return Access.create(scenario.run.name, groups)
+
+
+def _load_or_create_access(scenario: Scenario, world: World, folder: Path, listen: str, separate: bool) -> Access:
+    """The users of a run whose agents are started by hand; written where they are not there yet."""
+    if (folder / "access.json").exists() or separate:
+        access = Access.load(folder)
+        nodes = {node for process in access.processes for node in process}
+        if access.run != scenario.run.name or nodes != set(world.node_ids):
+            raise LinkError(
+                f"access folder {folder} was made for another scenario; write a new one with: vnet access"
+            )
+        return access
+    access = _create_access(scenario, world)
+    access.save(folder, listen, folder.resolve())
+    return access
+
+
+def _run_live(scenario: Scenario, world: World, folder: RunFolder, rerun: Rerun, options: LiveOptions) -> None:
+    """A live run from its folder to its summary; exits with the verdict's status."""
+    quiet_zenoh()
+    emulation = Emulation(scenario, world, folder)
+    if rerun is Rerun.SAVE:
+        options = replace(options, record=folder.path / "recording.rrd")
+    with ProgressLine(emulation) as progress:
+        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
+    _finish(emulation, wall_s, interrupted, "run")
+
+
+def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str) -> None:
+    judgement, verdict = conclude(emulation, wall_s, command)
+    print_summary(judgement, verdict, emulation.folder.path, Console())
+    raise typer.Exit(130 if interrupted else judgement.exit_status)
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """Say what went wrong in one line, and end with status 2."""
+    try:
+        yield
+    except VnetError as error:
+        print(f"vnet: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+
+
+def main() -> None:
+    """The console script."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""The folder of a run: everything that is kept of it, written so that an interruption leaves it readable.
+
+`scenario.toml` first, `events.jsonl` line by line as things happen, tables and `verdict.json` at the end, each
+put in place in one step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vnet.errors import VnetError
+from vnet.scenario import Scenario, dump_scenario
+
+RUNS = Path("runs")
+
+
+@dataclass(frozen=True)
+class Event:
+    """One line of `events.jsonl`: something that happened to a node, or to the run where `node` is None."""
+
+    time_ns: int
+    kind: str
+    node: str | None
+    details: dict[str, Any]
+
+
+class RunFolder:
+    """A run's folder; see the module's text. All methods raise VnetError where the disk does not play along."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.logs = path / "logs"
+        self.events: list[Event] = []
+
+    @classmethod
+    def create(cls, path: Path | None, scenario: Scenario) -> RunFolder:
+        """Make the folder, at `path` or as `runs/{name}-{seed}` with a number where that exists already.
+
+        Never touches another run's files: a `path` that is not empty is refused.
+        """
+        folder = cls(path or _unused(RUNS / f"{scenario.run.name}-{scenario.run.seed}"))
+        if path is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
+            raise VnetError(f"--out {path}: exists and is not an empty folder")
+        with _disk(folder.path):
+            folder.logs.mkdir(parents=True)
+            (folder.path / "scenario.toml").write_text(dump_scenario(scenario))
+            (folder.path / "events.jsonl").touch()
+            if path is None:
+                _point_latest_to(folder.path)
+        return folder
+
+    def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
+        """Write down what happened at an emulated instant."""
+        event = Event(time_ns, kind, node, details)
+        self.events.append(event)
+        line = json.dumps({"time_ns": time_ns, "kind": kind, "node": node, **details})
+        with _disk(self.path), (self.path / "events.jsonl").open("a") as file:
+            file.write(line + "\n")
+
+    def put(self, name: str, write: Callable[[Path], None]) -> None:
+        """Have `write` make a file beside its place, then move it there in one step."""
+        part = self.path / f".{name}.part"
+        with _disk(self.path):
+            write(part)
+            part.replace(self.path / name)
+
+    def put_json(self, name: str, data: dict[str, Any]) -> None:
+        """Write a JSON file in one step."""
+        self.put(name, lambda path: _write_text(path, json.dumps(data, indent=2) + "\n"))
+
+
+def read_events(folder: Path) -> list[Event]:
+    """The events of a run. Raises VnetError if they cannot be read."""
+    events = []
+    try:
+        lines = (folder / "events.jsonl").read_text().splitlines()
+    except OSError as error:
+        raise VnetError(f"{folder}: not a run's folder: events.jsonl: {error.strerror}") from None
+    for line in lines:
+        try:
+            data = json.loads(line)
+        except ValueError:
+            continue  # the last line of a run that was killed
+        events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
+    return events
+
+
+@contextlib.contextmanager
+def _disk(path: Path) -> Any:
+    try:
+        yield
+    except OSError as error:
+        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def _unused(path: Path) -> Path:
+    number = 2
+    candidate = path
+    while candidate.exists():
+        candidate = path.with_name(f"{path.name}-{number}")
+        number += 1
+    return candidate
+
+
+def _point_latest_to(path: Path) -> None:
+    link = path.parent / "latest"
+    fresh = path.parent / f".latest-{os.getpid()}"
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(path.name)
+    fresh.replace(link)

@@ -1,0 +1,90 @@
+"""What a run prints at its end: the verdict, the figures, where the files are and what to type next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from emulator.observe.checks import Judgement, Verdict
+
+_STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
+_FIGURES = {
+    "common_error_rmse_m": "common error, RMSE",
+    "deviation_m": "deviation between vehicles",
+    "position_rmse_m": "position, RMSE of the estimates",
+    "fix_rmse_m": "position, RMSE of the raw fixes",
+    "consensus_error_m": "consensus error",
+}
+
+
+def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console) -> None:
+    """The whole summary of a run that has just ended."""
+    print_checks(judgement, console)
+    console.print(_figures(verdict))
+    console.print(_frames(verdict["frames_by_outcome"]))
+    console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
+    console.print(f"files        {folder}", highlight=False, soft_wrap=True)
+    console.print(f"next         {verdict['reproduce']}   (the same run again)", highlight=False, soft_wrap=True)
+    console.print(f"             vnet check {folder}   (judge it again)", highlight=False, soft_wrap=True)
+    if (folder / "recording.rrd").exists():
+        console.print(
+            f"             rerun {folder / 'recording.rrd'}   (look at it)", highlight=False, soft_wrap=True
+        )
+
+
+def print_checks(judgement: Judgement, console: Console) -> None:
+    """The verdict and its checks."""
+    table = Table(
+        title=Text(f"verdict: {judgement.verdict}", style=_STYLE[judgement.verdict]), title_justify="left"
+    )
+    table.add_column("check")
+    table.add_column("verdict")
+    table.add_column("what was seen", overflow="fold")
+    for check in judgement.checks:
+        table.add_row(check.name, Text(check.verdict.value, style=_STYLE[check.verdict]), Text(check.text))
+    for skipped in judgement.not_exercised:
+        table.add_row(skipped.name, Text("left out", style="dim"), Text(skipped.reason, style="dim"))
+    console.print(table)
+    for check in judgement.checks:
+        if check.verdict is not Verdict.VALID:
+            _print_details(check.figures, console)
+
+
+def _print_details(figures: dict[str, Any], console: Console) -> None:
+    for item in figures.get("gone", [figures]):
+        for key in ("where", "log_tail"):
+            if item.get(key):
+                console.print(Text(f"{item.get('node', '')} {key}:", style="bold"))
+                console.print(Text(str(item[key]).rstrip()))
+
+
+def _figures(verdict: dict[str, Any]) -> Table:
+    table = Table(title="figures (means after the first fifth of the run)", title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_row("vehicles", str(verdict["vehicles"]))
+    table.add_row("emulated time", f"{verdict['emulated_s']:.1f} s")
+    table.add_row("wall-clock time", f"{verdict['wall_s']:.1f} s")
+    table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
+    for name, title in _FIGURES.items():
+        if (value := verdict["figures"].get(name)) is not None:
+            table.add_row(title, f"{value:.3f} m")
+    return table
+
+
+def _frames(counts: dict[str, int]) -> Table:
+    in_range = sum(count for outcome, count in counts.items() if outcome != "out_of_range")
+    table = Table(title="frames, by receiver in range", title_justify="left", show_header=False)
+    table.add_column()
+    table.add_column(justify="right")
+    table.add_column(justify="right")
+    for outcome, count in counts.items():
+        if count and outcome != "out_of_range":
+            table.add_row(outcome, f"{count:,}", f"{count / in_range:.2%}")
+    if counts.get("out_of_range"):
+        table.add_row("out of range", f"{counts['out_of_range']:,}", "")
+    return table

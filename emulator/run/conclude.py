@@ -1,0 +1,53 @@
+"""The end of a run: its tables, its verdict, and how to have it again."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from emulator.channel.outcomes import Outcome
+from emulator.observe.checks import Evidence, Judgement, judge
+from emulator.observe.metrics import summarize
+from emulator.run.emulation import Emulation
+
+FORMAT = 1
+
+
+def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgement, dict[str, Any]]:
+    """Write what is kept of a run and judge it. `command` is the vnet command that ran it (run, simulate).
+
+    Returns the judgement and the contents of verdict.json. Raises VnetError if the disk is full.
+    """
+    folder = emulation.folder
+    emulated_s = emulation.emulated_ns / 1e9
+    folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
+    trace = emulation.engine.trace.to_table()
+    states = emulation.metrics.states_table()
+    metrics = emulation.metrics.metrics_table()
+    folder.put("trace.parquet", lambda path: pq.write_table(trace, path, compression="zstd"))
+    folder.put("states.parquet", lambda path: pq.write_table(states, path, compression="zstd"))
+    folder.put("metrics.parquet", lambda path: pq.write_table(metrics, path, compression="zstd"))
+    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events))
+    verdict = {
+        "format": FORMAT,
+        "verdict": judgement.verdict.value,
+        "checks": [asdict(check) for check in judgement.checks],
+        "not_exercised": [asdict(check) for check in judgement.not_exercised],
+        "trace_sha256": judgement.trace_sha256,
+        "metrics_sha256": emulation.metrics.sha256(),
+        "emulated_s": emulated_s,
+        "wall_s": round(wall_s, 3),
+        "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,
+        "seed": emulation.scenario.run.seed,
+        "vehicles": len(emulation.world.node_ids),
+        "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
+        "figures": summarize(emulation.metrics.rows),
+        "reproduce": f"vnet {command} {folder.path / 'scenario.toml'}",
+        "versions": {"python": platform.python_version(), "numpy": np.__version__},
+    }
+    folder.put_json("verdict.json", verdict)
+    return judgement, verdict
