@@ -56,7 +56,7 @@ class Observation:
 
 
 class Rbpf:
-    """The filter's state: common-error hypotheses `common_m` (2, K), `log_weight` (K,), and the tracked vehicles."""
+    """The filter's state: hypotheses `common_m` (2, K), `log_weight` (K,), and the tracked vehicles."""
 
     def __init__(self, config: RbpfConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
         self.config = config
@@ -272,20 +272,27 @@ class Rbpf:
         cross = (self.mean - mean[:, :, None]) @ (spread * weight).T
         return mean, cross @ np.linalg.inv(covariance), centre
 
-    def replace(self, common_m: Array, own: NDArray[np.intp], imported: NDArray[np.intp]) -> None:
-        """Continue with some own particles (`own` indices) and some of the imported hypotheses `common_m` (n, 2).
-
-        The imported ones get this filter's own conditional means by regression.
-        """
+    def supply(self, common_m: Array) -> tuple[Array, Array]:
+        """What this filter makes of others' hypotheses (n, 2): conditional means (M, 4, n), log P on road (M, n)."""
         mean, slope, centre = self.regression()
-        hypotheses = common_m[imported].T
-        supplied = mean[:, :, None] + slope @ (hypotheses - centre[:, None])
-        log_road = self.log_road(supplied, self.covariance) if len(self._lane) else np.zeros((len(mean), len(imported)))
+        supplied = mean[:, :, None] + slope @ (common_m.T - centre[:, None])
+        if not len(self._lane):
+            return supplied, np.zeros((len(mean), len(common_m)))
+        return supplied, self.log_road(supplied, self.covariance)
+
+    def own_log_road(self, rows: NDArray[np.bool_]) -> Array:
+        """Σ log P on road over some tracked vehicles, per particle (K,)."""
+        return np.asarray(self._log_road[rows].sum(axis=0))
+
+    def replace(self, own: NDArray[np.intp], common_m: Array, log_weight: Array) -> None:
+        """Go on with the particles `own` (indices) and hypotheses `common_m` (n, 2), weighted, resampled to K."""
+        supplied, log_road = self.supply(common_m)
         self._take(own)
-        self.common_m = np.concatenate([self.common_m, hypotheses], axis=1)
+        self.common_m = np.concatenate([self.common_m, common_m.T], axis=1)
         self.mean = np.concatenate([self.mean, supplied], axis=2)
         self._log_road = np.concatenate([self._log_road, log_road], axis=1)
-        self.log_weight = np.zeros(self.common_m.shape[1])
+        self.log_weight = np.concatenate([np.zeros(len(own)), log_weight])
+        self.resample()
 
 
 REST_SPEED_M_S = 0.5
@@ -294,7 +301,7 @@ COLLAPSED_M2 = 1e-6
 
 
 def systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Indices of a systematic sample: one uniform draw, `count` equidistant pointers into the cumulated weights."""
+    """Indices of a systematic sample: one draw, `count` equidistant pointers into the cumulated weights."""
     pointers = (np.arange(count) + rng.random()) / count
     index = np.searchsorted(np.cumsum(weight), pointers)
     return np.asarray(np.minimum(index, len(weight) - 1))
@@ -309,7 +316,7 @@ def _process_noise(heading_rad: float | None, acceleration_m2_s4: float, dt_s: f
         across = np.array([-along[1], along[0]])
         shape = acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across))
     push = np.array([dt_s**2 / 2, dt_s])
-    return np.kron(np.outer(push, push), shape)
+    return np.asarray(np.kron(np.outer(push, push), shape))
 
 
 def _inverse_2x2(matrix: Array) -> Array:

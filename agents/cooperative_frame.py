@@ -1,0 +1,122 @@
+"""The one frame that a cooperative vehicle broadcasts each period, as bytes and back (MODEL 3).
+
+Fix, estimate, consensus state, whom it hears, and a sample of its hypotheses of the common error in steps of 1 cm.
+Vehicles are named by 4-byte hashes of their ids. Whatever does not decode, or decodes to absurd values, is a
+`FrameError` with a one-word reason: the radio brings anything.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from vnet.roads.lanes import Array
+
+VERSION = 1
+NAME_BYTES = 4
+COMMON_LIMIT_M = 300.0
+"""Larger common errors are absurd; int16 centimetres end at 327 m."""
+NO_HEADING = 0xFFFF
+_FULL_TURN = 0xFFFF  # headings in steps of 2π / 65535; the last code means none
+
+# version, heard, particles, heading, fix time, fix x, y (cm), x_i, Cov(x_i), epoch, running sums
+_HEADER = struct.Struct("<BBHHQii2f3fI3d")
+
+
+class FrameError(ValueError):
+    """A payload that is no frame of this program; the message is the reason it is counted under."""
+
+
+@dataclass(frozen=True)
+class CooperativeFrame:
+    """The contents of a frame. Names are `short_name`s; `heard` says of each whether it is given a share."""
+
+    fix_time_ns: int
+    fix_m: Array
+    heading_rad: float | None
+    estimate_m: Array
+    covariance_m2: Array
+    epoch: int
+    running_sum: tuple[float, float, float]
+    heard: dict[str, bool]
+    cloud_m: Array
+
+
+def short_name(node: str) -> str:
+    """The name of a node in frames: 4 bytes in hexadecimal."""
+    return hashlib.blake2b(node.encode(), digest_size=NAME_BYTES).hexdigest()
+
+
+def room_for_particles(heard: int, max_payload: int) -> int:
+    """How many hypotheses fit beside `heard` names into `max_payload` bytes."""
+    return max(0, (max_payload - _HEADER.size - heard * NAME_BYTES - (heard + 7) // 8) // 4)
+
+
+def encode(frame: CooperativeFrame) -> bytes:
+    """A frame as bytes; hypotheses beyond ±300 m are clipped."""
+    heading = NO_HEADING if frame.heading_rad is None else int(frame.heading_rad / (2 * math.pi) * _FULL_TURN)
+    x_cm, y_cm = np.round(frame.fix_m * 100).astype(int).tolist()
+    covariance = frame.covariance_m2
+    header = _HEADER.pack(
+        VERSION,
+        len(frame.heard),
+        len(frame.cloud_m),
+        heading,
+        frame.fix_time_ns,
+        x_cm,
+        y_cm,
+        *frame.estimate_m,
+        covariance[0, 0],
+        covariance[0, 1],
+        covariance[1, 1],
+        frame.epoch,
+        *frame.running_sum,
+    )
+    names = bytes.fromhex("".join(frame.heard))
+    takes = np.packbits(np.array(list(frame.heard.values()), dtype=bool)).tobytes()
+    cloud = np.clip(frame.cloud_m, -COMMON_LIMIT_M, COMMON_LIMIT_M)
+    return header + names + takes + np.round(cloud * 100).astype("<i2").tobytes()
+
+
+def decode(payload: bytes) -> CooperativeFrame:
+    """Restore a frame. Raises FrameError: `length`, `version`, `not_finite`, `absurd` or `covariance`."""
+    if len(payload) < _HEADER.size:
+        raise FrameError("length")
+    (version, heard_count, particles, heading, fix_time_ns, x_cm, y_cm, *rest) = _HEADER.unpack_from(payload)
+    if version != VERSION:
+        raise FrameError("version")
+    names_end = _HEADER.size + heard_count * NAME_BYTES
+    takes_end = names_end + (heard_count + 7) // 8
+    if len(payload) != takes_end + 4 * particles or particles == 0:
+        raise FrameError("length")
+    x, y, c_xx, c_xy, c_yy, epoch, *running_sum = rest
+    _check_numbers(x, y, c_xx, c_xy, c_yy, running_sum)
+    names = payload[_HEADER.size : names_end].hex()
+    takes = np.unpackbits(np.frombuffer(payload[names_end:takes_end], dtype=np.uint8), count=heard_count)
+    cloud = np.frombuffer(payload, dtype="<i2", offset=takes_end).reshape(-1, 2) / 100
+    if np.abs(cloud).max() > COMMON_LIMIT_M:
+        raise FrameError("absurd")
+    return CooperativeFrame(
+        fix_time_ns,
+        np.array([x_cm / 100, y_cm / 100]),
+        None if heading == NO_HEADING else heading / _FULL_TURN * 2 * math.pi,
+        np.array([x, y]),
+        np.array([[c_xx, c_xy], [c_xy, c_yy]]),
+        epoch,
+        (running_sum[0], running_sum[1], running_sum[2]),
+        {names[2 * NAME_BYTES * i : 2 * NAME_BYTES * (i + 1)]: bool(takes[i]) for i in range(heard_count)},
+        cloud,
+    )
+
+
+def _check_numbers(x: float, y: float, c_xx: float, c_xy: float, c_yy: float, running_sum: list[float]) -> None:
+    if not all(map(math.isfinite, (x, y, c_xx, c_xy, c_yy, *running_sum))):
+        raise FrameError("not_finite")
+    if max(abs(x), abs(y)) > COMMON_LIMIT_M or not 0 <= running_sum[2] < 1e12:
+        raise FrameError("absurd")
+    if not (c_xx > 0 and c_yy > 0 and c_xx * c_yy > c_xy * c_xy):
+        raise FrameError("covariance")

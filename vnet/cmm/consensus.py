@@ -1,0 +1,135 @@
+"""Mean consensus by running sums: the mean of everybody's x, from neighbours only (MODEL 4).
+
+Each node holds mass (s, w), at first (x, 1); the ratio s/w tends to the mean x̄ of all. Every round it splits its
+mass evenly between itself and the peers that hear it, and broadcasts the *running sum* of what it has given to each
+peer. A peer takes what has been added since the last sum it saw, so that a later frame repairs an earlier loss
+(Hadjicostis, Vaidya, Domínguez-García 2016, "Robust distributed average consensus via exchange of running sums").
+The inputs change: a change of x is added to s, so that the ratio tracks the mean (dynamic average consensus).
+
+Mass must be neither created nor lost. A sender splits only over peers whose recent frames list it as heard, and
+names them; only they take a share. When that set changes (a peer dies, joins, restarts, no longer hears), everybody
+starts again under a new epoch: the highest spreads, and the old mean serves until the new one has settled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vnet.roads.lanes import Array
+
+
+@dataclass(frozen=True)
+class Share:
+    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `takers`."""
+
+    epoch: int
+    running_sum: tuple[float, float, float]
+    takers: frozenset[str]
+    heard: frozenset[str]
+
+
+@dataclass(frozen=True)
+class ConsensusConfig:
+    """Rounds, that is periods, of patience.
+
+    `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
+    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
+    """
+
+    silence_rounds: int = 20
+    steady_rounds: int = 5
+    settle_rounds: int = 30
+
+
+class RatioConsensus:
+    """The consensus state of one node. Epoch 0 means: not taking part yet."""
+
+    def __init__(self, node: str, config: ConsensusConfig | None = None) -> None:
+        self._node = node
+        self._config = config or ConsensusConfig()
+        self.epoch = 0
+        self._highest = 0
+        self._mass = np.zeros(3)
+        self._running_sum = np.zeros(3)
+        self._input: Array | None = None
+        self._takers: frozenset[str] = frozenset()
+        self._changed_rounds = 0
+        self._age = 0
+        self._seen: dict[str, Array] = {}
+        self._silent: dict[str, int] = {}
+        self._hears_us: dict[str, bool] = {}
+        self._old_mean: Array | None = None
+
+    @property
+    def mean_m(self) -> Array | None:
+        """The mean (2,) as far as it is known; None before the first has settled."""
+        if self.epoch and self._age >= self._config.settle_rounds:
+            return np.asarray(self._mass[:2] / self._mass[2])
+        return self._old_mean
+
+    @property
+    def mass(self) -> Array:
+        """(s_x, s_y, w), for tests of conservation."""
+        return self._mass
+
+    def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
+        """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        self._listen(shares)
+        self._follow(value)
+        for peer in sorted(shares):
+            self._take(peer, shares[peer])
+        self._split()
+        self._input = np.array(value, dtype=float)
+        s_x, s_y, w = self._running_sum.tolist()
+        return Share(self.epoch, (s_x, s_y, w), self._takers, frozenset(self._silent))
+
+    def _listen(self, shares: Mapping[str, Share]) -> None:
+        """Who is there, and who hears us."""
+        for peer in list(self._silent):
+            self._silent[peer] += 1
+            if self._silent[peer] > self._config.silence_rounds:
+                del self._silent[peer], self._hears_us[peer]
+        for peer, share in shares.items():
+            self._silent[peer] = 0
+            self._hears_us[peer] = self._node in share.heard
+            self._highest = max(self._highest, share.epoch)
+
+    def _follow(self, value: Array) -> None:
+        """Start a new epoch where one is due, otherwise add the change of the input."""
+        wanted = frozenset(peer for peer, hears in self._hears_us.items() if hears)
+        changed = wanted != self._takers or self.epoch == 0
+        self._changed_rounds = self._changed_rounds + 1 if changed else 0
+        if self._changed_rounds >= self._config.steady_rounds:
+            self._start(self._highest + 1, value, wanted)
+        elif self.epoch and self._highest > self.epoch:
+            self._start(self._highest, value, wanted)
+        elif self.epoch:
+            assert self._input is not None
+            self._mass[:2] += value - self._input
+            self._age += 1
+
+    def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
+        self._old_mean = self.mean_m
+        self.epoch = self._highest = epoch
+        self._mass = np.array([value[0], value[1], 1.0])
+        self._running_sum = np.zeros(3)
+        self._takers = takers
+        self._changed_rounds = 0
+        self._age = 0
+        self._seen = {}
+
+    def _take(self, peer: str, share: Share) -> None:
+        if share.epoch != self.epoch or self._node not in share.takers:
+            return
+        total = np.array(share.running_sum)
+        self._mass += total - self._seen.get(peer, 0.0)
+        self._seen[peer] = total
+
+    def _split(self) -> None:
+        if self.epoch:
+            share = self._mass / (len(self._takers) + 1)
+            self._running_sum += share
+            self._mass = self._mass - share * len(self._takers)
