@@ -285,7 +285,7 @@ class Rbpf:
         return np.asarray(self._log_road[rows].sum(axis=0))
 
     def replace(self, own: NDArray[np.intp], common_m: Array, log_weight: Array) -> None:
-        """Go on with the particles `own` (indices) and hypotheses `common_m` (n, 2), weighted, resampled to K."""
+        """Go on with the particles `own` (indices) and the weighted `common_m` (n, 2), resampled to K."""
         supplied, log_road = self.supply(common_m)
         self._take(own)
         self.common_m = np.concatenate([self.common_m, common_m.T], axis=1)
