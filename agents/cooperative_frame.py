@@ -97,9 +97,13 @@ def decode(payload: bytes) -> CooperativeFrame:
     _check_numbers(x, y, c_xx, c_xy, c_yy, running_sum)
     names = payload[_HEADER.size : names_end].hex()
     takes = np.unpackbits(np.frombuffer(payload[names_end:takes_end], dtype=np.uint8), count=heard_count)
-    cloud = np.frombuffer(payload, dtype="<i2", offset=takes_end).reshape(-1, 2) / 100
-    if np.abs(cloud).max() > COMMON_LIMIT_M:
+    steps = np.frombuffer(payload, dtype="<i2", offset=takes_end)
+    if max(steps.max(), -int(steps.min())) > COMMON_LIMIT_M * 100:
         raise FrameError("absurd")
+    starts = range(0, len(names), 2 * NAME_BYTES)
+    heard = {
+        names[i : i + 2 * NAME_BYTES]: take for i, take in zip(starts, takes.astype(bool).tolist(), strict=True)
+    }
     return CooperativeFrame(
         fix_time_ns,
         np.array([x_cm / 100, y_cm / 100]),
@@ -108,8 +112,8 @@ def decode(payload: bytes) -> CooperativeFrame:
         np.array([[c_xx, c_xy], [c_xy, c_yy]]),
         epoch,
         (running_sum[0], running_sum[1], running_sum[2]),
-        {names[2 * NAME_BYTES * i : 2 * NAME_BYTES * (i + 1)]: bool(takes[i]) for i in range(heard_count)},
-        cloud,
+        heard,
+        steps.reshape(-1, 2) / 100,
     )
 
 

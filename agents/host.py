@@ -127,8 +127,10 @@ class _Attachment:
         """Put a message on the process's own `tx`."""
         self._publishers[self.nodes[0]].put(wire.encode(message))
 
-    def copy_reports(self, traffic: wire.Traffic) -> None:
-        """Put a copy of each report on its key, where somebody listens."""
+    def publish(self, traffic: wire.Traffic) -> None:
+        """Put a copy of each report on its key, where somebody listens; log how programs ended."""
+        for ending in traffic.endings:
+            print(f"{ending.node} {ending.kind}\n{ending.details}", file=sys.stderr)
         for report in traffic.reports:
             publisher = self._reports[report.node]
             if publisher.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
@@ -218,7 +220,7 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
     def exchange(next_timer_ns: int | None) -> int:
         message = host.make_yield(attachment.nonce, seq, next_timer_ns)
         attachment.say(message)
-        attachment.copy_reports(message.traffic)
+        attachment.publish(message.traffic)
         return next_grant()
 
     def next_grant() -> int:
@@ -357,7 +359,7 @@ class _RealTimeAgent:
         )
         self._seq += 1
         self._missed = []
-        self._attachment.copy_reports(traffic)
+        self._attachment.publish(traffic)
 
     async def _acknowledge(self) -> None:
         """A sign of life once a second, also from programs that never send."""

@@ -55,7 +55,7 @@ def print_checks(judgement: Judgement, console: Console) -> None:
 
 
 def _print_details(figures: dict[str, Any], console: Console) -> None:
-    for item in figures.get("gone", [figures]):
+    for item in figures.get("gone", [figures])[:3]:  # the others are in verdict.json
         for key in ("where", "log_tail"):
             if item.get(key):
                 console.print(Text(f"{item.get('node', '')} {key}:", style="bold"))

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vnet.cmm.rbpf import Rbpf, systematic
 from vnet.cmm.weights import largest_remainder
@@ -32,41 +33,33 @@ def fuse(rbpf: Rbpf, clouds: Sequence[Cloud], weights: Array, rng: np.random.Gen
     """
     counts = largest_remainder(weights, rbpf.config.particles)
     own = systematic(rbpf.weight, int(counts[0]), rng) if counts[0] else np.empty(0, dtype=np.intp)
-    imported = [
-        (cloud, cloud.common_m[systematic(_equal(cloud), int(count), rng)])
-        for cloud, count in zip(clouds, counts[1:], strict=True)
-        if count
-    ]
-    if not imported:
+    used = [(cloud, int(count)) for cloud, count in zip(clouds, counts[1:], strict=True) if count]
+    if not used:
         return rbpf.estimate_m
-    common = np.concatenate([hypotheses for _, hypotheses in imported])
-    stacked = np.concatenate([rbpf.common_m[:, own].T, common]).mean(axis=0)
-    _, log_road = rbpf.supply(common)
-    log_weight = np.concatenate(
-        [
-            _evidence(rbpf, cloud, log_road[:, start : start + len(hypotheses)])
-            for start, (cloud, hypotheses) in zip(_starts(imported), imported, strict=True)
-        ]
-    )
-    rbpf.replace(own, common, log_weight)
+    common = np.concatenate([_evenly(cloud.common_m, count, rng) for cloud, count in used])
+    stacked = (rbpf.common_m[:, own].sum(axis=1) + common.sum(axis=0)) / rbpf.config.particles
+    supplied, log_road = rbpf.supply(common)
+    batch = np.repeat(np.arange(len(used)), [count for _, count in used])
+    log_weight = _evidence(rbpf, [cloud for cloud, _ in used], batch, log_road)
+    rbpf.replace(own, common, supplied, log_road, log_weight)
     return np.asarray(stacked)
 
 
-def _evidence(rbpf: Rbpf, cloud: Cloud, log_road: Array) -> Array:
-    """Log-weights of a neighbour's hypotheses: the roads it does not know, relative to this filter's own cloud."""
-    unknown = np.array([vehicle not in cloud.known for vehicle in rbpf.vehicles], dtype=bool)
+def _evidence(rbpf: Rbpf, clouds: Sequence[Cloud], batch: NDArray[np.intp], log_road: Array) -> Array:
+    """Log-weights (n,) of imported hypotheses; `batch` says which cloud each is from, `log_road` is (M, n).
+
+    They are the roads that the neighbour does not know, relative to what is usual in this filter's own cloud.
+    """
+    unknown = np.array([[v not in cloud.known for v in rbpf.vehicles] for cloud in clouds], dtype=float)
     if not unknown.any():
-        return np.zeros(log_road.shape[1])
-    own = rbpf.own_log_road(unknown)
-    top = own.max()
-    usual = top + np.log(np.exp(own - top) @ rbpf.weight)
-    return np.asarray(log_road[unknown].sum(axis=0) - usual)
+        return np.zeros(len(batch))
+    own = unknown @ rbpf.own_log_road
+    top = own.max(axis=1)
+    usual = top + np.log(np.exp(own - top[:, None]) @ rbpf.weight)
+    return np.asarray(np.einsum("nm,mn->n", unknown[batch], log_road) - usual[batch])
 
 
-def _equal(cloud: Cloud) -> Array:
-    return np.full(len(cloud.common_m), 1 / len(cloud.common_m))
-
-
-def _starts(imported: Sequence[tuple[Cloud, Array]]) -> list[int]:
-    """Where each neighbour's hypotheses begin in the stack."""
-    return [0, *np.cumsum([len(hypotheses) for _, hypotheses in imported])[:-1].tolist()]
+def _evenly(hypotheses: Array, count: int, rng: np.random.Generator) -> Array:
+    """A systematic sample of `count` from equally likely `hypotheses` (n, 2)."""
+    index = (np.arange(count) + rng.random()) * (len(hypotheses) / count)
+    return hypotheses[index.astype(np.intp)]

@@ -273,26 +273,35 @@ class Rbpf:
         return mean, cross @ np.linalg.inv(covariance), centre
 
     def supply(self, common_m: Array) -> tuple[Array, Array]:
-        """What this filter makes of others' hypotheses (n, 2): conditional means (M, 4, n), log P on road (M, n)."""
+        """What this filter makes of hypotheses (n, 2): conditional means (M, 4, n), log P on road (M, n)."""
         mean, slope, centre = self.regression()
         supplied = mean[:, :, None] + slope @ (common_m.T - centre[:, None])
         if not len(self._lane):
             return supplied, np.zeros((len(mean), len(common_m)))
         return supplied, self.log_road(supplied, self.covariance)
 
-    def own_log_road(self, rows: NDArray[np.bool_]) -> Array:
-        """Σ log P on road over some tracked vehicles, per particle (K,)."""
-        return np.asarray(self._log_road[rows].sum(axis=0))
+    @property
+    def own_log_road(self) -> Array:
+        """log P on road of each tracked vehicle and particle (M, K), as counted in the weights."""
+        return self._log_road
 
-    def replace(self, own: NDArray[np.intp], common_m: Array, log_weight: Array) -> None:
-        """Go on with the particles `own` (indices) and the weighted `common_m` (n, 2), resampled to K."""
-        supplied, log_road = self.supply(common_m)
-        self._take(own)
-        self.common_m = np.concatenate([self.common_m, common_m.T], axis=1)
-        self.mean = np.concatenate([self.mean, supplied], axis=2)
-        self._log_road = np.concatenate([self._log_road, log_road], axis=1)
-        self.log_weight = np.concatenate([np.zeros(len(own)), log_weight])
-        self.resample()
+    def replace(
+        self, own: NDArray[np.intp], common_m: Array, supplied: Array, log_road: Array, log_weight: Array
+    ) -> None:
+        """Go on with the particles `own` (indices) and hypotheses (n, 2) as `supply` made them, resampled to K.
+
+        `log_weight` (n,) are the weights of the hypotheses relative to own particles.
+        """
+        count = self.config.particles
+        weight = np.concatenate([np.ones(len(own)), np.exp(log_weight - max(0.0, log_weight.max()))])
+        weight[: len(own)] *= np.exp(-max(0.0, log_weight.max()))
+        index = systematic(weight / weight.sum(), count, self._rng)
+        from_own = own[index[index < len(own)]]
+        imported = index[index >= len(own)] - len(own)
+        self.common_m = np.concatenate([self.common_m[:, from_own], common_m[imported].T], axis=1)
+        self.mean = np.concatenate([self.mean[:, :, from_own], supplied[:, :, imported]], axis=2)
+        self._log_road = np.concatenate([self._log_road[:, from_own], log_road[:, imported]], axis=1)
+        self.log_weight = np.zeros(count)
 
 
 REST_SPEED_M_S = 0.5

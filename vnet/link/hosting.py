@@ -205,7 +205,6 @@ class Host:
                 self.end(node.id, "finished")
                 return
             self.end(node.id, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
-            traceback.print_exception(error)
         else:
             self.end(node.id, "finished")
 
