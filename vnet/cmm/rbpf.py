@@ -204,10 +204,22 @@ class Rbpf:
     # What the filter believes.
 
     @property
+    def log_weight(self) -> Array:
+        """Log-weights (K,), up to a constant."""
+        return self._log_weight
+
+    @log_weight.setter
+    def log_weight(self, log_weight: Array) -> None:
+        self._log_weight = log_weight
+        self._weight: Array | None = None
+
+    @property
     def weight(self) -> Array:
         """Normalized weights (K,)."""
-        weight = np.exp(self.log_weight - self.log_weight.max())
-        return np.asarray(weight / weight.sum())
+        if self._weight is None:
+            weight = np.exp(self._log_weight - self._log_weight.max())
+            self._weight = weight / weight.sum()
+        return self._weight
 
     @property
     def effective_sample_size(self) -> float:
