@@ -122,6 +122,7 @@ class LiveRun:
         self._origin_ns = 0
         self._incoming: deque[tuple[str, bytes | bool]] = deque()
         self._wake_pending = False
+        self._over = False
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
         self._join_failure: VnetError | None = None
@@ -164,7 +165,7 @@ class LiveRun:
 
     def _intake(self, node: str, item: bytes | bool) -> None:
         self._incoming.append((node, item))
-        if not self._wake_pending:
+        if not self._wake_pending and not self._over:
             self._wake_pending = True
             self._loop.call_soon_threadsafe(self._drain)
 
@@ -172,7 +173,7 @@ class LiveRun:
 
     def _drain(self) -> None:
         self._wake_pending = False
-        while self._incoming:
+        while self._incoming and not self._over:
             node, item = self._incoming.popleft()
             if isinstance(item, bool):
                 if not item:
@@ -291,6 +292,7 @@ class LiveRun:
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
             self._loop.remove_signal_handler(signal.SIGCHLD)
+            self._over = True
         return wall_s, interrupted
 
     async def _join(self, endpoint: str, on_state: Callable[[str], None]) -> None:

@@ -1,0 +1,90 @@
+"""Whole runs: real routers on ports that the system chooses, real processes, through the commands users type."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+ROOT = Path(__file__).parents[2]
+VNET = [sys.executable, "-P", "-m", "emulator.cli"]
+AGENT = [sys.executable, "-P", "-m", "agents.cli"]
+TIMEOUT_S = 300
+"""Only against hanging for ever; nothing here is judged by how long it takes."""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A command that has ended, and the folder of its run."""
+
+    status: int
+    stdout: str
+    stderr: str
+    folder: Path
+
+    @property
+    def verdict(self) -> dict[str, Any]:
+        return json.loads((self.folder / "verdict.json").read_text())
+
+    @property
+    def fingerprint(self) -> tuple[str, str]:
+        """What must be the same wherever the same run is run: the trace and the metrics."""
+        return self.verdict["trace_sha256"], self.verdict["metrics_sha256"]
+
+    @property
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in (self.folder / "events.jsonl").read_text().splitlines()]
+
+    def events_of(self, kind: str) -> list[dict[str, Any]]:
+        return [event for event in self.events if event["kind"] == kind]
+
+    @property
+    def outcomes(self) -> dict[str, int]:
+        return self.verdict["frames_by_outcome"]
+
+    def check(self, name: str) -> dict[str, Any]:
+        return next(check for check in self.verdict["checks"] if check["name"] == name)
+
+    def trace(self) -> list[dict[str, Any]]:
+        return pq.read_table(self.folder / "trace.parquet").to_pylist()
+
+
+Vnet = Callable[..., Finished]
+
+
+@pytest.fixture
+def vnet(tmp_path: Path) -> Vnet:
+    """Run a vnet command to its end: vnet("run", "scenarios/twelve.toml", "--seed", "3")."""
+    numbers = iter(range(100))
+
+    def run(command: str, scenario: str, *options: str) -> Finished:
+        folder = tmp_path / f"run{next(numbers)}"
+        done = subprocess.run(
+            [*VNET, command, scenario, "--out", str(folder), *options],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+        )
+        return Finished(done.returncode, done.stdout, done.stderr, folder)
+
+    return run
+
+
+def running_agents(of: Path) -> list[int]:
+    """Pids of agent processes whose log lies in the run folder `of`."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (process / "cmdline").read_bytes().split(b"\0")
+            log = str((process / "fd" / "1").readlink())
+        except OSError:
+            continue
+        if b"agents.cli" in command and log.startswith(str(of)):
+            found.append(int(process.name))
+    return found

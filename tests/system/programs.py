@@ -1,0 +1,95 @@
+"""Vehicle programs that behave and misbehave, for whole runs: entries are `tests.system.programs:NAME`."""
+
+import asyncio
+import os
+import signal
+import time
+import zlib
+
+from vnet import Node
+
+
+async def only_waits(node: Node) -> None:
+    """Speaks once, then only ever waits on the radio; what it hears it says again, up to three hops."""
+    await node.radio.broadcast(b"")
+    async for packet in node.radio:
+        if len(packet.payload) < 3:
+            await node.radio.broadcast(packet.payload + node.id[-1:].encode())
+        node.report(heard_ns=packet.received_ns)
+
+
+async def never_waits(node: Node) -> None:
+    """Sleeps by its own timers, at its own pace, and looks at its packets only then."""
+    while True:
+        await asyncio.sleep(float(node.rng.uniform(0.05, 0.15)))
+        heard = node.radio.drain()
+        await node.radio.broadcast(len(heard).to_bytes(2, "big"))
+        node.report(heard=len(heard), first_ns=heard[0].received_ns if heard else -1)
+
+
+async def computes(node: Node) -> None:
+    """Computes for a while in the loop's own thread: that costs wall-clock time and no emulated time."""
+    async for fix in node.gnss:
+        total = sum(i * i for i in range(2_000_000 if fix.time_ns == 500_000_000 else 10))
+        await node.radio.broadcast(total.to_bytes(8, "big"))
+
+
+async def uses_executor(node: Node) -> None:
+    """Hands work to threads, several at once, whose results decide what it sends."""
+    async for fix in node.gnss:
+        sums = await asyncio.gather(*(asyncio.to_thread(zlib.crc32, bytes([i]) * 50_000) for i in range(4)))
+        await node.radio.broadcast(repr((fix.time_ns, sums)).encode())
+
+
+async def raises(node: Node) -> None:
+    """One vehicle has a bug."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        if node.id == "v02" and fix.time_ns >= 500_000_000:
+            raise RuntimeError("the battery is flat")
+
+
+async def exits_early(node: Node) -> None:
+    """One vehicle has done its work before the others."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        if node.id == "v02" and fix.time_ns >= 500_000_000:
+            return
+
+
+async def dies(node: Node) -> None:
+    """One vehicle's process is killed in the middle of the run."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        if node.id == "v02" and fix.time_ns >= 500_000_000:
+            print("v02 is about to be killed", flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+async def spins(node: Node) -> None:
+    """One vehicle goes on for ever at one instant."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        while node.id == "v02" and fix.time_ns >= 500_000_000:
+            await asyncio.sleep(0)
+
+
+async def hangs(node: Node) -> None:
+    """One vehicle never comes back from a call."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        if node.id == "v02" and fix.time_ns >= 500_000_000:
+            time.sleep(3600)
+
+
+async def runs_long(node: Node) -> None:
+    """Speaks at every fix; for runs that are ended from outside."""
+    print(f"{node.id} is on its way", flush=True)
+    async for _ in node.gnss:
+        await node.radio.broadcast(b"x")
+
+
+async def forgetful(node: Node) -> None:
+    """Takes its randomness from the machine instead of `node.rng`: it does not replay."""
+    async for _ in node.gnss:
+        await node.radio.broadcast(os.urandom(8))

@@ -1,0 +1,99 @@
+"""Whole runs of programs that behave and misbehave, live and simulated."""
+
+import pytest
+
+from tests.system.conftest import Finished, Vnet
+
+OPTIONS = ["--duration", "2", "--set", "network.vehicles=4", "--set", "run.stall_timeout_s=3"]
+
+
+def run(vnet: Vnet, command: str, program: str) -> Finished:
+    return vnet(command, "scenarios/beacon.toml", "--program", f"tests.system.programs:{program}", *OPTIONS)
+
+
+@pytest.mark.parametrize("program", ["only_waits", "never_waits", "computes", "uses_executor", "exits_early"])
+def test_what_behaves_is_valid_and_the_same_live_and_simulated(vnet: Vnet, program: str) -> None:
+    live, simulated = run(vnet, "run", program), run(vnet, "simulate", program)
+    assert live.status == 0, live.stderr + live.stdout
+    assert live.outcomes["delivered"] > 0
+    assert live.fingerprint == simulated.fingerprint
+
+
+def test_packets_reach_who_waits_for_them_at_the_instant_of_their_arrival(vnet: Vnet) -> None:
+    done = run(vnet, "simulate", "only_waits")
+    arrivals = {row["arrival_ns"] for row in done.trace() if row["outcome"] == "delivered"}
+    sent_again = {row["sent_ns"] for row in done.trace() if row["sent_ns"] > 0}
+    assert sent_again
+    assert sent_again <= arrivals
+
+
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_a_program_that_raises_is_named_with_its_traceback(vnet: Vnet, command: str) -> None:
+    done = run(vnet, command, "raises")
+    assert done.status == 1
+    assert "v02 crashed at 0.500 s" in done.check("agents_alive")["text"]
+    (crash,) = done.events_of("crashed")
+    assert crash["node"] == "v02"
+    assert "the battery is flat" in crash["error"]
+    assert "in raises" in crash["where"]
+    assert done.outcomes["receiver_down"] > 0
+
+
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_a_program_that_spins_is_invalid_and_shown(vnet: Vnet, command: str) -> None:
+    done = run(vnet, command, "spins")
+    assert done.status == 1
+    (spun,) = done.events_of("spun")
+    assert (spun["node"], spun["time_ns"]) == ("v02", 500_000_000)
+    assert "in spins" in spun["where"]
+
+
+def test_a_program_that_hangs_makes_the_run_unknown_and_is_shown(vnet: Vnet) -> None:
+    done = run(vnet, "run", "hangs")
+    assert done.status == 3
+    assert done.verdict["verdict"] == "unknown"
+    (stalled,) = done.events_of("stalled")
+    assert stalled["node"] == "v02"
+    assert "in hangs" in stalled["where"]
+
+
+def test_a_killed_process_is_survived_and_named_with_its_last_words(vnet: Vnet) -> None:
+    done = run(vnet, "run", "dies")
+    assert done.status == 1
+    (death,) = done.events_of("died")
+    assert (death["node"], death["how"], death["time_ns"]) == ("v02", "SIGKILL", 500_000_000)
+    assert "about to be killed" in death["log_tail"]
+    assert "about to be killed" in done.stdout
+    assert done.outcomes["receiver_down"] > 0
+    assert done.verdict["emulated_s"] == 2.0, "the others went on to the end"
+    senders = {row["sender"] for row in done.trace() if row["sent_ns"] > 500_000_000}
+    assert "v02" not in senders
+    assert len(senders) == 3
+
+
+def test_a_program_that_cannot_be_imported_ends_everything_at_once(vnet: Vnet) -> None:
+    for command in ("run", "simulate"):
+        done = vnet(command, "scenarios/beacon.toml", "--program", "no.such.module:main")
+        assert done.status == 2
+        assert "no.such.module" in done.stderr.splitlines()[-1]
+        assert "Traceback" not in done.stderr
+
+
+def test_real_time_runs_on_the_wall_clock(vnet: Vnet) -> None:
+    done = vnet(
+        "run", "scenarios/beacon.toml", "--duration", "2", "--pacing", "realtime", "--set", "network.vehicles=4"
+    )
+    assert done.verdict["wall_s"] >= 2.0
+    assert done.outcomes["delivered"] > 0
+    assert {"conservation", "range", "loss_rate", "agents_alive"} <= {
+        check["name"] for check in done.verdict["checks"] if check["verdict"] == "valid"
+    }
+    (late,) = done.events_of("late_deliveries")
+    assert late["total"] > 0
+
+
+def test_a_recording_is_written_beside_the_run(vnet: Vnet) -> None:
+    for command in ("run", "simulate"):
+        done = vnet(command, "scenarios/beacon.toml", "--duration", "1", "--rerun", "save")
+        assert done.status == 0, done.stderr + done.stdout
+        assert (done.folder / "recording.rrd").stat().st_size > 10_000

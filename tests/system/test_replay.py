@@ -1,0 +1,61 @@
+"""Replay is exact: the same scenario and seed give the same trace and metrics, whatever the machine does."""
+
+import multiprocessing
+import os
+from multiprocessing.synchronize import Event
+
+from tests.system.conftest import Vnet
+
+SCENARIO = "scenarios/twelve.toml"
+
+
+def _burn(stop: Event) -> None:
+    while not stop.is_set():
+        sum(range(10_000))
+
+
+def test_twice_live_beside_a_busy_machine_and_simulated_are_one_run(vnet: Vnet) -> None:
+    first = vnet("run", SCENARIO)
+    assert first.status == 0, first.stderr + first.stdout
+    simulated = vnet("simulate", SCENARIO)
+    assert simulated.status == 0, simulated.stderr + simulated.stdout
+    assert simulated.fingerprint == first.fingerprint
+
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    burners = [context.Process(target=_burn, args=(stop,)) for _ in range(2 * (os.cpu_count() or 1))]
+    for burner in burners:
+        burner.start()
+    try:
+        busy = vnet("run", SCENARIO)
+    finally:
+        stop.set()
+        for burner in burners:
+            burner.join()
+    assert busy.status == 0, busy.stderr + busy.stdout
+    assert busy.fingerprint == first.fingerprint
+
+
+def test_several_nodes_in_a_process_make_no_difference(vnet: Vnet) -> None:
+    alone = vnet("simulate", SCENARIO)
+    together = vnet("run", SCENARIO, "--set", "run.nodes_per_process=5")
+    assert together.status == 0, together.stderr + together.stdout
+    assert together.fingerprint == alone.fingerprint
+
+
+def test_a_runs_own_scenario_file_reproduces_it(vnet: Vnet) -> None:
+    first = vnet("simulate", SCENARIO, "--seed", "7", "--duration", "2", "--set", "radio.loss=0.3")
+    again = vnet("simulate", str(first.folder / "scenario.toml"))
+    assert again.fingerprint == first.fingerprint
+
+
+def test_another_seed_is_another_run(vnet: Vnet) -> None:
+    one, two = (vnet("simulate", SCENARIO, "--duration", "1", "--seed", seed) for seed in "12")
+    assert one.fingerprint != two.fingerprint
+
+
+def test_a_nondeterministic_payload_cannot_hide(vnet: Vnet) -> None:
+    options = ["--program", "tests.system.programs:forgetful", "--duration", "1"]
+    one, two = (vnet("simulate", "scenarios/beacon.toml", *options) for _ in range(2))
+    assert one.outcomes == two.outcomes
+    assert one.verdict["trace_sha256"] != two.verdict["trace_sha256"]
