@@ -304,7 +304,7 @@ class LiveRun:
         if self._options.record is not None:
             self._start_recorder(endpoint, self._options.record)
         if self._options.launch:
-            on_state(f"starting {len(groups)} agent processes for {len(node_ids)} vehicles")
+            on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
             for nodes in groups:
                 self._launcher.start_agent(endpoint, self._options.access, nodes)
         else:

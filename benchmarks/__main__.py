@@ -1,0 +1,160 @@
+"""Run all benchmarks: a table on stderr, JSON on stdout. `python -m benchmarks [NAME ...]` runs some."""
+
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+from vnet.roads.lanes import LaneMap
+
+Figures = dict[str, float]
+ROOT = Path(__file__).parents[1]
+FIFTY = ["--set", "network.vehicles=50"]
+
+
+def vnet(command: str, scenario: str, *options: str, watch: Callable[[int], None] | None = None) -> dict[str, Any]:
+    """Run a vnet command; returns its verdict and events, and the whole wall-clock time as `total_s`."""
+    with tempfile.TemporaryDirectory(prefix="vnet-bench-") as folder:
+        out = Path(folder) / "run"
+        arguments = [sys.executable, "-P", "-m", "emulator.cli", command, scenario, "--out", str(out), *options]
+        started = time.monotonic()
+        process = subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        watcher = threading.Thread(target=watch or (lambda pid: None), args=(process.pid,))
+        watcher.start()
+        process.wait()
+        watcher.join()
+        result: dict[str, Any] = json.loads((out / "verdict.json").read_text())
+        result["events"] = [json.loads(line) for line in (out / "events.jsonl").read_text().splitlines()]
+        result["total_s"] = time.monotonic() - started
+        return result
+
+
+def event(result: dict[str, Any], kind: str) -> dict[str, Any]:
+    """The last event of a kind."""
+    return [e for e in result["events"] if e["kind"] == kind][-1]
+
+
+def agents_uss_mb(parent: int) -> list[float]:
+    """Unique set size of the agent processes that `parent` has started, in MB."""
+    sizes = []
+    for pid in Path(f"/proc/{parent}/task/{parent}/children").read_text().split():
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+        private = [int(line.split()[1]) for line in lines if line.startswith("Private_")]
+        sizes.append(sum(private) / 1024)
+    return sizes
+
+
+def bench_lockstep() -> Figures:
+    """50 processes, 10 Hz, 200 particles, in lockstep."""
+    sizes: list[float] = []
+
+    def watch(pid: int) -> None:
+        while Path(f"/proc/{pid}").exists():
+            time.sleep(2)
+            try:
+                sizes[:] = agents_uss_mb(pid) or sizes
+            except OSError:
+                return
+
+    result = vnet("run", "scenarios/quickstart.toml", *FIFTY, "--duration", "30", watch=watch)
+    return {
+        "real_time_factor": result["real_time_factor"],
+        "start_up_s": event(result, "started")["start_up_s"],
+        "agent_uss_mb": statistics.median(sizes),
+        "common_error_rmse_m": result["figures"]["common_error_rmse_m"],
+    }
+
+
+def bench_demo() -> Figures:
+    """The quickstart as `make demo` runs it, from the command to the prompt."""
+    result = vnet("run", "scenarios/quickstart.toml", "--rerun", "save")
+    return {"total_s": result["total_s"], "start_up_s": event(result, "started")["start_up_s"]}
+
+
+def bench_simulate() -> Figures:
+    """The same 50-vehicle run in one process."""
+    result = vnet("simulate", "scenarios/quickstart.toml", *FIFTY, "--duration", "30")
+    return {"real_time_factor": result["real_time_factor"]}
+
+
+def bench_realtime() -> Figures:
+    """50 beacons × 10 Hz × 30 peers × 300 B for 30 s on the wall clock."""
+    options = ["--program", "benchmarks.programs:steady_beacon", "--pacing", "realtime", "--duration", "30"]
+    options += [*FIFTY, "--set", "radio.range_m=100000", "--set", "radio.loss=0.0"]
+    result = vnet("run", "scenarios/beacon.toml", *options)
+    late = event(result, "late_deliveries")
+    gaps = [e["count"] for e in result["events"] if e["kind"] == "transport_gap"]
+    return {
+        "transport_gaps": sum(gaps),
+        "lost_in_transport": result["frames_by_outcome"]["transport"],
+        "delivered": result["frames_by_outcome"]["delivered"],
+        "added_latency_p50_ms": late["p50_ms"],
+        "added_latency_p99_ms": late["p99_ms"],
+        "over_20_ms_share": late["count"] / late["total"],
+    }
+
+
+def bench_awaiting() -> Figures:
+    """A program that always awaits packets: 50 nodes × 10 Hz × 13 peers, with and without a delivery tick."""
+    options = ["--program", "benchmarks.programs:always_awaits", "--duration", "5", *FIFTY]
+    figures = {}
+    for tick_us in (0, 1000, 5000):
+        result = vnet("run", "scenarios/beacon.toml", *options, "--set", f"radio.delivery_tick_us={tick_us}")
+        figures[f"real_time_factor_tick_{tick_us}_us"] = result["real_time_factor"]
+    return figures
+
+
+def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Figures:
+    """One RBPF step with all fixes present."""
+    rng = np.random.default_rng(0)
+    heading = rng.uniform(0, 2 * np.pi, vehicles)
+    point = rng.uniform(0, 5000, (vehicles, 2))
+    rbpf = Rbpf(RbpfConfig(particles=particles), LaneMap(point, heading, 0.85), np.random.default_rng(1))
+    times_s = []
+    for _ in range(steps):
+        fixes = {
+            f"v{j}": Observation(point[j] + [2.0, -1.0] + rng.normal(size=2), np.eye(2), float(heading[j]))
+            for j in range(vehicles)
+        }
+        started = time.perf_counter()
+        rbpf.step(0.1, fixes)
+        times_s.append(time.perf_counter() - started)
+    return {"step_us": statistics.median(times_s) * 1e6}
+
+
+BENCHMARKS: dict[str, Callable[[], Figures]] = {
+    "rbpf": bench_rbpf,
+    "simulate": bench_simulate,
+    "lockstep": bench_lockstep,
+    "demo": bench_demo,
+    "realtime": bench_realtime,
+    "awaiting": bench_awaiting,
+}
+
+
+def main() -> None:
+    """Run the benchmarks that the command line names, or all."""
+    names = sys.argv[1:] or list(BENCHMARKS)
+    table = Table("benchmark", "figure", "value")
+    results = {}
+    for name in names:
+        results[name] = BENCHMARKS[name]()
+        for figure, value in results[name].items():
+            table.add_row(name, figure, f"{value:.4g}")
+    Console(stderr=True).print(table)
+    print(json.dumps(results, indent=2))
+
+
+if __name__ == "__main__":
+    main()

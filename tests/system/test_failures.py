@@ -1,0 +1,158 @@
+"""What a user meets when things go wrong: one clear line, no process left, files readable."""
+
+import os
+import resource
+import select
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from emulator.observe.checks import check_run
+from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
+
+LONG = ["--program", "tests.system.programs:runs_long", "--duration", "3600", "--set", "network.vehicles=3"]
+
+
+@contextmanager
+def long_run(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    """`vnet run` of a run that would take very long, once it has emulated its first periods."""
+    command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(folder), *LONG, *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        while "real time" not in (line := process.stderr.readline()):
+            assert line, "it ended early"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for_exit(pids: list[int]) -> None:
+    """Wait until processes that are not our children have ended."""
+    for pid in pids:
+        try:
+            descriptor = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        ready, _, _ = select.select([descriptor], [], [], TIMEOUT_S)
+        os.close(descriptor)
+        assert ready, f"process {pid} is still there"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_ends_everything_and_leaves_readable_files(tmp_path: Path, number: signal.Signals) -> None:
+    folder = tmp_path / "run"
+    with long_run(folder) as process:
+        assert len(running_agents(folder)) == 3
+        process.send_signal(number)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 130
+    assert running_agents(folder) == []
+    assert "Traceback" not in stderr
+    assert "interrupted at" in stdout
+    done = Finished(process.returncode, stdout, stderr, folder)
+    assert done.verdict["verdict"] == "unknown"
+    assert check_run(folder).exit_status == 3
+
+
+def test_agents_that_lose_the_emulator_end_with_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with long_run(folder, "--set", "run.orphan_timeout_s=0.5") as process:
+        agents = running_agents(folder)
+        assert len(agents) == 3
+        process.kill()
+        wait_for_exit(agents)
+    for log in sorted((folder / "logs").iterdir()):
+        first, *rest = log.read_text().splitlines()
+        assert first == f"{log.stem} is on its way"
+        assert rest == [f"vnet-agent: {log.stem}: the emulator has been gone for 0.5 s; ending"]
+
+
+def test_a_killed_run_can_still_be_read(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with long_run(folder) as process:
+        agents = running_agents(folder)
+        process.kill()
+        wait_for_exit(agents)
+    done = Finished(-9, "", "", folder)
+    assert done.events_of("started")
+    judged = subprocess.run(
+        [*VNET, "check", str(folder)], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S
+    )
+    assert judged.returncode == 2
+    assert judged.stderr.count("\n") == 1
+    assert "not the folder of a finished run" in judged.stderr
+
+
+def test_a_port_in_use_is_one_line(vnet: Vnet) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = vnet("emulator", "scenarios/beacon.toml", "--listen", endpoint)
+    assert done.status == 2
+    assert done.stderr.splitlines()[-1] == f"vnet: cannot listen on {endpoint}: the address is already in use"
+
+
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a folder")
+    command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(tmp_path / "file" / "run")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert "cannot write" in done.stderr
+
+
+def test_another_runs_folder_is_never_written_into(vnet: Vnet, tmp_path: Path) -> None:
+    (tmp_path / "run0").mkdir()
+    (tmp_path / "run0" / "precious").write_text("data")
+    done = vnet("simulate", "scenarios/beacon.toml")
+    assert done.status == 2
+    assert "is not an empty folder" in done.stderr
+    assert [path.name for path in (tmp_path / "run0").iterdir()] == ["precious"]
+
+
+def test_a_disk_that_fills_up_is_one_line_and_no_process_stays(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [*VNET, "run", "scenarios/beacon.toml", "--out", str(folder), "--duration", "20"]
+
+    def small_files_only() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000))
+
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, preexec_fn=small_files_only
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(f"vnet: {folder}: cannot write")
+    assert running_agents(folder) == []
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("radio.los=0.1", "radio.los: unknown key"),
+        ("radio.loss=2", "radio.loss = 2"),
+        ("network.path=nowhere.csv", "network"),
+    ],
+)
+def test_a_wrong_scenario_starts_nothing(vnet: Vnet, override: str, message: str) -> None:
+    done = vnet("run", "scenarios/beacon.toml", "--set", override)
+    assert done.status == 2
+    assert done.stderr.count("\n") == 1
+    assert "scenarios/beacon.toml" in done.stderr
+    assert message in done.stderr
+    assert not done.folder.exists()
+
+
+def test_nodes_that_never_join_are_named(vnet: Vnet) -> None:
+    done = vnet(
+        "emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--set", "run.join_timeout_s=0.2"
+    )
+    assert done.status == 2
+    assert "10 of 10 nodes have not joined within 0.2 s: v01, v02, v03" in done.stderr
