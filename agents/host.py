@@ -7,6 +7,7 @@ who owns the clock.
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import queue
 import secrets
@@ -15,7 +16,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 import zenoh
@@ -46,6 +47,10 @@ class _Found:
     """Stands in the message queue for: the emulator is there (again)."""
 
 
+Item = tuple[bytes, int] | type[_Lost] | type[_Found]
+"""What Zenoh's threads queue: a message and when it came (monotonic ns), or how the emulator is."""
+
+
 def run_agent(
     endpoint: str, run: str, nodes: Sequence[str], credentials: Credentials | None, join_timeout_s: float
 ) -> None:
@@ -62,6 +67,7 @@ def run_agent(
         except ProgramError as error:
             attachment.say_hello(failure=str(error))
             raise
+        gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
             _run_lockstep(attachment, welcomes, program)
@@ -75,8 +81,8 @@ class _Attachment:
     def __init__(self, session: zenoh.Session, run: str, nodes: Sequence[str], stack: ExitStack) -> None:
         self.nodes = list(nodes)
         self.nonce = secrets.token_bytes(16)
-        self.inbox: queue.SimpleQueue[bytes | type[_Lost] | type[_Found]] = queue.SimpleQueue()
-        self.on_message = _no_wake
+        self.inbox: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.on_message: Callable[[bytes], None] = _no_wake
         self.orphan_timeout_s = 5.0
         self._host = socket.gethostname()
         self._main_thread = threading.main_thread().ident
@@ -110,12 +116,12 @@ class _Attachment:
         if payload == _WHERE:  # the program's thread may be stuck: this one answers
             self.say(wire.Standing(self.nonce, self._stack()))
             return
-        self.inbox.put(payload)
-        self.on_message()
+        self.inbox.put((payload, time.monotonic_ns()))
+        self.on_message(payload)
 
     def _on_emulator(self, sample: zenoh.Sample) -> None:
         self.inbox.put(_Found if sample.kind == zenoh.SampleKind.PUT else _Lost)
-        self.on_message()
+        self.on_message(b"")
 
     def _stack(self) -> str:
         frame = sys._current_frames().get(self._main_thread or 0)
@@ -183,11 +189,11 @@ class _Attachment:
             return None
         return self.decode(item)
 
-    def decode(self, item: bytes | type[_Lost] | type[_Found]) -> wire.EmulatorMessage | None:
+    def decode(self, item: Item) -> wire.EmulatorMessage | None:
         """A queued item as a message for this process; raises _RunOverError and LinkError when told to go."""
-        if not isinstance(item, bytes):
+        if not isinstance(item, tuple):
             return None
-        message = wire.decode_rx(item)
+        message = wire.decode_rx(item[0])
         if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
             if message.refused:
                 raise LinkError(f"refused: {message.reason}")
@@ -209,7 +215,7 @@ class _Attachment:
         return f"{self.nodes[0]}: the emulator has been gone for {self.orphan_timeout_s:g} s; ending"
 
 
-def _no_wake() -> None:
+def _no_wake(payload: bytes) -> None:
     """In lockstep the program's thread waits on the queue itself."""
 
 
@@ -281,7 +287,9 @@ class _RealTimeAgent:
         self._loop = asyncio.get_running_loop()
         self._over: asyncio.Future[None] = self._loop.create_future()
         self._attachment.on_message = self._wake
-        self._wake()
+        for node in self._host.nodes.values():
+            node.radio.inbox.refill = self._drain
+        self._wake(b"")
         acknowledging = self._loop.create_task(self._acknowledge())
         try:
             await self._over
@@ -292,8 +300,13 @@ class _RealTimeAgent:
             acknowledging.cancel()
             self._attachment.on_message = _no_wake
 
-    def _wake(self) -> None:
-        # Zenoh's thread; one wake-up for however many messages come before it is answered.
+    def _wake(self, payload: bytes) -> None:
+        # Zenoh's thread; one wake-up for however many messages come before it is answered. What nobody waits
+        # for wakes nobody: the program finds it when it looks.
+        if wire.is_packets_only(payload) and not any(
+            node.radio.inbox.awaited for node in self._host.nodes.values()
+        ):
+            return
         if not self._wake_pending:
             self._wake_pending = True
             self._loop.call_soon_threadsafe(self._drain)
@@ -303,10 +316,10 @@ class _RealTimeAgent:
         try:
             while True:
                 item = self._attachment.inbox.get_nowait()
-                if not isinstance(item, bytes):
+                if not isinstance(item, tuple):
                     self._emulator_present(item is _Found)
                 elif isinstance(message := self._attachment.decode(item), wire.Batch):
-                    self._take(message)
+                    self._take(message, item[1])
         except queue.Empty:
             pass
         except (_RunOverError, VnetError) as end:
@@ -324,16 +337,17 @@ class _RealTimeAgent:
         if not self._over.done():
             self._over.set_exception(LinkError(self._attachment.orphaned()))
 
-    def _take(self, batch: wire.Batch) -> None:
+    def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
         if batch.seq > self._expected:
             self._missed.append((self._expected, batch.seq - 1))
         self._expected = batch.seq + 1
         if batch.origin_ns is not None and not self._started:
             same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
-            self._origin_ns = batch.origin_ns if same_machine else time.monotonic_ns()
+            self._origin_ns = batch.origin_ns if same_machine else time.monotonic_ns() + wire.HEAD_START_NS
             self._started = True
-            self._host.start(self._loop, self._program)
-        now_ns = self._now_ns()
+            head_start_s = max(0.0, (self._origin_ns - time.monotonic_ns()) / 1e9)
+            self._loop.call_later(head_start_s, self._host.start, self._loop, self._program)
+        now_ns = arrived_ns - self._origin_ns
         for packet in batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.deliver(batch.packets, batch.fixes)
@@ -366,4 +380,5 @@ class _RealTimeAgent:
         while True:
             await asyncio.sleep(1.0)
             if self._started:
+                self._drain()
                 self._flush()

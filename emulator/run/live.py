@@ -7,6 +7,7 @@ or waits for those started by hand, runs the pacing to the end, and leaves no pr
 from __future__ import annotations
 
 import asyncio
+import gc
 import signal
 import time
 from collections import deque
@@ -196,7 +197,7 @@ class LiveRun:
             if not self._pacing.owed:
                 self._changed.set()
         elif isinstance(message, wire.Frames) and isinstance(self._pacing, RealTime):
-            self._pacing.receive(self._now_ns(), node, message)
+            self._pacing.receive(self._time_ns(), node, message)
             self._changed.set()
         else:
             self._refuse(node, f"an unexpected {type(message).__name__}")
@@ -228,7 +229,7 @@ class LiveRun:
         """Emulated time for the event log."""
         if isinstance(self._pacing, Lockstep):
             return self._pacing.now_ns
-        return self._now_ns() if self._pacing is not None else 0
+        return max(self._now_ns(), 0) if self._pacing is not None else 0
 
     def _now_ns(self) -> int:
         return time.monotonic_ns() - self._origin_ns
@@ -277,6 +278,7 @@ class LiveRun:
             await self._join(endpoint, on_state)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
             self._emulation.watch(self._publish_period)
+            gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started = time.monotonic()
             await self._course()
             patience_s = FAREWELL_S * 5
@@ -387,10 +389,11 @@ class LiveRun:
         raise Stalled
 
     async def _run_realtime(self, realtime: RealTime) -> None:
-        self._origin_ns = time.monotonic_ns()
+        self._origin_ns = time.monotonic_ns() + wire.HEAD_START_NS
         duration_ns = self._emulation.duration_ns
         for lead, batch in realtime.start(self._origin_ns).items():
             self._send(lead, batch)
+        await asyncio.sleep(wire.HEAD_START_NS / 1e9)
         while (now_ns := self._now_ns()) < duration_ns:
             for lead, batch in realtime.due(now_ns).items():
                 self._send(lead, batch)

@@ -233,7 +233,7 @@ class RealTime:
         self._unacknowledged[lead][seq] = deliveries
         node_ids = self._emulation.world.node_ids
         packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
-        return wire.Batch(seq, packets, fixes, origin_ns)
+        return wire.Batch(fixes, seq, packets, origin_ns)
 
     def died(self, now_ns: int, lead: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""

@@ -54,7 +54,7 @@ agent_messages = st.one_of(
 )
 emulator_messages = st.one_of(
     st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3)),
-    st.builds(wire.Batch, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), st.none() | times),
+    st.builds(wire.Batch, st.lists(fixes, max_size=3), times, st.lists(packets, max_size=3), st.none() | times),
     st.just(wire.Where()),
     st.builds(wire.End, st.none() | st.binary(), names, st.booleans()),
 )
@@ -116,3 +116,10 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
     assert wire.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
     assert wire.lateness_bin(-5) == 0
     assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(emulator_messages)
+def test_batches_without_fixes_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
+    expected = isinstance(message, wire.Batch) and not message.fixes
+    assert wire.is_packets_only(wire.encode(message)) == expected

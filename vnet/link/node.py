@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -80,12 +80,19 @@ class Mailbox(Generic[T]):
     """A bounded queue with one side for the link (`deliver`) and one for the program.
 
     `waiting` tells the link whether a task of the program is waiting here: only then is a node woken by
-    what arrives; otherwise it finds it at its next wake-up.
+    what arrives; otherwise it finds it at its next wake-up. `refill` is called before the program looks, so that
+    a link may leave what nobody waits for where it is (real time).
     """
 
     def __init__(self) -> None:
+        self.refill: Callable[[], None] = lambda: None
         self._items: deque[T] = deque(maxlen=INBOX_LIMIT)
         self._waiters: deque[asyncio.Future[None]] = deque()
+
+    @property
+    def awaited(self) -> bool:
+        """Whether a task may be waiting here; safe to ask from another thread."""
+        return bool(self._waiters)
 
     @property
     def waiting(self) -> bool:
@@ -101,10 +108,12 @@ class Mailbox(Generic[T]):
 
     async def get(self) -> T:
         """The oldest item; waits for one if there is none. Safe to cancel: nothing is lost."""
+        self.refill()
         while not self._items:
             waiter = asyncio.get_running_loop().create_future()
             self._waiters.append(waiter)
             try:
+                self.refill()  # once more: what came before the waiter could be seen has woken nobody
                 await waiter
             finally:
                 self._waiters.remove(waiter)
@@ -112,6 +121,7 @@ class Mailbox(Generic[T]):
 
     def drain(self) -> list[T]:
         """All items, oldest first, without waiting."""
+        self.refill()
         items = list(self._items)
         self._items.clear()
         return items

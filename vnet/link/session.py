@@ -35,7 +35,7 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())
         config = router_config([listen], dictionary, access.access_control())
-        config["transport"]["link"] = {"tx": {"lease": lease_ms, "keep_alive": 4}}
+        config["transport"]["link"] = _link(lease_ms)
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
         session = _open(config, f"cannot listen on {listen}")
     with session:
@@ -56,7 +56,7 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {"tx": {"lease": lease_ms, "keep_alive": 4}},
+            "link": _link(lease_ms),
         },
     }
     if credentials is not None:
@@ -79,6 +79,11 @@ def router_endpoint(session: zenoh.Session) -> str:
 def quiet_zenoh() -> None:
     """Zenoh's own log on stderr, at `RUST_LOG` if set; otherwise only what vnet itself says is shown."""
     zenoh.init_log_from_env_or(os.environ.get("RUST_LOG", "off"))
+
+
+def _link(lease_ms: int) -> dict[str, Any]:
+    """Leases, and queues as long as Zenoh allows: in real time what finds its queue full is dropped."""
+    return {"tx": {"lease": lease_ms, "keep_alive": 4, "queue": {"size": {"data": 16}}}}
 
 
 def _open(config: dict[str, Any], failure: str) -> zenoh.Session:

@@ -170,9 +170,9 @@ class Batch(Message, frozen=True):
     the machine whose boot the welcome names; on other machines, its arrival.
     """
 
+    fixes: Sequence[WireFix]
     seq: Count
     packets: Sequence[WirePacket] = ()
-    fixes: Sequence[WireFix] = ()
     origin_ns: int | None = None
 
 
@@ -228,6 +228,11 @@ def decode_observation(data: bytes) -> dict[str, Any]:
     return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
 
 
+def is_packets_only(data: bytes) -> bool:
+    """Whether an encoded message is a batch without fixes: told from its first bytes, without decoding it."""
+    return data[1:8] == b"\xa5Batch\x90"
+
+
 def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
     try:
         return decoder.decode(data)
@@ -235,6 +240,8 @@ def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
         raise WireError(f"{len(data)} bytes that are no message: {error}") from None
 
 
+HEAD_START_NS = 200_000_000
+"""Real time: time 0 is this much later than the message that announces it, so that all hear of it in time."""
 LATENESS_LIMIT_NS = 20_000_000
 """Deliveries later than this count against a real-time run."""
 LATENESS_BINS = 80
