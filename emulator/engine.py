@@ -83,14 +83,13 @@ class Engine:
             pairs.cause,
         )
         pending = outcome == Outcome.pending
-        for kind, number in zip(*np.unique(outcome[~pending], return_counts=True), strict=True):
-            self.counts[Outcome(kind)] += int(number)
+        for kind, number in enumerate(np.bincount(outcome).tolist()):
+            self.counts[Outcome(kind)] += number
         rows = first_row + np.flatnonzero(pending)
         for receiver, arrival, row in zip(
             receivers[pending].tolist(), arrival_ns[pending].tolist(), rows.tolist(), strict=True
         ):
             heappush(self._pending[receiver], (arrival, frame.sender, frame.seq, row, frame.sent_ns, payload))
-        self.counts[Outcome.pending] += len(rows)
 
     def next_arrival_ns(self, node: int) -> int | None:
         """When the next pending frame arrives at `node`."""

@@ -54,12 +54,17 @@ class Launcher:
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
-    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str]) -> None:
-        """Start the process of `nodes`; its name here is that of its lead, the first node."""
+    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
+        """Start the process of `nodes`; its name here is that of its lead, the first node.
+
+        `nice` lowers its priority, so that on a full machine the emulator, which all wait for, comes first.
+        """
         arguments = ["-P", "-m", "agents.cli", "--connect", endpoint, "--run", access.run]
         for node in nodes:
             arguments += ["--node", node]
         self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
+        if nice:
+            os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
 
     def start(
         self, name: str, arguments: Sequence[str], credentials: Credentials, environment: Mapping[str, str]

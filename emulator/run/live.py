@@ -38,6 +38,7 @@ STANDING_WAIT_S = 1.0
 FAREWELL_S = 1.0
 RECORDER_WAIT_S = 20.0
 RECORDER = "recorder"
+REALTIME_AGENT_NICE = 5
 SCENE_EVERY_PERIODS = 50
 
 
@@ -307,8 +308,9 @@ class LiveRun:
             self._start_recorder(endpoint, self._options.record)
         if self._options.launch:
             on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
+            nice = REALTIME_AGENT_NICE if run.pacing == "realtime" else 0
             for nodes in groups:
-                self._launcher.start_agent(endpoint, self._options.access, nodes)
+                self._launcher.start_agent(endpoint, self._options.access, nodes, nice)
         else:
             on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
         while self._members.missing or not self._recorder_listens():

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from vnet.errors import ScenarioError
 from vnet.link.keys import is_segment
@@ -164,8 +163,21 @@ class _Town:
         return cost
 
     def _is_split(self) -> bool:
-        _, label = connected_components(self.linked, directed=False)
-        return sorted(np.bincount(label).tolist()) != sorted(self._components)
+        """Whether a district has fallen apart; districts lie too far apart to merge."""
+        first = 0
+        for size in self._components:
+            reached = np.zeros(len(self.linked), dtype=bool)
+            reached[first] = True
+            count = 1
+            while True:
+                reached |= self.linked[reached].any(axis=0)
+                if reached.sum() == count:
+                    break
+                count = int(reached.sum())
+            if count != size:
+                return True
+            first += size
+        return False
 
     def anneal(self) -> Array:
         """Move vehicles one at a time, by the rule of Metropolis, until the cost is 0; returns the best."""
