@@ -1,0 +1,174 @@
+"""Running-sum consensus: mass is neither made nor lost, whatever the radio and the vehicles do."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vnet.cmm.consensus import ConsensusConfig, RatioConsensus, Share
+
+Hears = Callable[[int, int, int], bool]
+"""Whether, in a round, a receiver hears a sender: (round, sender, receiver)."""
+
+
+class Net:
+    """Nodes that broadcast once a round to those who `hears` says; inputs (N, 2) may be changed in between."""
+
+    def __init__(self, inputs: np.ndarray, hears: Hears, config: ConsensusConfig | None = None) -> None:
+        self.inputs = inputs
+        self.config = config
+        self.hears = hears
+        self.nodes: dict[int, RatioConsensus] = {i: self.fresh(i) for i in range(len(inputs))}
+        self.said: dict[int, Share] = {}
+        self.round = 0
+
+    def fresh(self, node: int) -> RatioConsensus:
+        return RatioConsensus(f"n{node:02d}", self.config)
+
+    def run(self, rounds: int) -> None:
+        for _ in range(rounds):
+            said = {}
+            for i, node in self.nodes.items():
+                heard = {
+                    f"n{j:02d}": share for j, share in self.said.items() if j != i and self.hears(self.round, j, i)
+                }
+                said[i] = node.round(self.inputs[i], heard)
+            self.said = said
+            self.round += 1
+
+    def errors(self) -> np.ndarray:
+        """Distance of each node's mean from the true mean of those who are there."""
+        true = np.mean([self.inputs[i] for i in self.nodes], axis=0)
+        means = [node.mean_m for node in self.nodes.values()]
+        assert all(mean is not None for mean in means)
+        return np.linalg.norm(np.array(means) - true, axis=1)
+
+    def epochs(self) -> set[int]:
+        return {node.epoch for node in self.nodes.values()}
+
+    def total(self) -> np.ndarray:
+        """All mass: held, and on its way to those who have not heard the last running sum."""
+        total = sum((node.mass for node in self.nodes.values()), np.zeros(3))
+        for i, node in self.nodes.items():
+            share = self.said[i]
+            for taker in share.takers:
+                seen = self.nodes[int(taker[1:])]._seen.get(f"n{i:02d}", 0.0)
+                total = total + np.array(share.running_sum) - seen
+            assert node.epoch == share.epoch
+        return total
+
+
+def graph(count: int, seed: int, reach: float = 0.25) -> np.ndarray:
+    """A connected random geometric graph on the unit square, (N, N)."""
+    rng = np.random.default_rng(seed)
+    while True:
+        place = rng.uniform(size=(count, 2))
+        linked = np.linalg.norm(place[:, None] - place[None], axis=2) <= reach
+        np.fill_diagonal(linked, False)
+        reached = np.linalg.matrix_power(linked.astype(float) + np.eye(count), count) > 0
+        if reached.all():
+            return linked
+
+
+def lossy(linked: np.ndarray, loss: float, seed: int) -> Hears:
+    rng = np.random.default_rng(seed)
+    return lambda _, j, i: bool(linked[j, i] and rng.random() >= loss)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_all_find_the_mean_and_no_mass_is_lost(loss: float) -> None:
+    inputs = np.random.default_rng(1).normal(size=(50, 2))
+    net = Net(inputs, lossy(graph(50, 2), loss, 3))
+    net.run(60)
+    settled = net.epochs()
+    assert len(settled) == 1, "one epoch for all"
+    for _ in range(5):
+        net.run(30)
+        assert net.epochs() == settled, "loss alone starts no new epoch"
+        assert net.total() == pytest.approx([*inputs.sum(axis=0), 50], abs=1e-9)
+    spread = np.linalg.norm(inputs - inputs.mean(axis=0), axis=1).max()
+    assert net.errors().max() < 1e-3 * spread
+
+
+def test_under_a_peer_cap_only_those_who_hear_take_a_share() -> None:
+    """A receiver-side cap makes hearing one-way: a sender that split over all in range would lose mass."""
+    rng = np.random.default_rng(5)
+    place = rng.uniform(size=(60, 2))
+    distance = np.linalg.norm(place[:, None] - place[None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    rank = np.argsort(np.argsort(distance, axis=0), axis=0)
+    hears = rank < 30  # hears[j, i]: j is among the 30 nearest of i
+    assert (hears != hears.T).sum() > 100, "the cap binds and is not symmetric"
+    inputs = rng.normal(size=(60, 2))
+    net = Net(inputs, lossy(hears, 0.1, 6))
+    net.run(200)
+    assert net.total() == pytest.approx([*inputs.sum(axis=0), 60], abs=1e-9)
+    assert net.errors().max() < 1e-3
+
+
+def test_after_a_death_the_survivors_agree_on_their_own_mean() -> None:
+    inputs = np.random.default_rng(1).normal(size=(20, 2)) * 10
+    net = Net(inputs, lossy(graph(20, 4, 0.45), 0.1, 3))
+    net.run(150)
+    before = net.epochs()
+    for dead in (3, 7, 11):
+        del net.nodes[dead], net.said[dead]
+    net.run(10)
+    old_mean = np.mean(inputs, axis=0)
+    for node in net.nodes.values():
+        assert node.mean_m == pytest.approx(old_mean, abs=0.1), "the old mean serves meanwhile"
+    net.run(250)
+    assert net.epochs() != before
+    assert net.errors().max() < 0.01
+    survivors = [inputs[i] for i in net.nodes]
+    assert net.total() == pytest.approx([*np.sum(survivors, axis=0), 17], abs=1e-9)
+
+
+def test_a_restarted_node_brings_its_mass_only_once() -> None:
+    inputs = np.random.default_rng(2).normal(size=(15, 2))
+    net = Net(inputs, lossy(graph(15, 6, 0.5), 0.1, 3))
+    net.run(100)
+    net.nodes[4] = net.fresh(4)
+    net.run(250)
+    assert net.total() == pytest.approx([*inputs.sum(axis=0), 15], abs=1e-9)
+    assert net.errors().max() < 0.01
+
+
+def test_a_link_that_turns_one_way_carries_no_share_any_more() -> None:
+    linked = graph(15, 6, 0.5)
+    one_way = linked.copy()
+    first, second = np.argwhere(linked)[0]
+    one_way[first, second] = False
+    inputs = np.random.default_rng(2).normal(size=(15, 2))
+    net = Net(inputs, lambda r, j, i: bool(linked[j, i] if r < 100 else one_way[j, i]))
+    net.run(350)
+    assert f"n{second:02d}" not in net.said[int(first)].takers
+    assert net.total() == pytest.approx([*inputs.sum(axis=0), 15], abs=1e-9)
+    assert net.errors().max() < 1e-3
+
+
+def test_it_tracks_inputs_that_move() -> None:
+    inputs = np.random.default_rng(2).normal(size=(15, 2))
+    net = Net(inputs, lossy(graph(15, 6, 0.5), 0.1, 3))
+    net.run(120)
+    pace = 0.01
+    for step in range(100):
+        net.inputs = inputs + pace * step
+        net.run(1)
+    assert net.errors().max() < 10 * pace * np.sqrt(2), "less than ten rounds behind"
+    net.run(100)
+    assert net.errors().max() < 1e-3
+
+
+def test_two_components_have_two_means() -> None:
+    inputs = np.arange(20.0).reshape(10, 2)
+    net = Net(inputs, lambda _, j, i: (j < 5) == (i < 5))
+    net.run(100)
+    for i, node in net.nodes.items():
+        assert node.mean_m == pytest.approx(inputs[:5].mean(axis=0) if i < 5 else inputs[5:].mean(axis=0), abs=1e-6)
+
+
+def test_before_anything_has_settled_there_is_no_mean() -> None:
+    net = Net(np.zeros((3, 2)), lambda *_: True)
+    net.run(3)
+    assert all(node.mean_m is None for node in net.nodes.values())

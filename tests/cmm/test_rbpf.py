@@ -1,0 +1,150 @@
+"""The filter against textbook filters and closed forms."""
+
+import numpy as np
+import pytest
+
+from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
+from vnet.errors import VnetError
+from vnet.roads.lanes import LaneMap
+
+DT_S = 0.1
+NOWHERE = LaneMap(np.empty((0, 2)), np.empty(0), 0.85)
+
+
+def observation(position: np.ndarray, heading: float = 0.3) -> Observation:
+    return Observation(np.asarray(position, dtype=float), np.eye(2), heading)
+
+
+def textbook(fixes: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
+    """A Kalman filter on [x, y, ẋ, ẏ] with white acceleration 1 m²/s⁴ along, 0.01 across, written out."""
+    along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+    acceleration = np.outer(along, along) + 0.01 * np.outer(across, across)
+    process = np.block(
+        [
+            [DT_S**4 / 4 * acceleration, DT_S**3 / 2 * acceleration],
+            [DT_S**3 / 2 * acceleration, DT_S**2 * acceleration],
+        ]
+    )
+    transition = np.block([[np.eye(2), DT_S * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]])
+    observe = np.hstack([np.eye(2), np.zeros((2, 2))])
+    state = np.concatenate([fixes[0], [0, 0]])
+    covariance = np.diag([1.0, 1.0, REST_SPEED_M_S**2, REST_SPEED_M_S**2])
+    for fix in fixes[1:]:
+        state, covariance = transition @ state, transition @ covariance @ transition.T + process
+        if np.isnan(fix).any():
+            continue
+        gain = covariance @ observe.T @ np.linalg.inv(observe @ covariance @ observe.T + np.eye(2))
+        state = state + gain @ (fix - observe @ state)
+        covariance = (np.eye(4) - gain @ observe) @ covariance
+    return state, covariance
+
+
+def known_error(common_m: tuple[float, float], particles: int = 2) -> Rbpf:
+    """A filter that knows the common error: all particles on it, and it never moves."""
+    config = RbpfConfig(particles=particles, common_sigma_m=0.0, common_tau_s=1e12)
+    rbpf = Rbpf(config, NOWHERE, np.random.default_rng(0))
+    rbpf.common_m[:] = np.array(common_m)[:, None]
+    return rbpf
+
+
+@pytest.mark.parametrize("missing", [[], [5, 6, 12]])
+def test_with_a_known_common_error_it_is_the_textbook_kalman_filter(missing: list[int]) -> None:
+    rng = np.random.default_rng(3)
+    common = np.array([2.0, -1.0])
+    fixes = np.cumsum(rng.normal(0, 0.2, (30, 2)), axis=0) + rng.normal(size=(30, 2))
+    fixes[missing] = np.nan
+    rbpf = known_error((2.0, -1.0))
+    for fix in fixes:
+        rbpf.step(DT_S, {} if np.isnan(fix).any() else {"v": observation(fix + common)})
+    state, covariance = textbook(fixes, 0.3)
+    position, position_covariance = rbpf.position_m("v")
+    assert position == pytest.approx(state[:2], abs=1e-9)
+    assert rbpf.velocity_m_s("v") == pytest.approx(state[2:], abs=1e-9)
+    assert position_covariance == pytest.approx(covariance[:2, :2], abs=1e-9)
+
+
+def test_one_gain_serves_all_particles() -> None:
+    rbpf = Rbpf(RbpfConfig(particles=50), NOWHERE, np.random.default_rng(1))
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        rbpf.step(DT_S, {"v": observation(rng.normal(size=2)), "w": observation(rng.normal(size=2), 1.2)})
+    assert rbpf.mean.shape == (2, 4, 50)
+    assert rbpf.covariance.shape == (2, 4, 4)
+
+
+def test_an_outlier_is_left_out() -> None:
+    with_outlier, without = known_error((0.0, 0.0)), known_error((0.0, 0.0))
+    for _ in range(20):
+        for rbpf in (with_outlier, without):
+            rbpf.step(DT_S, {"v": observation([0.0, 0.0])})
+    with_outlier.step(DT_S, {"v": observation([60.0, 0.0])})
+    without.step(DT_S, {})
+    assert with_outlier.position_m("v")[0] == pytest.approx(without.position_m("v")[0])
+
+
+def test_a_vehicle_not_heard_for_a_while_is_forgotten_and_may_come_back() -> None:
+    rbpf = Rbpf(RbpfConfig(particles=10, forget_s=1.0), NOWHERE, np.random.default_rng(1))
+    rbpf.step(DT_S, {"v": observation([0, 0]), "w": observation([5, 5])})
+    for _ in range(15):
+        rbpf.step(DT_S, {"v": observation([0, 0])})
+    assert rbpf.vehicles == ["v"]
+    rbpf.step(DT_S, {"w": observation([5, 5])})
+    assert rbpf.vehicles == ["v", "w"]
+    assert np.isfinite(rbpf.mean).all()
+
+
+def test_systematic_resampling_is_within_one_of_what_is_expected() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        weight = rng.dirichlet(np.ones(20))
+        counts = np.bincount(systematic(weight, 100, rng), minlength=20)
+        assert np.all(np.abs(counts - 100 * weight) <= 1 + 1e-9)
+        assert counts.sum() == 100
+
+
+def test_a_collapsed_cloud_supplies_means_with_slope_minus_one() -> None:
+    rbpf = known_error((1.0, 1.0), particles=20)
+    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
+    _, slope, centre = rbpf.regression()
+    assert np.array_equal(slope[0, :2], -np.eye(2))
+    assert centre == pytest.approx([1.0, 1.0])
+    supplied, _ = rbpf.supply(np.array([[2.0, 1.0]]))
+    assert supplied[0, :2, 0] == pytest.approx([1.0, 3.0])
+
+
+def test_regression_finds_that_a_new_vehicle_is_where_its_fix_says_less_c() -> None:
+    rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
+    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
+    mean, slope, centre = rbpf.regression()
+    assert slope[0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
+    assert mean[0, :2] == pytest.approx(np.array([3.0, 4.0]) - centre)
+
+
+def crossing_error(vehicles: int, parallel: bool, seed: int) -> float:
+    """Squared error of the common error after 3 s with `vehicles` on roads of random or one direction."""
+    rng = np.random.default_rng(seed)
+    heading = np.zeros(vehicles) if parallel else rng.uniform(0, 2 * np.pi, vehicles)
+    point = rng.uniform(0, 3000, (vehicles, 2))
+    lanes = LaneMap(point, heading, 0.85)
+    normal = lanes.normal
+    place = point + rng.uniform(-0.85, 0.85, (vehicles, 1)) * normal
+    common = rng.normal(0, 3, 2)
+    rbpf = Rbpf(RbpfConfig(particles=400), lanes, np.random.default_rng(seed + 1))
+    for _ in range(30):
+        fixes = place + common + rng.normal(0, 0.3, place.shape)
+        noise = 0.09 * np.eye(2)
+        rbpf.step(DT_S, {f"v{j}": Observation(fixes[j], noise, float(heading[j])) for j in range(vehicles)})
+    return float(np.sum((rbpf.estimate_m - common) ** 2))
+
+
+def test_more_road_directions_make_a_smaller_error() -> None:
+    """MODEL 8: the squared error falls with the number of vehicles; parallel roads leave one direction open."""
+    few, many = (np.mean([crossing_error(n, False, seed) for seed in range(12)]) for n in (3, 24))
+    assert many < few / 3
+    parallel = np.mean([crossing_error(24, True, seed) for seed in range(12)])
+    assert parallel > 10 * many
+
+
+def test_a_filter_needs_particles() -> None:
+    with pytest.raises(VnetError, match="particles = 1: at least 2"):
+        RbpfConfig(particles=1)

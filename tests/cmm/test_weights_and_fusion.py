@@ -1,0 +1,132 @@
+"""Fusion weights against a general solver; and what fusion does to a filter."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from vnet.cmm.fusion import Cloud, fuse
+from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+from vnet.cmm.weights import OptimizedWeights, largest_remainder, random_weights
+from vnet.errors import VnetError
+from vnet.roads.lanes import LaneMap
+
+
+def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 32))
+    estimates = rng.normal(size=(count, 2)) * rng.uniform(0.05, 3)
+    covariances = np.eye(2) * rng.uniform(0.001, 0.5, (count, 1, 1))
+    return estimates, covariances, rng.normal(size=2) * 0.3
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_optimized_weights_are_the_minimum(seed: int) -> None:
+    estimates, covariances, mean = problem(seed)
+    weights = OptimizedWeights().solve(estimates, covariances, mean)
+    offset = estimates - mean
+    hessian = offset @ offset.T + np.diag(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.01))
+    count = len(estimates)
+    best = minimize(
+        lambda a: a @ hessian @ a,
+        np.full(count, 1 / count),
+        jac=lambda a: 2 * hessian @ a,
+        bounds=[(0, 1)] * count,
+        constraints={"type": "eq", "fun": lambda a: a.sum() - 1, "jac": lambda a: np.ones(count)},
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 1000},
+    )
+    assert weights @ hessian @ weights <= best.fun * (1 + 1e-5)
+    assert weights.sum() == pytest.approx(1)
+    assert np.all((weights >= 0) & (weights <= 1))
+
+
+def test_the_same_history_gives_the_same_bits() -> None:
+    first, second = OptimizedWeights(), OptimizedWeights()
+    for seed in range(40):
+        assert np.array_equal(first.solve(*problem(seed)), second.solve(*problem(seed)))
+
+
+def test_a_floor_keeps_ones_own_estimate() -> None:
+    estimates = np.array([[5.0, 5.0], [0.0, 0.0], [0.1, 0.0]])
+    covariances = np.eye(2) * np.full((3, 1, 1), 0.01)
+    assert OptimizedWeights().solve(estimates, covariances, np.zeros(2))[0] < 0.01
+    assert OptimizedWeights(0.25).solve(estimates, covariances, np.zeros(2))[0] == pytest.approx(0.25, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    "bad", [np.zeros((2, 2)), -np.eye(2), np.array([[1.0, 2.0], [2.0, 1.0]]), np.eye(2) * np.nan]
+)
+def test_a_covariance_that_is_none_is_refused(bad: np.ndarray) -> None:
+    with pytest.raises(VnetError, match=r"covariance 1 = .* not positive definite"):
+        OptimizedWeights().solve(np.zeros((2, 2)), np.array([np.eye(2), bad]), np.zeros(2))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.floats(0.001, 1), min_size=1, max_size=31), st.integers(0, 500))
+def test_largest_remainder_shares_out_everything_in_proportion(raw: list[float], total: int) -> None:
+    weights = np.array(raw) / np.sum(raw)
+    counts = largest_remainder(weights, total)
+    assert counts.sum() == total
+    assert np.all(np.abs(counts - weights * total) < 1 + 1e-9)
+
+
+def test_random_weights_add_up() -> None:
+    weights = random_weights(5, np.random.default_rng(0))
+    assert weights.sum() == pytest.approx(1)
+    assert np.all(weights > 0)
+
+
+LANES = LaneMap(np.array([[0.0, 0.0], [0.0, 0.0]]), np.array([0.0, np.pi / 2]), 0.85)
+
+
+def settled(seed: int = 0) -> Rbpf:
+    """A filter that has seen two crossing roads for two seconds; the common error is (2, −1)."""
+    rbpf = Rbpf(RbpfConfig(particles=100), LANES, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed + 1)
+    for _ in range(20):
+        noisy = np.array([2.0, -1.0]) + rng.normal(0, 0.5, (2, 2))
+        noise = 0.25 * np.eye(2)
+        rbpf.step(0.1, {"a": Observation(noisy[0], noise, 0.0), "b": Observation(noisy[1], noise, np.pi / 2)})
+    return rbpf
+
+
+ALL = frozenset({"a", "b"})
+
+
+def test_all_weight_on_oneself_keeps_ones_own_hypotheses() -> None:
+    rbpf = settled()
+    before = rbpf.estimate_m
+    stacked = fuse(rbpf, [Cloud(np.full((10, 2), 99.0), ALL)], np.array([1.0, 0.0]), np.random.default_rng(2))
+    assert stacked == pytest.approx(before)
+    assert np.abs(rbpf.common_m).max() < 20
+
+
+def test_the_stacked_estimate_is_the_weighted_mean_of_the_clouds() -> None:
+    rbpf = settled()
+    rbpf.resample()
+    own = rbpf.estimate_m
+    cloud = Cloud(np.tile([1.0, 1.0], (50, 1)), ALL)
+    stacked = fuse(rbpf, [cloud], np.array([0.5, 0.5]), np.random.default_rng(2))
+    assert stacked == pytest.approx((own + 1.0) / 2, abs=0.05)
+    assert rbpf.common_m.shape == (2, 100)
+    assert rbpf.mean.shape == (2, 4, 100)
+
+
+def test_roads_that_a_neighbour_does_not_know_weigh_its_hypotheses() -> None:
+    wrong = np.tile([-8.0, 9.0], (50, 1))  # puts both vehicles far off their roads
+    knowing, ignorant = settled(), settled()
+    fuse(knowing, [Cloud(wrong, ALL)], np.array([0.5, 0.5]), np.random.default_rng(2))
+    fuse(ignorant, [Cloud(wrong, frozenset())], np.array([0.5, 0.5]), np.random.default_rng(2))
+    assert np.sum(knowing.common_m[0] == -8.0) == 50
+    assert np.sum(ignorant.common_m[0] == -8.0) == 0
+    assert ignorant.estimate_m == pytest.approx([2.0, -1.0], abs=1.0)
+
+
+def test_imported_hypotheses_get_this_filters_own_vehicles() -> None:
+    rbpf = settled()
+    position, _ = rbpf.position_m("a")
+    fix = position + rbpf.estimate_m
+    fuse(rbpf, [Cloud(np.tile([3.0, -1.0], (50, 1)), ALL)], np.array([0.0, 1.0]), np.random.default_rng(2))
+    assert rbpf.position_m("a")[0] == pytest.approx(fix - [3.0, -1.0], abs=0.3)
