@@ -39,6 +39,7 @@ class Options:
     common_tau_s: float = 600.0
     lateral_tau_s: float = 20.0
     self_floor: float = 0.0
+    fusion_interval_s: float = 1.0
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
@@ -56,7 +57,7 @@ class Options:
             raise ProgramError(f"program.options.fusion = {parsed.fusion!r}: allowed: {', '.join(FUSIONS)}")
         if not 2 <= parsed.particles <= 100_000:
             raise ProgramError(f"program.options.particles = {parsed.particles}: 2 to 100000 allowed")
-        for key in ("common_tau_s", "lateral_tau_s"):
+        for key in ("common_tau_s", "lateral_tau_s", "fusion_interval_s"):
             if not getattr(parsed, key) > 0:
                 raise ProgramError(f"program.options.{key} = {getattr(parsed, key)}: must be positive")
         if not 0 <= parsed.self_floor <= 1 or not parsed.common_sigma_m >= 0:
@@ -71,6 +72,7 @@ class Estimator:
         self.name = short_name(node_id)
         self.rejected: Counter[str] = Counter()
         self.stacked_m: Array | None = None
+        self._since_fusion_s = 0.0
         self._options = options
         self._rng = rng
         config = RbpfConfig(
@@ -109,12 +111,16 @@ class Estimator:
                 observations[sender] = Observation(frame.fix_m, own.covariance_m2, frame.heading_rad)
         self.rbpf.step(dt_s, observations)
         self._share = self.consensus.round(self.rbpf.estimate_m, {s: _share(f) for s, f in frames.items()})
-        self.stacked_m = self._fuse(frames)
+        self._since_fusion_s += dt_s
+        due = self._since_fusion_s >= self._options.fusion_interval_s - dt_s / 2
+        if due and frames and self._options.fusion != "none":
+            self._since_fusion_s = 0.0
+            self.stacked_m = self._fuse(frames)
+        else:
+            self.stacked_m = self.rbpf.estimate_m
 
     def _fuse(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         rbpf = self.rbpf
-        if self._options.fusion == "none" or not frames:
-            return rbpf.estimate_m
         estimates = np.array([rbpf.estimate_m, *(frame.estimate_m for frame in frames.values())])
         if self._options.fusion == "random":
             weights = random_weights(len(estimates), self._rng)
