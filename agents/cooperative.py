@@ -39,7 +39,7 @@ class Options:
     common_tau_s: float = 600.0
     lateral_tau_s: float = 20.0
     self_floor: float = 0.0
-    fusion_interval_s: float = 1.0
+    fusion_interval_s: float = 0.5
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
