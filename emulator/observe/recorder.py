@@ -28,6 +28,7 @@ BLUE, ORANGE, GREEN, RED, GREY, BLACK = (
     (90, 90, 90),
 )
 LANE_HALF_LENGTH_M = 250.0
+COMMON_VIEW_M, ERRORS_VIEW_M = 2.5, 10.0
 SERIES = {
     "error/rmse": ("common_error_rmse_m", "RMSE of the common error (m)", RED),
     "error/deviation": ("deviation_m", "deviation between vehicles (m)", BLUE),
@@ -77,6 +78,11 @@ class Recorder:
         strips = np.stack([point - along, point + along], axis=1)
         lanes = rr.LineStrips2D(_flip(strips), colors=[GREY], radii=rr.Radius.ui_points(1.0))
         self._recording.log("map/lanes", lanes, static=True)
+        for view, arm_m in (("common", COMMON_VIEW_M), ("errors", ERRORS_VIEW_M)):
+            cross = rr.LineStrips2D(
+                [[[-arm_m, 0], [arm_m, 0]], [[0, -arm_m], [0, arm_m]]], colors=[RED], radii=[0.005]
+            )
+            self._recording.log(f"{view}/truth", cross, static=True)
         for entity, (_, name, colour) in SERIES.items():
             self._recording.log(f"series/{entity}", rr.SeriesLines(names=name, colors=[colour]), static=True)
         for outcome, colour in OUTCOMES.items():
@@ -105,11 +111,11 @@ class Recorder:
         self._points("errors/estimate", unpack(message["estimate_m"], 2) - position, BLUE, 3.0)
 
     def _common_error(self, message: dict[str, Any]) -> None:
+        truth = unpack(message["common_error_m"], 2)
         if message["clouds"]:
             clouds = np.concatenate([unpack(cloud, 2) for cloud in message["clouds"].values()])
-            self._points("common/particles", clouds, GREY, 1.0)
-        self._points("common/estimates", unpack(message["common_error_estimate_m"], 2), BLUE, 4.0)
-        self._points("common/truth", unpack(message["common_error_m"], 2), RED, 7.0, labels=["truth"])
+            self._points("common/particles", clouds - truth, GREY, 1.0)
+        self._points("common/estimates", unpack(message["common_error_estimate_m"], 2) - truth, BLUE, 4.0)
 
     def _series(self, message: dict[str, Any]) -> None:
         for entity, (figure, _, _) in SERIES.items():
@@ -118,6 +124,8 @@ class Recorder:
                 self._recording.log(f"series/{entity}", rr.Scalars(value))
         for outcome in OUTCOMES:
             count = message["counts"].get(outcome, 0)
+            if count == 0:  # nothing of the kind so far: no line
+                continue
             self._recording.log(f"series/frames/{outcome}", rr.Scalars(count - self._counts.get(outcome, 0)))
         self._counts = message["counts"]
 
@@ -157,18 +165,22 @@ def _flip(position: ArrayLike) -> NDArray[np.float32]:
 
 
 def _blueprint() -> rrb.Blueprint:
-    metres = rrb.VisualBounds2D(x_range=[-8, 8], y_range=[-8, 8])
+    def around_truth(half_m: float) -> rrb.VisualBounds2D:
+        return rrb.VisualBounds2D(x_range=[-half_m, half_m], y_range=[-half_m, half_m])
+
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Spatial2DView(origin="map", name="Vehicles and links of the last period (east →, north ↑; m)"),
+            rrb.Spatial2DView(origin="map", name="Vehicles, and links of the last period (m; east →, north ↑)"),
             rrb.Vertical(
                 rrb.Spatial2DView(
-                    origin="common", name="Common GNSS error: truth, estimates, particles (m)", visual_bounds=metres
+                    origin="common",
+                    name="Common error − truth: estimates, particles (m)",
+                    visual_bounds=around_truth(COMMON_VIEW_M),
                 ),
                 rrb.Spatial2DView(
                     origin="errors",
-                    name="Position errors: raw fix (grey), estimate (blue) (m)",
-                    visual_bounds=metres,
+                    name="Position − truth: raw fixes grey, estimates blue (m)",
+                    visual_bounds=around_truth(ERRORS_VIEW_M),
                 ),
             ),
             rrb.Vertical(
