@@ -32,7 +32,7 @@ def write(folder: Path, text: str) -> Path:
         ("[network]\nkind = 'file'\npath = 'no.csv'", ["network.path = 'no.csv'", "no such file"]),
         ("radio = 3", ["radio = 3"]),
         ("[radio", ["not valid TOML"]),
-        ("[program]\nentry = 'beacon'", ["program.entry = 'beacon'"]),
+        ("[program]\nentry = 'beacon'", ["program.entry = 'beacon'", "package.module:function"]),
     ],
 )
 def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, parts: list[str]) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from vnet.errors import ScenarioError
 
@@ -112,8 +113,15 @@ class Radio(Section):
 class Program(Section):
     """`[program]`: what every vehicle runs, as `package.module:function`, and the options it is given."""
 
-    entry: str = Field("agents.beacon:main", pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")
+    entry: str = "agents.beacon:main"
     options: dict[str, Any] = {}
+
+    @field_validator("entry")
+    @classmethod
+    def _entry_is_module_and_function(cls, entry: str) -> str:
+        if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", entry):
+            raise ValueError("write it as package.module:function")
+        return entry
 
 
 class Scenario(Section):

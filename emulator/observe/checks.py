@@ -23,6 +23,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from emulator.channel.outcomes import Outcome
 from emulator.observe.run_folder import Event, read_events
 from emulator.observe.trace import read_trace, sha256_of_table
 from vnet.errors import VnetError
@@ -31,6 +32,7 @@ from vnet.scenario import Scenario, load_scenario
 
 LATE_SHARE_LIMIT = 0.001
 LOSS_BAND = 0.999
+IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
 
 
 class Verdict(StrEnum):
@@ -85,6 +87,12 @@ class Evidence:
         """The number of each node."""
         return {node: number for number, node in enumerate(self.node_ids)}
 
+    def number_of(self, node: str | None) -> int:
+        """The number of a node that trace or events name. Raises VnetError if the states do not know it."""
+        if node not in self.number:
+            raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
+        return self.number[node]
+
     def column(self, name: str) -> NDArray[np.int64]:
         """A column of whole numbers of the trace."""
         return np.asarray(self.trace[name].to_numpy(), dtype=np.int64)
@@ -92,7 +100,7 @@ class Evidence:
     def nodes(self, name: str) -> NDArray[np.intp]:
         """A column of node ids of the trace as numbers."""
         column = self.trace[name].combine_chunks()
-        code = np.array([self.number[node] for node in column.dictionary.to_pylist()], dtype=np.intp)
+        code = np.array([self.number_of(node) for node in column.dictionary.to_pylist()], dtype=np.intp)
         return np.asarray(code[column.indices.to_numpy()])
 
     def outcome_is(self, *names: str) -> NDArray[np.bool_]:
@@ -114,7 +122,7 @@ class Evidence:
         down = np.full(len(self.node_ids), np.inf)
         for event in self.event("died", "crashed", "finished", "spun"):
             if event.node is not None:
-                number = self.number[event.node]
+                number = self.number_of(event.node)
                 down[number] = min(down[number], event.time_ns)
         return down
 
@@ -137,27 +145,36 @@ def _in_range(evidence: Evidence) -> NDArray[np.bool_]:
     return np.asarray(in_range)
 
 
+def _nothing_seen(name: str, evidence: Evidence, text: str) -> CheckResult | NotExercised:
+    """Nothing observed is unknown, unless there was nobody to observe it."""
+    if not _in_range(evidence).any():
+        return NotExercised(name, "no vehicle has another in range")
+    return CheckResult(name, Verdict.UNKNOWN, text)
+
+
 def check_conservation(evidence: Evidence) -> CheckResult | NotExercised:
     """Every frame has exactly one row, with exactly one outcome, for each receiver in range."""
     name = "conservation"
     if not len(evidence.trace):
-        return CheckResult(name, Verdict.UNKNOWN, "no frame was sent")
+        return _nothing_seen(name, evidence, "no frame was sent")
     sender, receiver = evidence.nodes("sender"), evidence.nodes("receiver")
     seq, copy = evidence.column("seq"), evidence.column("copy")
     rows = np.column_stack([sender, seq, receiver, copy])
     repeated = len(rows) - len(np.unique(rows, axis=0))
     frames, heard = np.unique(np.column_stack([sender, seq])[copy == 0], axis=0, return_counts=True)
-    degree = _in_range(evidence).sum(axis=1)
-    wrong = int(np.sum(heard != degree[frames[:, 0]]))
-    pending = int(evidence.outcome_is("pending").sum())
+    in_range = _in_range(evidence)
+    wrong = int(np.sum(heard != in_range.sum(axis=1)[frames[:, 0]]))
+    strangers = int(np.sum(~in_range[sender, receiver]))
+    undecided = int(np.sum(~evidence.outcome_is(*IN_TRACE)))
     gaps = _missing_numbers(frames)
-    broken = repeated + wrong + pending + gaps
+    broken = repeated + wrong + strangers + undecided + gaps
     figures = {
         "frames": len(frames),
         "pairs": len(rows),
         "repeated": repeated,
         "wrong_count": wrong,
-        "undecided": pending,
+        "not_in_range": strangers,
+        "undecided": undecided,
         "missing_frames": gaps,
     }
     text = f"{len(frames):,} frames, {len(rows):,} pairs in range, each with one outcome"
@@ -178,7 +195,7 @@ def check_range(evidence: Evidence) -> CheckResult | NotExercised:
     name = "range"
     delivered = evidence.outcome_is("delivered")
     if not delivered.any():
-        return CheckResult(name, Verdict.UNKNOWN, "nothing was delivered")
+        return _nothing_seen(name, evidence, "nothing was delivered")
     reached = _in_range(evidence)[evidence.nodes("sender"), evidence.nodes("receiver")]
     beyond = int(np.sum(delivered & ~reached))
     count = int(delivered.sum())
@@ -214,6 +231,9 @@ def check_peer_cap(evidence: Evidence) -> CheckResult | NotExercised:
         rows = judged & (sent_ns > start) & (sent_ns < end)
         wrong += int(np.sum(admitted[sender, receiver][rows] == capped[rows]))
     figures = {"cap": cap, "largest_in_range": largest, "capped": int(capped.sum()), "wrong": wrong}
+    if not wrong and not capped.any():
+        text = f"the cap of {cap} never acted, though up to {largest} are in range: those beyond it sent nothing"
+        return CheckResult(name, Verdict.UNKNOWN, text, figures)
     text = f"{int(capped.sum()):,} pairs beyond the nearest {cap} (up to {largest} in range)"
     return _result(name, wrong, text, f"{wrong} pairs on the wrong side of the cap", **figures)
 
@@ -235,7 +255,7 @@ def check_loss_rate(evidence: Evidence) -> CheckResult | NotExercised:
     lost = int(evidence.outcome_is("lost").sum())
     drawn = lost + int(evidence.outcome_is("delivered", "receiver_down", "transport").sum())
     if drawn == 0:
-        return CheckResult(name, Verdict.UNKNOWN, "no pair came as far as the loss")
+        return _nothing_seen(name, evidence, "no pair came as far as the loss")
     low, high = (
         (int(edge) for edge in binom.interval(LOSS_BAND, drawn, loss)) if 0 < loss < 1 else (loss * drawn,) * 2
     )
@@ -259,12 +279,14 @@ def check_agents_alive(evidence: Evidence) -> CheckResult | NotExercised:
     """No process died and no program crashed."""
     name = "agents_alive"
     gone = evidence.event("died", "crashed")
+    if not gone and not evidence.event("started"):
+        return CheckResult(name, Verdict.UNKNOWN, "no event says that the run started")
     if not gone:
-        return CheckResult(name, Verdict.VALID, f"all {len(evidence.node_ids)} nodes to the end")
+        return CheckResult(name, Verdict.VALID, f"all {len(evidence.node_ids) or ''} nodes to the end")
     first = gone[0]
     why = first.details.get("error") or first.details.get("how", "")
     when = f"{first.node} {first.kind} at {first.time_ns / 1e9:.3f} s"
-    text = f"{len(gone)} of {len(evidence.node_ids)} nodes: {when}: {why}"
+    text = f"{len(gone)} of {len(evidence.node_ids) or 'the'} nodes: {when}: {why}"
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
     return CheckResult(name, Verdict.INVALID, text, {"gone": listed})
 
@@ -283,6 +305,12 @@ def check_progress(evidence: Evidence) -> CheckResult | NotExercised:
     if interrupted := evidence.event("interrupted"):
         text = f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s"
         return CheckResult(name, Verdict.UNKNOWN, text)
+    if not evidence.event("ended"):
+        return CheckResult(name, Verdict.UNKNOWN, "no event says that the run ended")
+    due = evidence.scenario.duration_ns // evidence.scenario.period_ns
+    if len(evidence.metrics) != due or len(evidence.states) != due * len(evidence.node_ids):
+        text = f"{len(evidence.metrics)} periods kept, {due} due"
+        return CheckResult(name, Verdict.UNKNOWN, text, {"periods": len(evidence.metrics), "due": due})
     return CheckResult(name, Verdict.VALID, f"{evidence.scenario.run.duration_s:g} s emulated to the end")
 
 
@@ -309,7 +337,7 @@ def check_kept_up(evidence: Evidence) -> CheckResult | NotExercised:
     if evidence.scenario.run.pacing != "realtime":
         return NotExercised(name, "in lockstep nothing can be late")
     late = evidence.event("late_deliveries")
-    if not late:
+    if not late or not late[-1].details["total"]:
         return CheckResult(name, Verdict.UNKNOWN, "no delivery was timed")
     figures = late[-1].details
     share = figures["count"] / figures["total"]
@@ -328,6 +356,7 @@ CHECKS: tuple[Check, ...] = (
     check_finite,
     check_kept_up,
 )
+NEED_POSITIONS = (check_conservation, check_range, check_peer_cap, check_loss_rate)
 
 
 @dataclass(frozen=True)
@@ -355,10 +384,18 @@ class Judgement:
 
 def judge(evidence: Evidence) -> Judgement:
     """Run all checks."""
-    results = [check(evidence) for check in CHECKS]
+    results = [_apply(check, evidence) for check in CHECKS]
     checks = [result for result in results if isinstance(result, CheckResult)]
     skipped = [result for result in results if isinstance(result, NotExercised)]
     return Judgement(checks, skipped, sha256_of_table(evidence.trace))
+
+
+def _apply(check: Check, evidence: Evidence) -> CheckResult | NotExercised:
+    """A run that ended within its first period has no states: who was in range of whom is not known."""
+    if check in NEED_POSITIONS and not len(evidence.states):
+        name = check.__name__.removeprefix("check_")
+        return CheckResult(name, Verdict.UNKNOWN, "no period was completed, so nobody's position is known")
+    return check(evidence)
 
 
 def check_run(folder: Path) -> Judgement:

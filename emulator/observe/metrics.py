@@ -232,7 +232,7 @@ def _rms(array: Array) -> float | None:
 def _anees(error: Array, covariance: Array) -> float | None:
     known = np.isfinite(error).all(axis=1) & np.isfinite(covariance).all(axis=1)
     error, matrix = error[known], covariance[known].reshape(-1, 2, 2)
-    regular = np.linalg.det(matrix) > 1e-18
+    regular = (np.linalg.det(matrix) > 1e-18) & (np.trace(matrix, axis1=1, axis2=2) > 0)  # positive definite
     if not regular.any():
         return None
     error, matrix = error[regular], matrix[regular]

@@ -67,7 +67,7 @@ def period_message(
         "clouds": {
             node: pack(cloud)
             for node, report in last.items()
-            if (cloud := report.values.get("cloud_m")) is not None
+            if isinstance(cloud := report.values.get("cloud_m"), list) and len(cloud) % 2 == 0
         },
         "figures": asdict(figures),
         "counts": counts,

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,11 @@ class RunFolder:
 
         Never touches another run's files: a `path` that is not empty is refused.
         """
-        folder = cls(path or _unused(RUNS / f"{scenario.run.name}-{scenario.run.seed}"))
-        if path is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise VnetError(f"--out {path}: exists and is not an empty folder")
-        with _disk(folder.path):
+        default = RUNS / f"{scenario.run.name}-{scenario.run.seed}"
+        with _disk(path or default):
+            if path is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
+                raise VnetError(f"--out {path}: exists and is not an empty folder")
+            folder = cls(path or _claim(default))
             folder.logs.mkdir(parents=True)
             (folder.path / "scenario.toml").write_text(dump_scenario(scenario))
             (folder.path / "events.jsonl").touch()
@@ -103,13 +105,14 @@ def _write_text(path: Path, text: str) -> None:
     path.write_text(text)
 
 
-def _unused(path: Path) -> Path:
-    number = 2
-    candidate = path
-    while candidate.exists():
-        candidate = path.with_name(f"{path.name}-{number}")
-        number += 1
-    return candidate
+def _claim(path: Path) -> Path:
+    """Make the first of path, path-2, path-3 … that does not exist; two runs that start at once get two."""
+    for number in count(1):
+        candidate = path if number == 1 else path.with_name(f"{path.name}-{number}")
+        with contextlib.suppress(FileExistsError):
+            candidate.mkdir(parents=True)
+            return candidate
+    raise AssertionError("count() ends")
 
 
 def _point_latest_to(path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +30,21 @@ def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, c
     console.print(_frames(verdict["frames_by_outcome"]))
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
-    console.print(f"next         {verdict['reproduce']}   (the same run again)", highlight=False, soft_wrap=True)
-    console.print(f"             vnet check {folder}   (judge it again)", highlight=False, soft_wrap=True)
+    following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
     if (folder / "recording.rrd").exists():
-        console.print(
-            f"             rerun {folder / 'recording.rrd'}   (look at it)", highlight=False, soft_wrap=True
-        )
+        following[f"rerun {folder / 'recording.rrd'}"] = "look at it"
+    for number, (command, why) in enumerate(following.items()):
+        heading = "" if number else "next"
+        console.print(f"{heading:13}{as_typed(command)}   ({why})", highlight=False, soft_wrap=True)
+
+
+def as_typed(command: str) -> str:
+    """A command as this user must type it: with its folder where that is not on the PATH."""
+    program, _, rest = command.partition(" ")
+    if shutil.which(program) is None:
+        beside = Path(sys.executable).parent / program
+        program = str(beside.relative_to(Path.cwd())) if beside.is_relative_to(Path.cwd()) else str(beside)
+    return f"{program} {rest}"
 
 
 def print_checks(judgement: Judgement, console: Console) -> None:

@@ -172,3 +172,25 @@ def test_before_anything_has_settled_there_is_no_mean() -> None:
     net = Net(np.zeros((3, 2)), lambda *_: True)
     net.run(3)
     assert all(node.mean_m is None for node in net.nodes.values())
+
+
+def test_without_loss_it_is_the_linear_iteration() -> None:
+    """MODEL 8: x(t+1) = A x(t), A_ij = 1/(d_j + 1); the error falls by the second-largest |eigenvalue| a round."""
+    linked = graph(20, 4, 0.45)
+    inputs = np.random.default_rng(1).normal(size=(20, 2))
+    net = Net(inputs, lambda _, j, i: bool(linked[j, i]))
+    net.run(60)
+    epochs = net.epochs()
+    kept = np.array([net.nodes[i].mass for i in range(20)])  # what a node keeps is what each of its peers gets
+    net.run(1)
+    assert net.epochs() == epochs
+    arrived = kept + linked.T @ kept
+    expected = arrived / (linked.sum(axis=0) + 1)[:, None]
+    assert np.array([net.nodes[i].mass for i in range(20)]) == pytest.approx(expected, abs=1e-12)
+
+    iteration = (linked + np.eye(20)) / (linked.sum(axis=0) + 1)
+    rates = np.sort(np.abs(np.linalg.eigvals(iteration)))[::-1]
+    assert rates[0] == pytest.approx(1.0)
+    first = net.errors().max()
+    net.run(40)
+    assert (net.errors().max() / first) ** (1 / 40) == pytest.approx(rates[1], rel=0.05)

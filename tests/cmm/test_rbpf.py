@@ -145,6 +145,24 @@ def test_more_road_directions_make_a_smaller_error() -> None:
     assert parallel > 10 * many
 
 
+def test_without_a_map_nothing_separates_a_vehicle_from_the_error() -> None:
+    """The fixes alone say where vehicle plus error is: the spread of c stays that of its prior."""
+    rbpf = Rbpf(RbpfConfig(particles=2000, common_tau_s=1e9), NOWHERE, np.random.default_rng(0))
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        rbpf.step(DT_S, {f"v{j}": observation(rng.normal(size=2)) for j in range(5)})
+    assert np.sqrt(np.diag(rbpf.estimate_covariance_m2)) == pytest.approx([3.0, 3.0], rel=0.2)
+
+
+def test_the_variance_of_a_mean_of_independent_fixes() -> None:
+    """A vehicle at rest, known error: after n fixes of variance 1 the variance is 1/n (no process noise)."""
+    config = RbpfConfig(particles=2, common_sigma_m=0.0, common_tau_s=1e12, acceleration_m2_s4=0.0)
+    rbpf = Rbpf(config, NOWHERE, np.random.default_rng(0))
+    for _ in range(25):
+        rbpf.step(1e-6, {"v": observation([1.0, 1.0])})
+    assert rbpf.position_m("v")[1] == pytest.approx(np.eye(2) / 25, rel=1e-3, abs=1e-6)
+
+
 def test_a_filter_needs_particles() -> None:
     with pytest.raises(VnetError, match="particles = 1: at least 2"):
         RbpfConfig(particles=1)
