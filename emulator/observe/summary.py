@@ -79,7 +79,9 @@ def _figures(verdict: dict[str, Any]) -> Table:
     table.add_column(justify="right")
     table.add_row("vehicles", str(verdict["vehicles"]))
     table.add_row("emulated time", f"{verdict['emulated_s']:.1f} s")
-    table.add_row("wall-clock time", f"{verdict['wall_s']:.1f} s")
+    if verdict["start_up_s"]:
+        table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
+    table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
     for name, title in _FIGURES.items():
         if (value := verdict["figures"].get(name)) is not None:

@@ -17,6 +17,12 @@ from emulator.run.emulation import Emulation
 FORMAT = 1
 
 
+def _start_up_s(emulation: Emulation) -> float | None:
+    """How long the processes took to start and join; None if they never did."""
+    started = [event for event in emulation.folder.events if event.kind == "started"]
+    return float(started[0].details["start_up_s"]) if started else None
+
+
 def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgement, dict[str, Any]]:
     """Write what is kept of a run and judge it. `command` is the vnet command that ran it (run, simulate).
 
@@ -40,6 +46,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         "trace_sha256": judgement.trace_sha256,
         "metrics_sha256": emulation.metrics.sha256(),
         "emulated_s": emulated_s,
+        "start_up_s": _start_up_s(emulation),
         "wall_s": round(wall_s, 3),
         "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,
         "seed": emulation.scenario.run.seed,

@@ -1,8 +1,8 @@
 """Who may do what on the router: users, passwords and rules for one run.
 
 The router denies by default. Roles: *node* (one user an agent process, granted exactly its nodes' keys),
-*observer* (receives only), *operator* (queries control) and *emulator* (all of the run's keys; needed only
-where the emulator is a client of a separate `zenohd`). Rules have no templating by user name, so that there
+*observer* (receives only) and *emulator* (all of the run's keys; needed only where the emulator is a client of a
+separate `zenohd`). Rules have no templating by user name, so that there
 is a set for each process.
 """
 
@@ -23,7 +23,6 @@ Rule = dict[str, Any]
 
 EMULATOR = "emulator"
 OBSERVER = "observer"
-OPERATOR = "operator"
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Access:
     @classmethod
     def create(cls, run: str, processes: Sequence[Sequence[str]]) -> Access:
         """Draw new passwords for every process and role of a run."""
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
+        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER]
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
@@ -99,7 +98,6 @@ class Access:
             keys.node_report(self.run, "*"),
             keys.emulator_alive(self.run),
         ]
-        control = [keys.control(self.run, "*")]
         return [
             *roles,
             (
@@ -107,13 +105,6 @@ class Access:
                 [
                     _rule("observer-in", ["ingress"], [*SUBSCRIBE, *WATCH_TOKENS], observed),
                     _rule("observer-out", ["egress"], ["put", "delete", "liveliness_token"], observed),
-                ],
-            ),
-            (
-                OPERATOR,
-                [
-                    _rule("operator-in", ["ingress"], ["query"], control),
-                    _rule("operator-out", ["egress"], ["reply", "declare_queryable"], control),
                 ],
             ),
             (EMULATOR, [_rule("emulator", ["ingress", "egress"], EVERYTHING, [f"vnet/{self.run}/**"])]),

@@ -43,11 +43,6 @@ def observe(run: str, stream: str) -> str:
     return f"vnet/{run}/observe/{stream}"
 
 
-def control(run: str, verb: str) -> str:
-    """Queries of operators to the emulator."""
-    return f"vnet/{run}/control/{verb}"
-
-
 def node_of(key: str) -> str:
     """The node id in one of the `node/` keys above."""
     return key.split("/")[3]
