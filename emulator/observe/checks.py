@@ -138,6 +138,8 @@ def _result(name: str, broken: int, text: str, broken_text: str, **figures: Any)
 
 def _in_range(evidence: Evidence) -> NDArray[np.bool_]:
     """(N, N), rows are senders: who is in range of whom. Vehicles stand still but for their place in the lane."""
+    if not len(evidence.states):  # a run that ended before its first period did
+        return np.zeros((0, 0), dtype=bool)
     position_m = evidence.positions()[0]
     offset = position_m[:, None] - position_m[None]
     in_range = np.hypot(offset[..., 0], offset[..., 1]) <= evidence.scenario.radio.range_m
@@ -282,7 +284,8 @@ def check_agents_alive(evidence: Evidence) -> CheckResult | NotExercised:
     if not gone and not evidence.event("started"):
         return CheckResult(name, Verdict.UNKNOWN, "no event says that the run started")
     if not gone:
-        return CheckResult(name, Verdict.VALID, f"all {len(evidence.node_ids) or ''} nodes to the end")
+        who = f"all {len(evidence.node_ids)} nodes" if evidence.node_ids else "all nodes"
+        return CheckResult(name, Verdict.VALID, f"{who} to the end")
     first = gone[0]
     why = first.details.get("error") or first.details.get("how", "")
     when = f"{first.node} {first.kind} at {first.time_ns / 1e9:.3f} s"
