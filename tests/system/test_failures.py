@@ -60,6 +60,21 @@ def test_an_interruption_ends_everything_and_leaves_readable_files(tmp_path: Pat
     assert check_run(folder).exit_status == 3
 
 
+def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    command = [*VNET, "emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--out", str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        while "waiting for 10 vehicles" not in (line := process.stderr.readline()):
+            assert line, "it ended early"
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 130
+    assert "Traceback" not in stderr
+    assert "interrupted at 0.000 s" in stdout
+    assert check_run(folder).exit_status == 3
+
+
 def test_agents_that_lose_the_emulator_end_with_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with long_run(folder, "--set", "run.orphan_timeout_s=0.5") as process:
