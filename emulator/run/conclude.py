@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import platform
+import shlex
 from dataclasses import asdict
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -53,8 +55,12 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
-        "reproduce": f"vnet {command} {folder.path / 'scenario.toml'}",
-        "versions": {"python": platform.python_version(), "numpy": np.__version__},
+        "reproduce": f"vnet {command} {shlex.quote(str(folder.path / 'scenario.toml'))}",
+        "versions": {
+            "vnet": version("vnet-emulator"),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
     }
     folder.put_json("verdict.json", verdict)
     return judgement, verdict
