@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from emulator.channel.outcomes import Outcome
 
 NOT_ARRIVING = -1
+FIRST_ROWS = 1 << 22
+"""Room from the start: the system hands out zeroed pages only as they are written, and growing means copying."""
 
 _ROW = np.dtype(
     [
@@ -45,7 +47,7 @@ class Trace:
     def __init__(self, node_ids: Sequence[str]) -> None:
         self._node_ids = list(node_ids)
         self._causes = [""]
-        self._rows = np.zeros(4096, dtype=_ROW)
+        self._rows = np.zeros(FIRST_ROWS, dtype=_ROW)
         self._count = 0
 
     def __len__(self) -> int:

@@ -264,7 +264,12 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
     cumulative = list(accumulate(counts))
 
     def percentile_ms(share: float) -> float:
-        return wire.lateness_edge_ms(next(i for i, c in enumerate(cumulative) if c >= share * total))
+        """Interpolated within its bin."""
+        index = next(i for i, c in enumerate(cumulative) if c >= share * total)
+        below = cumulative[index] - counts[index]
+        inside = (share * total - below) / counts[index]
+        low_ms, high_ms = wire.lateness_edge_ms(index - 1), wire.lateness_edge_ms(index)
+        return low_ms + inside * (high_ms - low_ms)
 
     return {
         "total": total,
