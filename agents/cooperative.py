@@ -8,15 +8,23 @@ period behind, because a neighbour's fix reaches it one period late or not at al
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from agents.cooperative_frame import CooperativeFrame, FrameError, decode, encode, room_for_particles, short_name
+from agents.cooperative_frame import (
+    COMMON_LIMIT_M,
+    CooperativeFrame,
+    FrameError,
+    decode,
+    encode,
+    room_for_particles,
+    short_name,
+)
 from vnet import Fix, Node, Packet
-from vnet.cmm.consensus import RatioConsensus, Share
+from vnet.cmm.consensus import AVERAGING_RULES, AveragingConsensus, Consensus, RatioConsensus, Share
 from vnet.cmm.fusion import Cloud, fuse
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.cmm.weights import OptimizedWeights, random_weights
@@ -25,8 +33,11 @@ from vnet.roads.lanes import Array, LaneMap
 
 NS_PER_S = 1_000_000_000
 STALE_PERIODS = 3
+EPOCHS_PER_PERIOD = 100
+"""More than a whole network could ever start in a period: a frame that claims it is absurd, and would spread."""
 CLOUD_REPORT_PARTICLES = 50
 FUSIONS = ("optimized", "random", "none")
+CONSENSUSES = ("ratio", *AVERAGING_RULES)
 
 
 @dataclass(frozen=True)
@@ -34,6 +45,7 @@ class Options:
     """`[program.options]`. Defaults fit the default world; lengths in metres, times in seconds."""
 
     fusion: str = "optimized"
+    consensus: str = "ratio"
     particles: int = 200
     common_sigma_m: float = 3.0
     common_tau_s: float = 600.0
@@ -55,13 +67,21 @@ class Options:
         parsed = cls(**options)
         if parsed.fusion not in FUSIONS:
             raise ProgramError(f"program.options.fusion = {parsed.fusion!r}: allowed: {', '.join(FUSIONS)}")
+        if parsed.consensus not in CONSENSUSES:
+            raise ProgramError(
+                f"program.options.consensus = {parsed.consensus!r}: allowed: {', '.join(CONSENSUSES)}"
+            )
         if not 2 <= parsed.particles <= 100_000:
             raise ProgramError(f"program.options.particles = {parsed.particles}: 2 to 100000 allowed")
         for key in ("common_tau_s", "lateral_tau_s", "fusion_interval_s"):
             if not getattr(parsed, key) > 0:
                 raise ProgramError(f"program.options.{key} = {getattr(parsed, key)}: must be positive")
-        if not 0 <= parsed.self_floor <= 1 or not parsed.common_sigma_m >= 0:
-            raise ProgramError("program.options: self_floor lies in 0 … 1, common_sigma_m is not negative")
+        if not 0 <= parsed.self_floor <= 1:
+            raise ProgramError(f"program.options.self_floor = {parsed.self_floor}: 0 to 1 allowed")
+        if not 0 <= parsed.common_sigma_m <= COMMON_LIMIT_M:
+            raise ProgramError(
+                f"program.options.common_sigma_m = {parsed.common_sigma_m}: 0 to {COMMON_LIMIT_M} allowed"
+            )
         return parsed
 
 
@@ -82,26 +102,37 @@ class Estimator:
             lateral_tau_s=options.lateral_tau_s,
         )
         self.rbpf = Rbpf(config, lanes, rng)
-        self.consensus = RatioConsensus(self.name)
+        self.consensus: Consensus = _consensus(options.consensus, self.name)
+        self._early: list[tuple[str, CooperativeFrame]] = []
         self._weights = OptimizedWeights(options.self_floor)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
 
     def read(self, packets: Iterable[Packet], now_ns: int, period_ns: int) -> dict[str, CooperativeFrame]:
-        """The newest usable frame of each neighbour, by short name; what is not usable is counted by reason."""
+        """The newest usable frame of each neighbour, by short name; what is not usable is counted by reason.
+
+        The filter runs one period behind. A vehicle that is late with its work, as in real time it may be, finds
+        frames of this very period: they are kept until it is their turn.
+        """
         newest: dict[str, CooperativeFrame] = {}
-        for packet in packets:
-            try:
-                frame = decode(packet.payload)
-            except FrameError as error:
-                self.rejected[str(error)] += 1
-                continue
+        waiting, self._early = self._early, []
+        for sender, frame in [*waiting, *self._decoded(packets)]:
             age_ns = now_ns - frame.fix_time_ns
-            sender = short_name(packet.sender)
-            if not 0 <= age_ns <= STALE_PERIODS * period_ns:
+            if abs(age_ns) > STALE_PERIODS * period_ns:
                 self.rejected["stale"] += 1
+            elif frame.epoch > EPOCHS_PER_PERIOD * (1 + now_ns // period_ns):
+                self.rejected["absurd"] += 1
+            elif age_ns <= 0:
+                self._early.append((sender, frame))
             elif sender not in newest or frame.fix_time_ns > newest[sender].fix_time_ns:
                 newest[sender] = frame
         return dict(sorted(newest.items()))
+
+    def _decoded(self, packets: Iterable[Packet]) -> Iterator[tuple[str, CooperativeFrame]]:
+        for packet in packets:
+            try:
+                yield short_name(packet.sender), decode(packet.payload)
+            except FrameError as error:
+                self.rejected[str(error)] += 1
 
     def step(self, dt_s: float, own: Fix, frames: Mapping[str, CooperativeFrame]) -> None:
         """One period, up to the time of the fix `own`, which is the one before the latest."""
@@ -149,6 +180,10 @@ class Estimator:
             self.rbpf.sample(count),
         )
         return encode(frame)
+
+
+def _consensus(rule: str, name: str) -> Consensus:
+    return RatioConsensus(name) if rule == "ratio" else AveragingConsensus(name, rule)
 
 
 def _share(frame: CooperativeFrame) -> Share:

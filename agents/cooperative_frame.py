@@ -58,7 +58,11 @@ def room_for_particles(heard: int, max_payload: int) -> int:
 
 def encode(frame: CooperativeFrame) -> bytes:
     """A frame as bytes; hypotheses beyond ±327 m are clipped."""
-    heading = NO_HEADING if frame.heading_rad is None else int(frame.heading_rad / (2 * math.pi) * _FULL_TURN)
+    heading = (
+        NO_HEADING
+        if frame.heading_rad is None
+        else int(frame.heading_rad % (2 * math.pi) / (2 * math.pi) * _FULL_TURN)
+    )
     x_cm, y_cm = np.round(frame.fix_m * 100).astype(int).tolist()
     covariance = frame.covariance_m2
     header = _HEADER.pack(
@@ -118,7 +122,10 @@ def decode(payload: bytes) -> CooperativeFrame:
 def _check_numbers(x: float, y: float, c_xx: float, c_xy: float, c_yy: float, running_sum: list[float]) -> None:
     if not all(map(math.isfinite, (x, y, c_xx, c_xy, c_yy, *running_sum))):
         raise FrameError("not_finite")
-    if max(abs(x), abs(y)) > COMMON_LIMIT_M or not 0 <= running_sum[2] < 1e12:
+    s_x, s_y, w = running_sum
+    if max(abs(x), abs(y)) > COMMON_LIMIT_M or not 0 <= w < 1e12:
+        raise FrameError("absurd")
+    if max(abs(s_x), abs(s_y)) > COMMON_LIMIT_M * w:  # s / w is itself a mean of common errors
         raise FrameError("absurd")
     if not (c_xx > 0 and c_yy > 0 and c_xx * c_yy > c_xy * c_xy):
         raise FrameError("covariance")

@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from vnet.cmm.consensus import ConsensusConfig, RatioConsensus, Share
+from vnet.cmm.consensus import AveragingConsensus, ConsensusConfig, RatioConsensus, Share
+from vnet.errors import VnetError
 
 Hears = Callable[[int, int, int], bool]
 """Whether, in a round, a receiver hears a sender: (round, sender, receiver)."""
@@ -194,3 +195,53 @@ def test_without_loss_it_is_the_linear_iteration() -> None:
     first = net.errors().max()
     net.run(40)
     assert (net.errors().max() / first) ** (1 / 40) == pytest.approx(rates[1], rel=0.05)
+
+
+def averaging(linked: np.ndarray, rule: str, loss: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Inputs (N, 2), and states (N, 2) after each of 300 rounds of averaging."""
+    count = len(linked)
+    inputs = np.random.default_rng(1).normal(size=(count, 2))
+    hears = lossy(linked, loss, 3)
+    nodes = [AveragingConsensus(f"n{i:02d}", rule) for i in range(count)]
+    said: list[Share] = []
+    states = []
+    for step in range(300):
+        heard = [{f"n{j:02d}": s for j, s in enumerate(said) if hears(step, j, i)} for i in range(count)]
+        said = [node.round(inputs[i], heard[i]) for i, node in enumerate(nodes)]
+        states.append(np.array([node.mean_m for node in nodes], dtype=float))
+    return inputs, states
+
+
+@pytest.mark.parametrize("rule", ["metropolis", "max-degree"])
+def test_averaging_without_loss_keeps_the_mean_and_finds_it(rule: str) -> None:
+    inputs, states = averaging(graph(20, 4, 0.45), rule, 0.0)
+    for state in states:
+        assert state.mean(axis=0) == pytest.approx(inputs.mean(axis=0), abs=1e-12)
+    assert states[-1] == pytest.approx(np.tile(inputs.mean(axis=0), (20, 1)), abs=1e-6)
+
+
+def test_metropolis_needs_fewer_rounds_than_max_degree() -> None:
+    spread = {
+        rule: averaging(graph(30, 7), rule, 0.0)[1][60].std(axis=0).max() for rule in ("metropolis", "max-degree")
+    }
+    assert spread["metropolis"] < spread["max-degree"]
+
+
+def test_metropolis_averaging_is_the_linear_iteration() -> None:
+    linked = graph(20, 4, 0.45)
+    _, states = averaging(linked, "metropolis", 0.0)
+    degree = linked.sum(axis=0) + 1
+    matrix = np.where(linked, 1 / np.maximum(degree[:, None], degree), 0.0)
+    matrix += np.diag(1 - matrix.sum(axis=1))
+    assert states[51] == pytest.approx(matrix @ states[50], abs=1e-12)
+
+
+def test_loss_moves_the_mean_of_averaging_which_is_why_running_sums_are_the_default() -> None:
+    inputs, states = averaging(graph(20, 4, 0.45), "metropolis", 0.3)
+    assert states[-1].std(axis=0).max() < 1e-3, "they agree"
+    assert np.linalg.norm(states[-1].mean(axis=0) - inputs.mean(axis=0)) > 1e-3, "but not on the mean"
+
+
+def test_averaging_refuses_another_rule() -> None:
+    with pytest.raises(VnetError, match="averaging rule 'exact': allowed: metropolis, max-degree"):
+        AveragingConsensus("a", "exact")

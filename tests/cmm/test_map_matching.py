@@ -55,8 +55,14 @@ def test_without_a_heading_all_within_the_gate_compete() -> None:
 
 
 def test_with_none_in_the_gate_the_nearest_that_fits_is_taken() -> None:
-    assert candidate_lanes(LANES, np.array([60.0, 0.0]), np.pi / 2, gate_m=5.0).tolist() == [3]
+    assert candidate_lanes(LANES, np.array([80.0, 0.0]), np.pi / 2, gate_m=5.0).tolist() == [3]
     assert candidate_lanes(LANES, np.array([60.0, 0.0]), np.pi / 4, gate_m=5.0).tolist() == []
+
+
+def test_a_vehicle_far_off_the_map_has_no_lane() -> None:
+    """One absurd fix, forced onto the nearest lane, would outweigh all other roads."""
+    assert candidate_lanes(LANES, np.array([60.0, 0.0]), np.pi / 2, gate_m=5.0).tolist() == []
+    assert candidate_lanes(LANES, np.array([60.0, 0.0]), np.pi / 2, gate_m=50.0).tolist() == [3]
 
 
 def test_signed_offsets_are_positive_to_the_right_of_travel() -> None:

@@ -163,6 +163,21 @@ def test_the_variance_of_a_mean_of_independent_fixes() -> None:
     assert rbpf.position_m("v")[1] == pytest.approx(np.eye(2) / 25, rel=1e-3, abs=1e-6)
 
 
+@pytest.mark.parametrize(("walk_m", "variance_m2"), [(None, 9.0), (0.5 / np.sqrt(0.1), 9.0 + 10 * 0.25)])
+def test_the_common_error_is_a_gauss_markov_process_or_a_random_walk(
+    walk_m: float | None, variance_m2: float
+) -> None:
+    """Ten steps: the Gauss-Markov process keeps its variance, a walk of 0.5 m a step gains 0.25 m² each."""
+    config = RbpfConfig(particles=40_000, common_walk_m=walk_m, common_tau_s=1.0)
+    rbpf = Rbpf(config, NOWHERE, np.random.default_rng(0))
+    start = rbpf.common_m.copy()
+    for _ in range(10):
+        rbpf.step(DT_S, {})
+    assert np.diag(rbpf.estimate_covariance_m2) == pytest.approx([variance_m2] * 2, rel=0.03)
+    kept = 1.0 if walk_m else np.exp(-1.0)
+    assert np.mean(start * rbpf.common_m) / 9.0 == pytest.approx(kept, abs=0.03)
+
+
 def test_a_filter_needs_particles() -> None:
     with pytest.raises(VnetError, match="particles = 1: at least 2"):
         RbpfConfig(particles=1)

@@ -8,7 +8,15 @@ from scipy.optimize import minimize
 
 from vnet.cmm.fusion import Cloud, fuse
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
-from vnet.cmm.weights import OptimizedWeights, largest_remainder, random_weights
+from vnet.cmm.weights import (
+    OptimizedWeights,
+    constant_weights,
+    largest_remainder,
+    max_degree_weights,
+    metropolis_weights,
+    no_fusion_weights,
+    random_weights,
+)
 from vnet.errors import VnetError
 from vnet.roads.lanes import LaneMap
 
@@ -76,6 +84,41 @@ def test_random_weights_add_up() -> None:
     weights = random_weights(5, np.random.default_rng(0))
     assert weights.sum() == pytest.approx(1)
     assert np.all(weights > 0)
+
+
+def test_constant_weights_are_the_papers_ring() -> None:
+    assert constant_weights(2, 0.2) == pytest.approx([0.2, 0.8])
+    assert constant_weights(5, 0.2) == pytest.approx([0.2] * 5)
+    assert constant_weights(1, 0.2) == pytest.approx([1.0]), "nobody to take anything from"
+    with pytest.raises(VnetError, match=r"alpha = 1\.5: 0 to 1 allowed"):
+        constant_weights(2, 1.5)
+
+
+def test_metropolis_and_max_degree_weights_are_doubly_stochastic_on_a_path() -> None:
+    neighbours = {0: [1], 1: [0, 2], 2: [1, 3], 3: [2]}
+    for rule in ("metropolis", "max-degree"):
+        matrix = np.zeros((4, 4))
+        for i, others in neighbours.items():
+            degrees = [len(neighbours[j]) for j in others]
+            weights = metropolis_weights(len(others), degrees)
+            matrix[i, [i, *others]] = weights if rule == "metropolis" else max_degree_weights(1 + len(others), 2)
+        assert matrix.sum(axis=0) == pytest.approx(np.ones(4))
+        assert matrix.sum(axis=1) == pytest.approx(np.ones(4))
+        assert np.array_equal(matrix, matrix.T)
+        assert (matrix >= 0).all()
+    with pytest.raises(VnetError, match="max_degree = 1: at least the vehicle's own 2"):
+        max_degree_weights(3, 1)
+
+
+def test_no_fusion_keeps_everything() -> None:
+    assert no_fusion_weights(3).tolist() == [1.0, 0.0, 0.0]
+
+
+def test_weights_stay_weights_when_the_mean_is_absurd() -> None:
+    estimates, covariances = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([np.eye(2)] * 2)
+    weights = OptimizedWeights().solve(estimates, covariances, np.array([1e14, -1e14]))
+    assert weights.sum() == pytest.approx(1.0)
+    assert np.all((weights >= 0) & (weights <= 1))
 
 
 LANES = LaneMap(np.array([[0.0, 0.0], [0.0, 0.0]]), np.array([0.0, np.pi / 2]), 0.85)

@@ -9,21 +9,28 @@ The inputs change: a change of x is added to s, so that the ratio tracks the mea
 Mass must be neither created nor lost. A sender splits only over peers whose recent frames list it as heard, and
 names them; only they take a share. When that set changes (a peer dies, joins, restarts, no longer hears), everybody
 starts again under a new epoch: the highest spreads, and the old mean serves until the new one has settled.
+
+`AveragingConsensus` is the ordinary averaging of neighbours' states, for comparison: lost frames move its mean.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
+from vnet.errors import VnetError
 from vnet.roads.lanes import Array
 
 
 @dataclass(frozen=True)
 class Share:
-    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `takers`."""
+    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `takers`.
+
+    Averaging needs no epoch (it is 0) and says (state x, state y, degree) instead of a sum.
+    """
 
     epoch: int
     running_sum: tuple[float, float, float]
@@ -44,6 +51,49 @@ class ConsensusConfig:
     settle_rounds: int = 30
 
 
+class Consensus(Protocol):
+    """What a vehicle needs of a consensus."""
+
+    @property
+    def mean_m(self) -> Array | None:
+        """The mean (2,) as far as it is known."""
+        ...
+
+    def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
+        """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        ...
+
+
+class Peers:
+    """Who is there, and who of them says that it hears this node."""
+
+    def __init__(self, node: str, silence_rounds: int) -> None:
+        self._node = node
+        self._silence_rounds = silence_rounds
+        self._silent: dict[str, int] = {}
+        self._hears_us: dict[str, bool] = {}
+
+    @property
+    def heard(self) -> frozenset[str]:
+        """Peers heard lately."""
+        return frozenset(self._silent)
+
+    @property
+    def mutual(self) -> frozenset[str]:
+        """Peers heard lately that hear this node as well."""
+        return frozenset(peer for peer, hears in self._hears_us.items() if hears)
+
+    def listen(self, shares: Mapping[str, Share]) -> None:
+        """Take note of one round's shares."""
+        for peer in list(self._silent):
+            self._silent[peer] += 1
+            if self._silent[peer] > self._silence_rounds:
+                del self._silent[peer], self._hears_us[peer]
+        for peer, share in shares.items():
+            self._silent[peer] = 0
+            self._hears_us[peer] = self._node in share.heard
+
+
 class RatioConsensus:
     """The consensus state of one node. Epoch 0 means: not taking part yet."""
 
@@ -59,8 +109,7 @@ class RatioConsensus:
         self._changed_rounds = 0
         self._age = 0
         self._seen: dict[str, Array] = {}
-        self._silent: dict[str, int] = {}
-        self._hears_us: dict[str, bool] = {}
+        self._peers = Peers(node, self._config.silence_rounds)
         self._old_mean: Array | None = None
 
     @property
@@ -77,29 +126,19 @@ class RatioConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
-        self._listen(shares)
+        self._peers.listen(shares)
+        self._highest = max([self._highest, *(share.epoch for share in shares.values())])
         self._follow(value)
         for peer in sorted(shares):
             self._take(peer, shares[peer])
         self._split()
         self._input = np.array(value, dtype=float)
         s_x, s_y, w = self._running_sum.tolist()
-        return Share(self.epoch, (s_x, s_y, w), self._takers, frozenset(self._silent))
-
-    def _listen(self, shares: Mapping[str, Share]) -> None:
-        """Who is there, and who hears us."""
-        for peer in list(self._silent):
-            self._silent[peer] += 1
-            if self._silent[peer] > self._config.silence_rounds:
-                del self._silent[peer], self._hears_us[peer]
-        for peer, share in shares.items():
-            self._silent[peer] = 0
-            self._hears_us[peer] = self._node in share.heard
-            self._highest = max(self._highest, share.epoch)
+        return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
-        wanted = frozenset(peer for peer, hears in self._hears_us.items() if hears)
+        wanted = self._peers.mutual
         changed = wanted != self._takers or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
         if self._changed_rounds >= self._config.steady_rounds:
@@ -133,3 +172,54 @@ class RatioConsensus:
             share = self._mass / (len(self._takers) + 1)
             self._running_sum += share
             self._mass = self._mass - share * len(self._takers)
+
+
+AVERAGING_RULES = ("metropolis", "max-degree")
+
+
+class AveragingConsensus:
+    """x_i += Σ_j (x_j − x_i) / max(D_i, D_j) over the peers that hear each other (Xiao and Boyd 2004).
+
+    Under `metropolis` D_i is the degree of the node, under `max-degree` the largest of the network as far as word
+    of it has come; both count the node itself, as the paper does. Both ends of a link weigh it by what they last
+    broadcast, so that without loss the mean stays what it is even while word spreads. Loss moves it. Raises
+    VnetError for another rule.
+    """
+
+    def __init__(self, node: str, rule: str, config: ConsensusConfig | None = None) -> None:
+        if rule not in AVERAGING_RULES:
+            raise VnetError(f"averaging rule {rule!r}: allowed: {', '.join(AVERAGING_RULES)}")
+        self._rule = rule
+        self._peers = Peers(node, (config or ConsensusConfig()).silence_rounds)
+        self._input: Array | None = None
+        self._state: Array | None = None
+        self._degree = 1.0
+
+    @property
+    def mean_m(self) -> Array | None:
+        """The state (2,), on its way to the mean; None before the first round."""
+        return self._state
+
+    def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
+        """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        self._peers.listen(shares)
+        mutual = self._peers.mutual
+        said = {peer: shares[peer].running_sum for peer in sorted(shares) if peer in mutual}
+        state = np.array(value, dtype=float)
+        if self._state is not None and self._input is not None:
+            pull = sum((_towards(self._state, self._degree, other) for other in said.values()), np.zeros(2))
+            state = self._state + pull + (value - self._input)
+        own_degree = 1.0 + len(mutual)
+        if self._rule == "max-degree":
+            self._degree = max([self._degree, own_degree, *(degree for _, _, degree in said.values())])
+        else:
+            self._degree = own_degree
+        self._state, self._input = state, np.array(value, dtype=float)
+        x, y = state.tolist()
+        return Share(0, (x, y, self._degree), mutual, self._peers.heard)
+
+
+def _towards(state: Array, degree: float, other: tuple[float, float, float]) -> Array:
+    """What one peer's state and degree add to one's own."""
+    x, y, other_degree = other
+    return np.asarray((np.array([x, y]) - state) / max(degree, other_degree, 1.0))

@@ -20,6 +20,10 @@ FAR_SIGMAS = 5.0
 """Beyond this many deviations outside the lane, the difference of two Φ would lose its digits."""
 
 
+OFF_MAP_M = 30.0
+"""A vehicle further from every lane that fits is not on this map: its road says nothing about the common error."""
+
+
 def log_on_lane(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
     """log P(on the lane) for offsets (..., K) and deviations that broadcast against them; metres."""
     near = np.abs(offset_m)
@@ -49,7 +53,8 @@ def candidate_lanes(
 ) -> NDArray[np.intp]:
     """Lanes that a vehicle may be on: within `gate_m` of `position_m` (2,), and fitting its heading if known.
 
-    Without a heading all lanes within the gate compete. With none in the gate, the nearest that fits.
+    Without a heading all lanes within the gate compete. With none in the gate, the nearest that fits, unless even
+    that is too far away to be the vehicle's.
     """
     offset = np.abs(lanes.normal @ position_m - lanes.offset_m)
     fits = np.ones(len(lanes), dtype=bool)
@@ -61,4 +66,5 @@ def candidate_lanes(
     found = np.flatnonzero(fits & (offset <= gate_m))
     if len(found):
         return found
-    return np.array([np.argmin(np.where(fits, offset, np.inf))])
+    nearest = int(np.argmin(np.where(fits, offset, np.inf)))
+    return np.array([nearest] if offset[nearest] <= OFF_MAP_M else [], dtype=np.intp)

@@ -27,15 +27,17 @@ from vnet.roads.lanes import Array, LaneMap
 class RbpfConfig:
     """Constants of the filter; lengths in metres, times in seconds.
 
-    `common_sigma_m`, `common_tau_s`: the Gauss-Markov process of the common error. `acceleration_m2_s4`: white
-    acceleration along the lane, a hundredth of it across. `lateral_tau_s`: how long a vehicle keeps its offset in
-    the lane (see the module's text). `gate_sigmas`: fixes further off are outliers. `forget_s`: vehicles not
-    heard for that long are dropped.
+    `common_sigma_m`, `common_tau_s`: the Gauss-Markov process of the common error; `common_walk_m` replaces it by a
+    random walk that strays so far in a second (the paper's 0.5 m in 0.1 s are 0.5 / √0.1). `acceleration_m2_s4`:
+    white acceleration along the lane, a hundredth of it across. `lateral_tau_s`: how long a vehicle keeps its
+    offset in the lane (see the module's text). `gate_sigmas`: fixes further off are outliers. `forget_s`: vehicles
+    not heard for that long are dropped.
     """
 
     particles: int = 200
     common_sigma_m: float = 3.0
     common_tau_s: float = 600.0
+    common_walk_m: float | None = None
     acceleration_m2_s4: float = 1.0
     lateral_tau_s: float = 20.0
     gate_sigmas: float = 5.0
@@ -92,9 +94,12 @@ class Rbpf:
 
     def _predict(self, dt_s: float) -> None:
         config = self.config
-        keep = np.exp(-dt_s / config.common_tau_s)
-        spread_m = config.common_sigma_m * np.sqrt(1 - keep**2)
-        self.common_m *= keep
+        if config.common_walk_m is None:
+            keep = np.exp(-dt_s / config.common_tau_s)
+            spread_m = config.common_sigma_m * np.sqrt(1 - keep**2)
+            self.common_m *= keep
+        else:
+            spread_m = config.common_walk_m * np.sqrt(dt_s)
         self.common_m += spread_m * self._rng.standard_normal(self.common_m.shape)
         self.mean[:, :2] += dt_s * self.mean[:, 2:]
         transition = np.eye(4)

@@ -6,6 +6,8 @@ ridge that says how uncertain each estimate is itself.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import osqp
 import scipy.sparse as sp
@@ -21,8 +23,9 @@ class OptimizedWeights:
     """min ‖Σ_j a_j x_j − x̄‖² + Σ_j λ_j a_j²  subject to  Σ_j a_j = 1, 0 ≤ a_j ≤ 1, a_0 ≥ `self_floor`.
 
     λ_j = tr Cov(x_j), at least 0.01 m²: without the ridge two rows of data do not determine up to 31 weights.
-    OSQP (Stellato et al. 2020) is set up once for each number of neighbours and updated afterwards. Nothing in it
-    depends on the wall clock or on earlier solutions, so that runs replay.
+    OSQP (Stellato et al. 2020) is set up once for each number of neighbours and updated afterwards. Its step size
+    is carried over from problem to problem, so the last digits depend on the history, but never on the wall clock:
+    the same problems in the same order give the same bits.
     """
 
     def __init__(self, self_floor: float = 0.0) -> None:
@@ -45,9 +48,9 @@ class OptimizedWeights:
         rows, columns = _upper_triangle(count)
         solver = self._solver(count)
         solver.update(Px=(hessian / scale)[rows, columns])
-        solution = np.asarray(solver.solve(raise_error=False).x)
-        weights = np.clip(solution, 0.0, 1.0)
-        return np.asarray(weights / weights.sum())
+        weights = np.clip(np.asarray(solver.solve(raise_error=False).x), 0.0, 1.0)
+        total = float(weights.sum())
+        return np.asarray(weights / total) if np.isfinite(total) and total > 0 else no_fusion_weights(count)
 
     def _solver(self, count: int) -> osqp.OSQP:
         if count not in self._solvers:
@@ -60,6 +63,49 @@ class OptimizedWeights:
             solver.setup(hessian, np.zeros(count), constraints, lower, np.ones(count + 1), **_SETTINGS)
             self._solvers[count] = solver
         return self._solvers[count]
+
+
+def no_fusion_weights(count: int) -> Array:
+    """Everything on the vehicle itself, the first of (count,)."""
+    weights = np.zeros(count)
+    weights[0] = 1.0
+    return weights
+
+
+def constant_weights(count: int, alpha: float) -> Array:
+    """α on the vehicle itself, the rest in equal parts on its neighbours: the paper's ring. (count,)
+
+    Raises VnetError for an α outside 0 … 1.
+    """
+    if not 0 <= alpha <= 1:
+        raise VnetError(f"alpha = {alpha}: 0 to 1 allowed")
+    if count == 1:
+        return np.ones(1)
+    weights = np.full(count, (1 - alpha) / (count - 1))
+    weights[0] = alpha
+    return weights
+
+
+def metropolis_weights(degree: int, neighbour_degrees: Sequence[int]) -> Array:
+    """1 / (1 + max(d_i, d_j)) on neighbour j, the rest on oneself: (1 + n,). Degrees leave out the node itself.
+
+    The paper's A_ij = 1 / max(d_i, d_j) counts it in, and is the same. Doubly stochastic on an undirected graph
+    (Xiao and Boyd 2004).
+    """
+    others = [1 / (1 + max(degree, other)) for other in neighbour_degrees]
+    return np.array([1 - sum(others), *others])
+
+
+def max_degree_weights(count: int, max_degree: int) -> Array:
+    """1 / (1 + d_max) on each neighbour, the rest on oneself: (count,). `max_degree` is that of the whole network.
+
+    Raises VnetError where the vehicle itself has more neighbours than that.
+    """
+    if max_degree < count - 1:
+        raise VnetError(f"max_degree = {max_degree}: at least the vehicle's own {count - 1} neighbours expected")
+    weights = np.full(count, 1 / (1 + max_degree))
+    weights[0] = 1 - (count - 1) / (1 + max_degree)
+    return weights
 
 
 def random_weights(count: int, rng: np.random.Generator) -> Array:
