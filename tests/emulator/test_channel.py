@@ -125,7 +125,7 @@ def test_the_payload_limit_is_the_last_size_that_passes(size: int, outcome: str)
 
 
 def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]:
-    """When each frame of one sender has left it at 1 µs a byte without access jitter; None where there was no room."""
+    """When each frame of one sender has left it at 1 µs a byte without access jitter; None where there was no room."""  # noqa: E501
     ends: list[int | None] = []
     on_air: list[tuple[int, int]] = []
     for time_ns, size in sends:
@@ -214,7 +214,7 @@ def test_latency_is_within_its_bounds_and_rounded_up_by_less_than_a_tick(
         assert np.array_equal(ticked, exact)
         return
     assert np.all(ticked % tick_ns == 0)
-    assert np.all((0 <= ticked - exact) & (ticked - exact < tick_ns))
+    assert np.all((ticked - exact >= 0) & (ticked - exact < tick_ns))
 
 
 def test_receivers_of_one_frame_hear_it_at_different_times() -> None:
