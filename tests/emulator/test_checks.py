@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from scipy.stats import binom
 
 from emulator.observe.checks import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
 from emulator.observe.run_folder import Event, RunFolder, read_events
@@ -30,7 +31,10 @@ async def first_only(node: Node) -> None:
 def run(folder: Path, program: str = "agents.beacon:main", vehicles: int = 5, **sections: dict) -> Evidence:
     """Simulate a small dense network and keep it in `folder`."""
     settings = {"network": {"vehicles": vehicles, "layout": "dense"}, "program": {"entry": program}}
-    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, **settings, **sections})
+    return run_scenario(folder, Scenario.model_validate({"run": {"duration_s": 1.0}, **settings, **sections}))
+
+
+def run_scenario(folder: Path, scenario: Scenario) -> Evidence:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
@@ -124,3 +128,216 @@ def test_deliveries_that_were_never_timed_leave_real_time_unknown(evidence: Evid
         late = Event(0, "late_deliveries", None, {"count": count, "total": total, "p99_ms": 1.0})
         timed = replace(evidence, scenario=scenario, events=[*evidence.events, late])
         assert verdict(timed, "kept_up") is expected
+
+
+HEADER = "id,x_m,y_m,heading_rad"
+
+
+def four(folder: Path, program: str = "agents.beacon:main", **sections: dict) -> Evidence:
+    """Four vehicles on a line, a kilometre apart; with a range of 2.1 km the ends do not hear each other."""
+    lines = [HEADER, *(f"v{number},{1000 * number},0,1.5" for number in range(4))]
+    (folder / "four.csv").write_text("\n".join(lines) + "\n")
+    network = {"kind": "file", "path": str(folder / "four.csv")}
+    radio = {"range_m": 2100.0, "loss": 0.2, **sections.pop("radio", {})}
+    settings = {"run": {"duration_s": 1.0}, "network": network, "radio": radio, "program": {"entry": program}}
+    return run_scenario(folder / "run", Scenario.model_validate({**settings, **sections}))
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    return four(tmp_path_factory.mktemp("line"))
+
+
+def damaged(evidence: Evidence, trace: pa.Table) -> dict[str, CheckResult]:
+    """The checks that a changed trace turns away from valid."""
+    checks = judge(replace(evidence, trace=trace)).checks
+    return {check.name: check for check in checks if check.verdict is not Verdict.VALID}
+
+
+def first(evidence: Evidence, outcome: str) -> int:
+    return int(np.flatnonzero(evidence.outcome_is(outcome))[0])
+
+
+def without(table: pa.Table, row: int) -> pa.Table:
+    return pa.concat_tables([table.slice(0, row), table.slice(row + 1)])
+
+
+def with_lost(evidence: Evidence, count: int) -> pa.Table:
+    """The trace with exactly `count` of the pairs that came as far as the loss lost."""
+    drawn = np.flatnonzero(evidence.outcome_is("lost", "delivered"))
+    names = np.array(evidence.trace["outcome"].cast(pa.string()).to_pylist(), dtype=object)
+    names[drawn] = "delivered"
+    names[drawn[:count]] = "lost"
+    index = evidence.trace.column_names.index("outcome")
+    return evidence.trace.set_column(index, "outcome", pa.array(names.tolist(), pa.string()).dictionary_encode())
+
+
+def test_an_honest_line_of_four_is_valid_with_its_figures(line: Evidence) -> None:
+    assert damaged(line, line.trace) == {}
+    conservation, range_ = result(line, "conservation"), result(line, "range")
+    assert isinstance(conservation, CheckResult)
+    assert isinstance(range_, CheckResult)
+    assert conservation.figures == {
+        "frames": 40,
+        "pairs": 40 * 10 // 4,  # of 12 ordered pairs all but v0–v3 and v3–v0 are in range
+        "repeated": 0,
+        "wrong_count": 0,
+        "not_in_range": 0,
+        "undecided": 0,
+        "missing_frames": 0,
+    }
+    assert range_.figures == {"delivered": int(line.outcome_is("delivered").sum()), "beyond": 0}
+
+
+@pytest.mark.parametrize("outcome", ["lost", "delivered"])
+def test_a_dropped_row_is_a_frame_with_too_few_pairs(line: Evidence, outcome: str) -> None:
+    found = damaged(line, without(line.trace, first(line, outcome)))
+    assert {name: check.verdict for name, check in found.items()} == {"conservation": Verdict.INVALID}
+    assert found["conservation"].figures["wrong_count"] == 1
+    assert found["conservation"].figures["pairs"] == len(line.trace) - 1
+
+
+def test_a_repeated_row_is_one_too_many(line: Evidence) -> None:
+    row = first(line, "lost")
+    found = damaged(line, pa.concat_tables([line.trace, line.trace.slice(row, 1)]))
+    assert {name: check.verdict for name, check in found.items()} == {"conservation": Verdict.INVALID}
+    assert found["conservation"].figures["repeated"] == 1
+
+
+def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: Evidence) -> None:
+    senders = line.nodes("sender")
+    row = int(np.flatnonzero(line.outcome_is("delivered") & (senders == 0))[0])
+    found = damaged(line, with_names(line.trace, "receiver", row, "v3"))
+    assert {name: check.verdict for name, check in found.items()} == {
+        "conservation": Verdict.INVALID,
+        "range": Verdict.INVALID,
+    }
+    assert found["range"].figures == {"delivered": int(line.outcome_is("delivered").sum()), "beyond": 1}
+    assert found["range"].text == "1 deliveries beyond range"
+    assert found["conservation"].figures["not_in_range"] == 1
+
+
+def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(line: Evidence) -> None:
+    drawn = int(line.outcome_is("lost", "delivered").sum())
+    low, high = (int(edge) for edge in binom.interval(0.999, drawn, 0.2))
+    assert damaged(line, with_lost(line, low)) == damaged(line, with_lost(line, high)) == {}
+    for lost in (low - 1, high + 1):
+        found = damaged(line, with_lost(line, lost))
+        assert {name: check.verdict for name, check in found.items()} == {"loss_rate": Verdict.INVALID}
+        assert found["loss_rate"].figures == {
+            "lost": lost,
+            "pairs": drawn,
+            "rate": lost / drawn,
+            "expected": 0.2,
+            "low": low,
+            "high": high,
+        }
+
+
+@pytest.mark.parametrize(("loss", "wrong"), [(0.0, 1), (1.0, -1)])
+def test_without_chance_a_single_pair_decides(tmp_path: Path, loss: float, wrong: int) -> None:
+    evidence = four(tmp_path, radio={"loss": loss})
+    lost = int(evidence.outcome_is("lost").sum())
+    assert verdict(evidence, "loss_rate") is Verdict.VALID
+    assert damaged(evidence, with_lost(evidence, lost + wrong))["loss_rate"].verdict is Verdict.INVALID
+
+
+def test_when_everything_is_lost_nothing_is_known_of_the_range(tmp_path: Path) -> None:
+    evidence = four(tmp_path, radio={"loss": 1.0})
+    judgement = judge(evidence)
+    assert {check.name for check in judgement.checks if check.verdict is not Verdict.VALID} == {"range"}
+    assert verdict(evidence, "range") is Verdict.UNKNOWN
+    assert check_run(tmp_path / "run").exit_status == judgement.exit_status == 3
+
+
+async def dies_early(node: Node) -> None:
+    """All talk; the second vehicle fails at its sixth fix."""
+    count = 0
+    async for _ in node.gnss:
+        count += 1
+        if node.id == "v1" and count == 6:
+            raise RuntimeError("tired")
+        await node.radio.broadcast(b"hello")
+
+
+def test_a_death_makes_room_under_the_cap_and_is_told_with_its_figures(tmp_path: Path) -> None:
+    evidence = four(tmp_path, f"{__name__}:dies_early", radio={"max_peers": 1, "loss": 0.0})
+    assert verdict(evidence, "peer_cap") is Verdict.VALID
+    alive = result(evidence, "agents_alive")
+    assert isinstance(alive, CheckResult)
+    assert alive.verdict is Verdict.INVALID
+    assert [(gone["node"], gone["time_ns"], gone["kind"]) for gone in alive.figures["gone"]] == [
+        ("v1", 500_000_000, "crashed")
+    ]
+    assert judge(evidence).exit_status == check_run(tmp_path / "run").exit_status == 1
+    # v0 hears v1 as long as v1 lives, and then v2: without the death v2 would be beyond the cap for ever.
+    found = judge(replace(evidence, events=[e for e in evidence.events if e.kind != "crashed"])).checks
+    wrong = next(check for check in found if check.name == "peer_cap")
+    assert wrong.verdict is Verdict.INVALID
+    assert wrong.figures["wrong"] > 0
+
+
+def test_each_pair_on_the_wrong_side_of_the_cap_is_counted(tmp_path: Path) -> None:
+    evidence = four(tmp_path, radio={"max_peers": 1, "loss": 0.0})
+    capped, heard = first(evidence, "peer_cap"), first(evidence, "delivered")
+    forged = with_names(with_names(evidence.trace, "outcome", capped, "delivered"), "outcome", heard, "peer_cap")
+    found = damaged(evidence, forged)
+    assert {name: check.verdict for name, check in found.items()} == {"peer_cap": Verdict.INVALID}
+    assert found["peer_cap"].figures == {
+        "cap": 1,
+        "largest_in_range": 3,
+        "capped": int(evidence.outcome_is("peer_cap").sum()),
+        "wrong": 2,
+    }
+
+
+def test_deliveries_that_the_machine_lost_are_unknown_and_not_the_radio(line: Evidence) -> None:
+    found = damaged(line, with_names(line.trace, "outcome", first(line, "delivered"), "transport"))
+    assert {name: check.verdict for name, check in found.items()} == {"transport": Verdict.UNKNOWN}
+    assert found["transport"].figures == {"gaps": 0, "lost": 1}
+
+
+async def reports_nan(node: Node) -> None:
+    """Talks like the others, but believes nonsense."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"hello")
+        node.report(fix.position_m, fix.covariance_m2, x=float("nan") if node.id == "v2" else 0.0)
+
+
+def test_numbers_that_are_none_are_counted(tmp_path: Path) -> None:
+    found = result(four(tmp_path, f"{__name__}:reports_nan"), "finite")
+    assert isinstance(found, CheckResult)
+    assert found.verdict is Verdict.INVALID
+    assert found.figures == {"reports": 40, "not_finite": 10}
+
+
+def test_programs_that_report_nothing_have_nothing_to_be_finite(tmp_path: Path) -> None:
+    evidence = four(tmp_path, f"{__name__}:dies_early")
+    assert result(evidence, "finite") == NotExercised("finite", "the program reports nothing")
+
+
+def test_invalid_wins_over_unknown_over_valid_in_a_run(line: Evidence) -> None:
+    unknown = with_names(line.trace, "outcome", first(line, "delivered"), "transport")
+    both = without(unknown, first(line, "lost"))
+    statuses = [judge(replace(line, trace=trace)).exit_status for trace in (line.trace, unknown, both)]
+    assert statuses == [0, 3, 1]
+
+
+@pytest.mark.parametrize(
+    "name", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
+)
+def test_a_folder_without_one_of_its_files_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    four(tmp_path)
+    (tmp_path / "run" / name).unlink()
+    with pytest.raises(VnetError, match=r"not (the folder of a finished run|a run's folder)") as refused:
+        check_run(tmp_path / "run")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json"])
+def test_a_file_that_was_cut_short_is_refused(name: str, tmp_path: Path) -> None:
+    four(tmp_path)
+    path = tmp_path / "run" / name
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(VnetError, match="not the folder of a finished run"):
+        check_run(tmp_path / "run")
