@@ -1,0 +1,147 @@
+"""Networks: the generated ones are like the published ones, and a wrong file is told by its line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from emulator.world.networks import Network, generate_network, load_network
+from vnet.errors import ScenarioError
+
+RANGE_M = 3000.0
+HEADER = "id,x_m,y_m,heading_rad\n"
+
+# Sorted degrees and component sizes of the published networks at 3 km (zhao-lab/network-propagation, MIT).
+PUBLISHED = {
+    50: ("2 2 3 4 4 5 7 7 7 8 9 9 10 10 10 10 11 11 11 11 12 12 12 12 13 13 13 14 14 15 15 15 16 16 16 16 16 16 17 "
+         "17 17 18 18 18 18 18 20 21 21 22", [50]),
+    38: ("2 2 3 3 4 4 5 5 5 6 6 6 7 7 7 7 7 7 7 8 8 9 9 9 9 9 9 10 10 10 10 10 10 10 10 12 12 12", [38]),
+    24: ("2 2 2 2 2 2 2 2 3 3 3 3 3 4 4 5 5 7 7 7 7 8 8 9", [3, 6, 15]),
+}  # fmt: skip
+
+
+def links(network: Network) -> NDArray[np.bool_]:
+    """Who is in range of whom, oneself left out."""
+    position_m = network.position_m
+    distance_m = np.sqrt(((position_m[:, None] - position_m[None]) ** 2).sum(axis=2))
+    return (distance_m <= RANGE_M) & ~np.eye(len(position_m), dtype=bool)
+
+
+def component_sizes(linked: NDArray[np.bool_]) -> list[int]:
+    """Sizes of the connected components, by walking along the links."""
+    unseen, sizes = set(range(len(linked))), []
+    while unseen:
+        waiting, size = [unseen.pop()], 0
+        while waiting:
+            size += 1
+            near = {int(other) for other in np.flatnonzero(linked[waiting.pop()])} & unseen
+            unseen -= near
+            waiting += near
+        sizes.append(size)
+    return sorted(sizes)
+
+
+@pytest.mark.parametrize("vehicles", [50, 38, 24])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_generated_networks_match_the_published_ones(vehicles: int, seed: int) -> None:
+    network = generate_network("urban", vehicles, seed)
+    linked = links(network)
+    degrees, sizes = PUBLISHED[vehicles]
+    assert len(set(network.node_ids)) == len(network.position_m) == len(network.heading_rad) == vehicles
+    assert component_sizes(linked) == sizes
+    assert np.abs(np.sort(linked.sum(axis=0)) - np.array(degrees.split(), dtype=int)).sum() <= 4
+
+
+@pytest.mark.parametrize("layout", ["urban", "dense"])
+def test_the_same_seed_gives_the_same_network_and_another_one_does_not(layout: str) -> None:
+    one, same, other = (generate_network(layout, 24, seed) for seed in (5, 5, 6))
+    assert one.node_ids == same.node_ids
+    assert np.array_equal(one.position_m, same.position_m)
+    assert np.array_equal(one.heading_rad, same.heading_rad)
+    assert not np.array_equal(one.position_m, other.position_m)
+    assert not np.array_equal(one.heading_rad, other.heading_rad)
+
+
+@pytest.mark.parametrize("vehicles", [1, 2, 3, 10, 12, 70, 300])
+def test_any_number_of_vehicles_can_be_had(vehicles: int) -> None:
+    network = generate_network("urban", vehicles, 1)
+    assert len(set(network.node_ids)) == vehicles
+    assert list(network.node_ids) == sorted(network.node_ids), "numbers are padded"
+    assert network.position_m.shape == (vehicles, 2)
+    if vehicles <= 70:
+        assert component_sizes(links(network)) == [vehicles]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_dense_networks_exceed_the_peer_cap(seed: int) -> None:
+    degrees = links(generate_network("dense", 60, seed)).sum(axis=0)
+    assert (degrees > 30).mean() > 0.5
+
+
+def test_headings_are_those_of_a_grid_town() -> None:
+    heading_rad = generate_network("dense", 2000, 1).heading_rad
+    assert heading_rad.min() >= 0
+    assert heading_rad.max() < 2 * np.pi
+    from_axis_rad = np.abs((heading_rad + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+    assert 0.45 < (from_axis_rad < np.radians(6)).mean() < 0.75, "about half of them; the others go anywhere"
+    quarters = np.bincount((heading_rad // (np.pi / 2)).astype(int), minlength=4)
+    assert quarters.min() > 200, "all ways are taken"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no column 'id'"),
+        ("id,x_m,y_m\na,0,0\n", "no column 'heading_rad'; needed are id, x_m, y_m, heading_rad"),
+        (HEADER, "no vehicles"),
+        (HEADER + "a,0,0,0\na,1,1,1\n", "line 3: id = 'a' appears twice"),
+        (HEADER + "a,0,0,0\nb,0,0,0\nc,0,0,0\nb,1,1,1\n", "line 5: id = 'b' appears twice"),
+        (HEADER + "a/b,0,0,0\n", "line 2: id = 'a/b': letters, digits"),
+        (HEADER + "a,0,0,0\n,0,0,0\n", "line 3: id = ''"),
+        (HEADER + f"{'a' * 65},0,0,0\n", f"line 2: id = '{'a' * 65}'"),
+        (HEADER + "a*,0,0,0\n", "line 2: id = 'a*'"),
+        (HEADER + "a,zero,0,0\n", "line 2: x_m = 'zero': a finite number is needed"),
+        (HEADER + "a,0,inf,0\n", "line 2: y_m = 'inf': a finite number is needed"),
+        (HEADER + "a,0,0,nan\n", "line 2: heading_rad = 'nan': a finite number is needed"),
+        (HEADER + "a,1e400,0,0\n", "line 2: x_m = '1e400': a finite number is needed"),
+        (HEADER + "a,,0,0\n", "line 2: x_m = '': a finite number is needed"),
+        (HEADER + "a,0,0\n", "line 2: heading_rad = None: a finite number is needed"),
+        (HEADER + "a,0,0,0\n\n\nb,0,north,0\n", "line 5: y_m = 'north'"),
+    ],
+)
+def test_a_wrong_network_file_names_its_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "n.csv"
+    path.write_text(text)
+    with pytest.raises(ScenarioError) as caught:
+        load_network(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"no\.csv: cannot be read: No such file"):
+        load_network(tmp_path / "no.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"id,x_m,y_m,heading_rad\n\xff,0,0,0\n")
+    with pytest.raises(ScenarioError, match=r"bytes\.csv: not a CSV file"):
+        load_network(tmp_path / "bytes.csv")
+
+
+def test_columns_go_by_their_names_and_headings_are_brought_into_one_turn(tmp_path: Path) -> None:
+    path = tmp_path / "n.csv"
+    path.write_text("colour,heading_rad,y_m,x_m,id\r\nred,-1.0,2.5,1.5, a \r\nblue,7.0,-4,3,b.2-x_y\r\n")
+    network = load_network(path)
+    assert network.node_ids == ("a", "b.2-x_y")
+    assert network.position_m.tolist() == [[1.5, 2.5], [3.0, -4.0]]
+    assert network.heading_rad == pytest.approx([2 * np.pi - 1, 7 - 2 * np.pi])
+
+
+def test_a_generated_network_survives_a_file(tmp_path: Path) -> None:
+    network = generate_network("dense", 5, 1)
+    rows = zip(network.node_ids, network.position_m.tolist(), network.heading_rad.tolist(), strict=True)
+    path = tmp_path / "n.csv"
+    path.write_text(HEADER + "".join(f"{name},{x!r},{y!r},{angle!r}\n" for name, (x, y), angle in rows))
+    again = load_network(path)
+    assert again.node_ids == network.node_ids
+    assert np.array_equal(again.position_m, network.position_m)
+    assert np.array_equal(again.heading_rad, network.heading_rad)
