@@ -288,7 +288,7 @@ class _RealTimeAgent:
         self._over: asyncio.Future[None] = self._loop.create_future()
         self._attachment.on_message = self._wake
         for node in self._host.nodes.values():
-            node.radio.inbox.refill = self._drain
+            node.radio.inbox.refill = node.gnss.inbox.refill = self._drain
         self._wake(b"")
         acknowledging = self._loop.create_task(self._acknowledge())
         try:
@@ -303,13 +303,17 @@ class _RealTimeAgent:
     def _wake(self, payload: bytes) -> None:
         # Zenoh's thread; one wake-up for however many messages come before it is answered. What nobody waits
         # for wakes nobody: the program finds it when it looks.
-        if wire.is_packets_only(payload) and not any(
-            node.radio.inbox.awaited for node in self._host.nodes.values()
-        ):
+        if self._started and wire.is_batch(payload) and not self._awaits(wire.is_packets_only(payload)):
             return
         if not self._wake_pending:
             self._wake_pending = True
             self._loop.call_soon_threadsafe(self._drain)
+
+    def _awaits(self, packets_only: bool) -> bool:
+        return any(
+            node.radio.inbox.awaited or (node.gnss.inbox.awaited and not packets_only)
+            for node in self._host.nodes.values()
+        )
 
     def _drain(self) -> None:
         self._wake_pending = False

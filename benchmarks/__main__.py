@@ -88,11 +88,52 @@ def bench_simulate() -> Figures:
     return {"real_time_factor": result["real_time_factor"]}
 
 
+REALTIME_RUNS = 5
+STALL_S = 0.03
+
+
+class StallWatch:
+    """How long the machine itself stood still: a thread that sleeps a millisecond and finds far more gone.
+
+    On a shared virtual machine such stalls, which are not ours, decide the tail of any latency.
+    """
+
+    def __init__(self) -> None:
+        self.stalled_s = 0.0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def _watch(self) -> None:
+        last = time.monotonic()
+        while not self._over.is_set():
+            time.sleep(0.001)
+            now = time.monotonic()
+            if now - last > STALL_S:
+                self.stalled_s += now - last
+            last = now
+
+    def __enter__(self) -> "StallWatch":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+
 def bench_realtime() -> Figures:
-    """50 beacons × 10 Hz × 30 peers × 300 B for 30 s on the wall clock."""
+    """50 beacons × 10 Hz × 30 peers × 300 B for 30 s on the wall clock: five runs, median and worst."""
+    runs = [_realtime_run() for _ in range(REALTIME_RUNS)]
+    figures = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
+    worst = {f"{name}_worst": max(run[name] for run in runs) for name in ("added_latency_p99_ms", "transport_gaps")}
+    return figures | worst
+
+
+def _realtime_run() -> Figures:
     options = ["--program", "benchmarks.programs:steady_beacon", "--pacing", "realtime", "--duration", "30"]
     options += [*FIFTY, "--set", "radio.range_m=100000", "--set", "radio.loss=0.0"]
-    result = vnet("run", "scenarios/beacon.toml", *options)
+    with StallWatch() as machine:
+        result = vnet("run", "scenarios/beacon.toml", *options)
     late = event(result, "late_deliveries")
     gaps = [e["count"] for e in result["events"] if e["kind"] == "transport_gap"]
     return {
@@ -102,6 +143,7 @@ def bench_realtime() -> Figures:
         "added_latency_p50_ms": late["p50_ms"],
         "added_latency_p99_ms": late["p99_ms"],
         "over_20_ms_share": late["count"] / late["total"],
+        "machine_stalled_s": machine.stalled_s,
     }
 
 

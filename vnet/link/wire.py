@@ -228,9 +228,14 @@ def decode_observation(data: bytes) -> dict[str, Any]:
     return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
 
 
+def is_batch(data: bytes) -> bool:
+    """Whether an encoded message is a batch: told from its first bytes, without decoding it."""
+    return data[1:7] == b"\xa5Batch"
+
+
 def is_packets_only(data: bytes) -> bool:
-    """Whether an encoded message is a batch without fixes: told from its first bytes, without decoding it."""
-    return data[1:8] == b"\xa5Batch\x90"
+    """Whether an encoded message is a batch without fixes."""
+    return is_batch(data) and data[7:8] == b"\x90"
 
 
 def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
