@@ -32,11 +32,22 @@ class Delivery:
 
 
 class Engine:
-    """The state of the emulated radio. Nodes are known by their numbers, 0 … N-1, in the order of `node_ids`."""
+    """The state of the emulated radio. Nodes are known by their numbers, 0 … N-1, in the order of `node_ids`.
 
-    def __init__(self, node_ids: Sequence[str], radio: Radio, seed: int, position_m: NDArray[np.float64]) -> None:
+    `position_m` (N, 2); `links` (N, N) is `radio.links` as loaded, whether i (row) hears j (column), or None where
+    `radio.range_m` decides.
+    """
+
+    def __init__(
+        self,
+        node_ids: Sequence[str],
+        radio: Radio,
+        seed: int,
+        position_m: NDArray[np.float64],
+        links: NDArray[np.bool_] | None,
+    ) -> None:
         self._node_ids = tuple(node_ids)
-        self._topology = Topology(position_m, radio.range_m, radio.max_peers)
+        self._topology = Topology(position_m, radio.range_m, radio.max_peers, links)
         self.chain = default_chain(radio, seed, self._topology)
         self.trace = Trace(node_ids)
         self.counts = dict.fromkeys(Outcome, 0)

@@ -51,6 +51,17 @@ def write(folder: Path, text: str) -> Path:
         ("[network]\nkind = 'file'\npath = '.'", ["network.path = '.'", "no such file"]),
         ("[program]\noptions = 3", ["program.options = 3", "dictionary"]),
         ("[program]\nentry = 'a.b:c; import d'", ["program.entry = 'a.b:c; import d'", "package.module:function"]),
+        ("[radio]\nlinks = 'no.csv'", ["radio.links = 'no.csv'", "no such file"]),
+        ("[radio]\nlinks = '.'", ["radio.links = '.'", "no such file"]),
+        ("[radio]\nlinks = 1", ["radio.links = 1", "name of a CSV file", "square matrix of 0 and 1"]),
+        ("[radio]\nlinks = []", ["radio.links = []", "name of a CSV file"]),
+        ("[radio.links]\na = 1", ["radio.links: ", "name of a CSV file"]),
+        ("[radio]\nlinks = [0, 1]", ["radio.links = [0, 1]", "not square: row 1 of 2"]),
+        ("[radio]\nlinks = [[0, 1], [1]]", ["radio.links = [[0, 1], [1]]", "not square: row 2 of 2"]),
+        ("[radio]\nlinks = [[0, 1]]", ["radio.links = [[0, 1]]", "not square: row 1 of 1"]),
+        ("[radio]\nlinks = [[0, 1], [2, 0]]", ["radio.links = [[0, 1], [2, 0]]", "row 2 holds 2", "0 or 1"]),
+        ("[radio]\nlinks = [[0, 'x'], [1, 0]]", ["radio.links = ", "row 1 holds 'x'", "0 or 1"]),
+        ("[radio]\nlinks = [[0, true], [1, 0]]", ["radio.links = ", "row 1 holds True", "0 or 1"]),
         ("[radio", ["not valid TOML"]),
         ("[radio]\nloss = 0.1\nloss = much\n", ["not valid TOML", "line 3"]),
         ("[program]\nentry = 'beacon'", ["program.entry = 'beacon'", "package.module:function"]),
@@ -129,13 +140,13 @@ def test_a_dumped_scenario_is_the_same_scenario(tmp_path: Path) -> None:
 
 
 def keys(section: BaseModel, prefix: str = "") -> list[str]:
-    """Every key of a scenario, as it stands after --set; the optional one is left out."""
+    """Every key of a scenario, as it stands after --set; the optional ones are left out."""
     found: list[str] = []
     for name in type(section).model_fields:
         value = getattr(section, name)
         inner = keys(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else [f"{prefix}{name}"]
         found += inner
-    return [key for key in found if key != "network.path"]
+    return [key for key in found if key not in ("network.path", "radio.links")]
 
 
 def test_a_dump_spells_out_every_default(tmp_path: Path) -> None:
@@ -217,6 +228,46 @@ def test_a_network_file_is_looked_for_beside_its_scenario(tmp_path: Path, monkey
     (tmp_path / "else").mkdir()
     monkeypatch.chdir(tmp_path / "else")
     assert load_scenario(path).network.path == (tmp_path / "n.csv").resolve()
+
+
+def test_links_of_a_file_are_found_recorded_and_held_to_their_digest(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    links = tmp_path / "links.csv"
+    links.write_text("0\n")
+    text = "[network]\nkind = 'file'\npath = 'n.csv'\n[radio]\nlinks = 'links.csv'"
+    original = load_scenario(write(tmp_path, text))
+    assert original.radio.links == links.resolve()
+    assert set(input_digests(original)) == {str((tmp_path / name).resolve()) for name in ("n.csv", "links.csv")}
+    (tmp_path / "else").mkdir()
+    recorded = write(tmp_path / "else", dump_scenario(original))
+    assert load_scenario(recorded) == original
+    links.write_text("1\n")
+    with pytest.raises(ScenarioError, match=r"links\.csv has changed"):
+        load_scenario(recorded)
+
+
+def test_a_links_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "links.csv").write_text("0\n")
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may read whatever it likes
+    with pytest.raises(ScenarioError, match=r"s\.toml: radio\.links = 'links\.csv': not readable: .*links\.csv$"):
+        load_scenario(write(tmp_path, "[radio]\nlinks = 'links.csv'"))
+
+
+@pytest.mark.parametrize("by", ["file", "override"])
+def test_links_written_out_survive_their_dump(tmp_path: Path, by: str) -> None:
+    key = "links = [[0, 1], [0, 0]]"
+    text, overrides = (f"[radio]\n{key}", []) if by == "file" else ("", [f"radio.{key.replace(' = ', '=')}"])
+    original = load_scenario(write(tmp_path, text), overrides)
+    assert original.radio.links == ((0, 1), (0, 0))
+    assert input_digests(original) == {}
+    assert load_scenario(write(tmp_path, dump_scenario(original))) == original
+
+
+def test_a_long_wrong_value_is_shown_by_its_beginning(tmp_path: Path) -> None:
+    links = [[0] * 50 for _ in range(49)]
+    with pytest.raises(ScenarioError, match="not square: row 1 of 49") as caught:
+        load_scenario(write(tmp_path, f"[radio]\nlinks = {links}"))
+    assert len(str(caught.value)) < len(str(tmp_path)) + 250
 
 
 def test_a_scenario_cannot_be_changed(tmp_path: Path) -> None:

@@ -20,6 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from vnet.errors import ScenarioError
 
 NS_PER_S = 1_000_000_000
+LONGEST_SHOWN = 100
+"""How many characters of a wrong value a message shows."""
 
 
 class Section(BaseModel):
@@ -96,9 +98,15 @@ class WorldSection(Section):
 
 
 class Radio(Section):
-    """`[radio]`: what stands between one vehicle's broadcast and another's reception."""
+    """`[radio]`: what stands between one vehicle's broadcast and another's reception.
+
+    All within `range_m` hear each other, unless `links` says who hears whom: a matrix of 0 and 1, or a CSV file of
+    one without a header (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in
+    the order of the network's vehicles; the diagonal means nothing.
+    """
 
     range_m: float = Field(3000.0, gt=0)
+    links: Path | tuple[tuple[int, ...], ...] | None = None
     max_peers: int = Field(30, ge=1)
     loss: float = Field(0.0, ge=0, le=1)
     latency_ms: float = Field(2.0, ge=0.001)
@@ -108,6 +116,21 @@ class Radio(Section):
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     bitrate_mbps: float = Field(6.0, gt=0)
     queue_frames: int = Field(64, ge=1)
+
+    @field_validator("links", mode="before")
+    @classmethod
+    def _links_are_a_file_or_a_matrix(cls, links: Any) -> Any:
+        if links is None or isinstance(links, (str, Path)):
+            return links
+        if not isinstance(links, (list, tuple)) or not links:
+            raise ValueError("write the name of a CSV file, or a square matrix of 0 and 1")
+        for number, row in enumerate(links, start=1):
+            if not isinstance(row, (list, tuple)) or len(row) != len(links):
+                raise ValueError(f"not square: row {number} of {len(links)} should be {len(links)} entries long")
+            for entry in row:
+                if type(entry) is not int or entry not in (0, 1):
+                    raise ValueError(f"row {number} holds {entry!r}: each entry should be 0 or 1")
+        return links
 
 
 class Program(Section):
@@ -147,8 +170,8 @@ class Scenario(Section):
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     """Read a scenario and apply `section.key=value` overrides.
 
-    Values are in TOML syntax; bare words are strings. A relative `network.path` is taken from the
-    scenario's own folder. Raises `ScenarioError`.
+    Values are in TOML syntax; bare words are strings. A relative `network.path` or `radio.links` is taken from
+    the scenario's own folder. Raises `ScenarioError`.
     """
     try:
         data = tomllib.loads(path.read_bytes().decode())
@@ -163,7 +186,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(f"{path}: {_first_problem(error)}") from None
-    scenario = _with_absolute_network_path(scenario, path)
+    scenario = _with_absolute_paths(scenario, path)
     for name, digest in input_digests(scenario).items():
         if recorded_digests.get(name, digest) != digest:
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
@@ -179,22 +202,28 @@ def dump_scenario(scenario: Scenario) -> str:
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
     """SHA-256 of each file that the scenario reads, by path."""
-    if scenario.network.path is None:
-        return {}
-    path = scenario.network.path
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
+    paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
 
 
-def _with_absolute_network_path(scenario: Scenario, scenario_path: Path) -> Scenario:
-    network = scenario.network
-    if network.path is None:
-        return scenario
-    path = (scenario_path.parent / network.path).resolve()
+def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
+    network, radio = scenario.network, scenario.radio
+    if network.path is not None:
+        path = _absolute(network.path, "network.path", scenario_path)
+        network = network.model_copy(update={"path": path})
+    if isinstance(radio.links, Path):
+        path = _absolute(radio.links, "radio.links", scenario_path)
+        radio = radio.model_copy(update={"links": path})
+    return scenario.model_copy(update={"network": network, "radio": radio})
+
+
+def _absolute(given: Path, key: str, scenario_path: Path) -> Path:
+    path = (scenario_path.parent / given).resolve()
     if not path.is_file():
-        raise ScenarioError(f"{scenario_path}: network.path = {str(network.path)!r}: no such file: {path}")
+        raise ScenarioError(f"{scenario_path}: {key} = {str(given)!r}: no such file: {path}")
     if not os.access(path, os.R_OK):
-        raise ScenarioError(f"{scenario_path}: network.path = {str(network.path)!r}: not readable: {path}")
-    return scenario.model_copy(update={"network": network.model_copy(update={"path": path})})
+        raise ScenarioError(f"{scenario_path}: {key} = {str(given)!r}: not readable: {path}")
+    return path
 
 
 def _apply_override(data: dict[str, Any], override: str) -> None:
@@ -224,7 +253,10 @@ def _first_problem(error: ValidationError) -> str:
     message = message[0].lower() + message[1:]
     if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
         return f"{key}: {message}"
-    return f"{key} = {problem['input']!r}: {message}"
+    value = repr(problem["input"])
+    if len(value) > LONGEST_SHOWN:  # a whole matrix
+        value = f"{value[:LONGEST_SHOWN]}…"
+    return f"{key} = {value}: {message}"
 
 
 def _allowed_keys(section: tuple[int | str, ...]) -> list[str]:

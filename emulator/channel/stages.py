@@ -61,11 +61,19 @@ class Stage(Protocol):
 class Topology:
     """Who is in range of whom, and whom each receiver's peer cap admits; rows are senders.
 
-    Recomputed only when vehicles move or go up or down. Positions are (N, 2) in metres.
+    Recomputed only when vehicles move or go up or down. Positions are (N, 2) in metres. `links` (N, N), whose rows
+    are receivers, says who is in range of whom in place of `range_m`; distances then only rank the peers.
     """
 
-    def __init__(self, position_m: NDArray[np.float64], range_m: float, max_peers: int) -> None:
+    def __init__(
+        self,
+        position_m: NDArray[np.float64],
+        range_m: float,
+        max_peers: int,
+        links: NDArray[np.bool_] | None = None,
+    ) -> None:
         self._range_m = range_m
+        self._links = links
         self._max_peers = max_peers
         self._up = np.ones(len(position_m), dtype=bool)
         self.move(position_m)
@@ -74,7 +82,7 @@ class Topology:
         """Take new positions."""
         offset_m = position_m[:, None, :] - position_m[None, :, :]
         self._distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
-        self.in_range = self._distance_m <= self._range_m
+        self.in_range = self._distance_m <= self._range_m if self._links is None else self._links.T.copy()
         np.fill_diagonal(self.in_range, False)
         self._rank()
 
@@ -97,8 +105,8 @@ class Topology:
         self.admitted = candidate & (rank < self._max_peers)
 
 
-class DiscRange:
-    """Everybody within `radio.range_m` hears, nobody else."""
+class InRange:
+    """Everybody within `radio.range_m` hears, or whom `radio.links` lets hear; nobody else."""
 
     def __init__(self, topology: Topology) -> None:
         self._topology = topology
@@ -200,7 +208,7 @@ class Latency:
 def default_chain(radio: Radio, seed: int, topology: Topology) -> list[Stage]:
     """The paper's radio, as DESIGN 5 has it."""
     return [
-        DiscRange(topology),
+        InRange(topology),
         PayloadLimit(radio.max_payload_bytes),
         TransmitQueue(seed, radio),
         PeerCap(topology),

@@ -26,6 +26,7 @@ from scipy.stats import binom
 from emulator.channel.outcomes import Outcome
 from emulator.observe.run_folder import Event, read_events
 from emulator.observe.trace import read_trace, sha256_of_table
+from emulator.world.links import load_links
 from vnet.errors import VnetError
 from vnet.roads.lanes import Array
 from vnet.scenario import Scenario, load_scenario
@@ -113,6 +114,11 @@ class Evidence:
         flat = self.states["position_m"].combine_chunks().values.to_numpy()
         return np.asarray(flat, dtype=float).reshape(-1, len(self.node_ids), 2)
 
+    @cached_property
+    def links(self) -> NDArray[np.bool_] | None:
+        """(N, N), who (row) hears whom (column), or None where the range decides. Raises ScenarioError."""
+        return load_links(self.scenario.radio, len(self.node_ids))
+
     def event(self, *kinds: str) -> list[Event]:
         """The events of these kinds."""
         return [event for event in self.events if event.kind in kinds]
@@ -140,6 +146,8 @@ def _in_range(evidence: Evidence) -> NDArray[np.bool_]:
     """(N, N), rows are senders: who is in range of whom. Vehicles stand still but for their place in the lane."""
     if not len(evidence.states):  # a run that ended before its first period did
         return np.zeros((0, 0), dtype=bool)
+    if evidence.links is not None:
+        return evidence.links.T
     position_m = evidence.positions()[0]
     offset = position_m[:, None] - position_m[None]
     in_range = np.hypot(offset[..., 0], offset[..., 1]) <= evidence.scenario.radio.range_m

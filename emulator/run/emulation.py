@@ -49,10 +49,9 @@ class Emulation:
         self.scenario = scenario
         self.world = world
         self.folder = folder
-        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m)
-        self.metrics = Metrics(
-            world.node_ids, components(start.position_m, scenario.radio.range_m), world.period_ns
-        )
+        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
+        component = components(start.position_m, scenario.radio.range_m, world.links)
+        self.metrics = Metrics(world.node_ids, component, world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.up = dict.fromkeys(world.node_ids, True)
         self._watchers: list[Callable[[PeriodView], None]] = []

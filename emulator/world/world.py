@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from emulator.world.links import load_links
 from emulator.world.networks import Network, generate_network, load_network
 from vnet.link.node import Fix
 from vnet.roads.lanes import Array, LaneMap
@@ -39,12 +40,17 @@ class Instant:
 
 
 class World:
-    """All that is true during a run. `lane_map` is what vehicles may know; `lane_of` (N,) is their secret."""
+    """All that is true during a run. `lane_map` is what vehicles may know; `lane_of` (N,) is their secret.
+
+    `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. Raises ScenarioError
+    if the scenario's links do not fit the network.
+    """
 
     def __init__(self, scenario: Scenario, network: Network) -> None:
         seed = scenario.run.seed
         count = len(network.node_ids)
         self.node_ids = network.node_ids
+        self.links = load_links(scenario.radio, count)
         self.period_ns = scenario.period_ns
         self.periods = math.ceil(scenario.duration_ns / scenario.period_ns) + 1
         order = _stream(seed, "map order", 0).permutation(count)
@@ -122,17 +128,21 @@ class World:
 
 
 def build_world(scenario: Scenario) -> World:
-    """The world of a scenario. Raises ScenarioError if its network cannot be used."""
+    """The world of a scenario. Raises ScenarioError if its network or its links cannot be used."""
     network = scenario.network
     if network.path is not None:
         return World(scenario, load_network(network.path))
     return World(scenario, generate_network(network.layout, network.vehicles, network.seed))
 
 
-def components(position_m: Array, range_m: float) -> NDArray[np.intp]:
-    """Which connected component each vehicle belongs to, as (N,) labels, at a range in metres."""
+def components(position_m: Array, range_m: float, links: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
+    """Which connected component each vehicle belongs to, as (N,) labels.
+
+    Positions (N, 2) and the range are in metres. `links` (N, N), if given, says who hears whom in place of the
+    range; a link of one direction connects as well (weakly).
+    """
     offset = position_m[:, None] - position_m[None]
-    linked = np.hypot(offset[..., 0], offset[..., 1]) <= range_m
+    linked = np.hypot(offset[..., 0], offset[..., 1]) <= range_m if links is None else links
     _, label = connected_components(linked, directed=False)
     return np.asarray(label, dtype=np.intp)
 

@@ -11,8 +11,8 @@ from scipy.stats import binom
 from emulator.channel.draws import Draws
 from emulator.channel.outcomes import Outcome
 from emulator.channel.stages import (
-    DiscRange,
     Frame,
+    InRange,
     Latency,
     Loss,
     Pairs,
@@ -84,7 +84,7 @@ def test_a_pair_that_is_decided_stays_decided() -> None:
 
 def test_the_range_is_a_closed_disc_without_its_centre() -> None:
     position = np.array([[0.0, 0.0], [3000.0, 0.0], [0.0, np.nextafter(3000.0, 4000.0)], [1800.0, 2400.0]])
-    heard = sent(DiscRange(Topology(position, 3000.0, 30)), 4).outcome
+    heard = sent(InRange(Topology(position, 3000.0, 30)), 4).outcome
     assert [Outcome(o).name for o in heard] == ["out_of_range", "pending", "out_of_range", "pending"]
 
 

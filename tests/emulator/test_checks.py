@@ -323,6 +323,48 @@ def test_invalid_wins_over_unknown_over_valid_in_a_run(line: Evidence) -> None:
     assert statuses == [0, 3, 1]
 
 
+FORK = [[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [1, 1, 1, 0]]  # 0 → 1 → 2, and 3 hears them all
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_a_matrix_run_is_judged_by_its_matrix(tmp_path: Path, written: bool) -> None:
+    """Vehicles 0 and 3 are out of range, 1 and 0 well within it: only the matrix explains who heard whom."""
+    path = tmp_path / "links.csv"
+    path.write_text("\n".join(",".join(map(str, row)) for row in FORK))
+    evidence = four(tmp_path, radio={"links": path if written else FORK, "max_peers": 2})
+    assert damaged(evidence, evidence.trace) == {}
+    assert verdict(evidence, "peer_cap") is Verdict.VALID, "the cap of 2 acts on vehicle 3"
+    assert check_run(tmp_path / "run").verdict is Verdict.VALID
+    pairs = set(zip(evidence.nodes("sender").tolist(), evidence.nodes("receiver").tolist(), strict=True))
+    assert pairs == {(0, 1), (1, 2), (0, 3), (1, 3), (2, 3)}
+    disc = evidence.scenario.radio.model_copy(update={"links": None})
+    by_range = replace(evidence, scenario=evidence.scenario.model_copy(update={"radio": disc}))
+    assert verdict(by_range, "conservation") is Verdict.INVALID
+
+
+def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: Path) -> None:
+    evidence = four(tmp_path, radio={"links": FORK, "loss": 0.0})
+    row = int(np.flatnonzero((evidence.nodes("sender") == 1) & (evidence.nodes("receiver") == 2))[0])
+    found = damaged(evidence, with_names(evidence.trace, "receiver", row, "v0"))  # within range, but deaf to v1
+    assert {name: check.verdict for name, check in found.items()} == {
+        "conservation": Verdict.INVALID,
+        "range": Verdict.INVALID,
+    }
+    assert found["range"].figures["beyond"] == found["conservation"].figures["not_in_range"] == 1
+
+
+def test_a_capped_pair_that_was_delivered_is_found_in_a_matrix_run(tmp_path: Path) -> None:
+    evidence = four(tmp_path, radio={"links": FORK, "loss": 0.0, "max_peers": 2})
+    forged = with_names(evidence.trace, "outcome", first(evidence, "peer_cap"), "delivered")
+    assert set(damaged(evidence, forged)) == {"peer_cap"}
+
+
+def test_a_matrix_in_which_nobody_hears_leaves_no_radio_to_judge(tmp_path: Path) -> None:
+    judgement = judge(four(tmp_path, radio={"links": [[0] * 4] * 4}))
+    assert judgement.verdict is Verdict.VALID
+    assert {"conservation", "range", "peer_cap", "loss_rate"} <= {left.name for left in judgement.not_exercised}
+
+
 @pytest.mark.parametrize(
     "name", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
 )

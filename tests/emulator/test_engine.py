@@ -20,9 +20,9 @@ def place(count: int, seed: int, side_m: float = 8000.0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0, side_m, (count, 2))
 
 
-def engine(position_m: np.ndarray, seed: int = 1, **radio: float) -> Engine:
+def engine(position_m: np.ndarray, seed: int = 1, links: np.ndarray | None = None, **radio: float) -> Engine:
     ids = [f"v{number}" for number in range(len(position_m))]
-    return Engine(ids, Radio.model_validate(radio), seed, position_m)
+    return Engine(ids, Radio.model_validate(radio), seed, position_m, links)
 
 
 def rows(of: Engine) -> list[dict]:
@@ -195,6 +195,53 @@ def test_moving_changes_who_hears_from_then_on() -> None:
     subject.drain()
     assert subject.counts[Outcome.out_of_range] == 1
     assert subject.counts[Outcome.delivered] == 1
+
+
+def heard(subject: Engine) -> set[tuple[str, str]]:
+    """Which (sender, receiver) pairs came to a delivery."""
+    return {(row["sender"], row["receiver"]) for row in rows(subject) if row["outcome"] == "delivered"}
+
+
+def test_in_a_directed_ring_frames_go_one_way_only() -> None:
+    """Vehicle i hears only vehicle i - 1, though all stand in one place, and as little when they have moved."""
+    links = np.roll(np.eye(4, dtype=bool), -1, axis=1)
+    subject = engine(np.zeros((4, 2)), links=links)
+    for time_ns in (0, PERIOD_NS):
+        for node in range(4):
+            subject.transmit(time_ns, node, [b"x"])
+        subject.set_positions(place(4, 1, side_m=1e6))
+    subject.drain()
+    assert heard(subject) == {("v0", "v1"), ("v1", "v2"), ("v2", "v3"), ("v3", "v0")}
+    assert subject.counts[Outcome.delivered] == 2 * 4
+    assert subject.counts[Outcome.out_of_range] == 2 * 4 * 2
+
+
+def test_in_a_matrix_a_row_is_what_a_receiver_hears_and_the_cap_goes_by_distance() -> None:
+    links = np.zeros((4, 4), dtype=bool)
+    links[0] = [False, True, True, True]  # vehicle 0 hears all others, and is heard by none
+    position = np.array([[0.0, 0.0], [9e3, 0.0], [7e3, 0.0], [8e3, 0.0]])
+    subject = engine(position, links=links, max_peers=2)
+    for time_ns, down in ((0, []), (PERIOD_NS, [2])):
+        for node in down:
+            subject.set_up(node, False)
+        for node in range(4):
+            subject.transmit(time_ns, node, [b"x"])
+        subject.advance(time_ns + PERIOD_NS)
+        live = {("v2", "v0"), ("v3", "v0")} if not down else {("v1", "v0"), ("v2", "v0"), ("v3", "v0")}
+        assert heard(subject) == live
+    assert subject.counts[Outcome.peer_cap] == 1, "vehicle 1, as long as vehicle 2 lived"
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 8), seeds)
+def test_any_matrix_decides_who_hears_whom(count: int, seed: int) -> None:
+    links = np.random.default_rng(seed % 1000).random((count, count)) < 0.5
+    np.fill_diagonal(links, False)
+    subject = engine(place(count, seed % 1000), seed, links)
+    for node in range(count):
+        subject.transmit(0, node, [b"x"])
+    subject.drain()
+    assert heard(subject) == {(f"v{j}", f"v{i}") for i in range(count) for j in range(count) if links[i, j]}
 
 
 @pytest.mark.parametrize("change", ["payload", "time", "loss"])

@@ -257,6 +257,13 @@ def test_components_are_those_found_by_merging(cells: list[tuple[int, int]], ran
     assert len(set(zip(label, found.tolist(), strict=True))) == len(set(label)) == len(set(found.tolist()))
 
 
+def test_components_of_a_matrix_are_connected_by_links_of_either_direction() -> None:
+    links = np.zeros((5, 5), dtype=bool)
+    links[0, 1] = links[2, 1] = links[3, 4] = True
+    labels = components(np.zeros((5, 2)), 3000.0, links).tolist()
+    assert labels[0] == labels[1] == labels[2] != labels[3] == labels[4]
+
+
 def test_the_dense_scenario_exercises_the_cap() -> None:
     dense = load_scenario(ROOT / "scenarios" / "dense.toml")
     position_m = build_world(dense).at(0).position_m
