@@ -175,8 +175,24 @@ def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Fi
     return {"step_us": statistics.median(times_s) * 1e6}
 
 
+def bench_estimators() -> Figures:
+    """The RBPF step against the same with a covariance a particle, and against Stone Soup and filterpy."""
+    from benchmarks import estimators  # needs the extra `bench`
+
+    return estimators.compare()
+
+
+def bench_quadratic_programs() -> Figures:
+    """The fusion weights by OSQP's update against other solvers."""
+    from benchmarks import quadratic_programs  # needs the extra `bench`
+
+    return quadratic_programs.compare()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
+    "estimators": bench_estimators,
+    "quadratic_programs": bench_quadratic_programs,
     "simulate": bench_simulate,
     "lockstep": bench_lockstep,
     "demo": bench_demo,
@@ -191,7 +207,11 @@ def main() -> None:
     table = Table("benchmark", "figure", "value")
     results = {}
     for name in names:
-        results[name] = BENCHMARKS[name]()
+        try:
+            results[name] = BENCHMARKS[name]()
+        except ModuleNotFoundError as error:
+            print(f"{name}: skipped, {error.name} is missing; `make bench` installs it", file=sys.stderr)
+            continue
         for figure, value in results[name].items():
             table.add_row(name, figure, f"{value:.4g}")
     Console(stderr=True).print(table)
