@@ -58,7 +58,7 @@ class Piqp:
         if self._solver is None:
             bounds = {"x_l": np.zeros(count), "x_u": np.ones(count)}
             self._solver = piqp.DenseSolver()
-            # Else `update` of the Hessian alone scales the other data twice (0.6.4), and most solutions are wrong.
+            # Else an `update` of the Hessian alone makes wrong solutions (0.6.4); one of all the data does not.
             self._solver.settings.preconditioner_reuse_on_update = True
             self._solver.setup(hessian, np.zeros(count), np.ones((1, count)), np.ones(1), **bounds)
         else:
