@@ -1,34 +1,44 @@
 """Decentralized cooperative map matching: what a vehicle does each period, and what it sends.
 
-At each fix: take what neighbours broadcast a period ago; filter everybody's fixes of that period; one round of mean
-consensus; mix neighbours' particles into one's own; predict to now; broadcast once; report. The filter runs one
-period behind, because a neighbour's fix reaches it one period late or not at all. The mathematics is `vnet.cmm`'s.
+At each fix: wait for one's slot and broadcast once, with what one knows by then, so that a fix may be passed on
+several times within the period; listen until the period is nearly over; then filter all fixes that have come, do
+one round of mean consensus, come together with the neighbours, and report. The mathematics is `vnet.cmm`'s.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from agents.cooperative_frame import (
-    COMMON_LIMIT_M,
+    RELAY_LIMIT,
+    RELAYED,
     CooperativeFrame,
     FrameError,
     decode,
     encode,
-    room_for_particles,
+    name_of_code,
+    room,
     short_name,
 )
+from agents.cooperative_options import Options
+from agents.sightings import Sightings
 from vnet import Fix, Node, Packet
-from vnet.cmm.consensus import AVERAGING_RULES, AveragingConsensus, Consensus, RatioConsensus, Share
+from vnet.cmm.consensus import AveragingConsensus, Consensus, DirectMean, RatioConsensus, Share
 from vnet.cmm.fusion import Cloud, fuse
-from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
-from vnet.cmm.weights import OptimizedWeights, random_weights
-from vnet.errors import ProgramError
+from vnet.cmm.rbpf import Observation, Rbpf
+from vnet.cmm.weights import (
+    OptimizedWeights,
+    constant_weights,
+    max_degree_weights,
+    metropolis_weights,
+    no_fusion_weights,
+    random_weights,
+)
 from vnet.roads.lanes import Array, LaneMap
 
 NS_PER_S = 1_000_000_000
@@ -36,154 +46,182 @@ STALE_PERIODS = 3
 EPOCHS_PER_PERIOD = 100
 """More than a whole network could ever start in a period: a frame that claims it is absurd, and would spread."""
 CLOUD_REPORT_PARTICLES = 50
-FUSIONS = ("optimized", "random", "none")
-CONSENSUSES = ("ratio", *AVERAGING_RULES)
-
-
-@dataclass(frozen=True)
-class Options:
-    """`[program.options]`. Defaults fit the default world; lengths in metres, times in seconds."""
-
-    fusion: str = "optimized"
-    consensus: str = "ratio"
-    particles: int = 200
-    common_sigma_m: float = 3.0
-    common_tau_s: float = 600.0
-    lateral_tau_s: float = 20.0
-    self_floor: float = 0.0
-    fusion_interval_s: float = 0.5
-
-    @classmethod
-    def parse(cls, options: Mapping[str, Any]) -> Options:
-        """Options from a scenario. Raises ProgramError that names the key, the value and what is allowed."""
-        kinds = {field.name: type(field.default) for field in fields(cls)}
-        for key, value in options.items():
-            if key not in kinds:
-                raise ProgramError(f"program.options.{key}: unknown; allowed: {', '.join(sorted(kinds))}")
-            if not isinstance(value, (int, float) if kinds[key] is float else kinds[key]) or isinstance(
-                value, bool
-            ):
-                raise ProgramError(f"program.options.{key} = {value!r}: {kinds[key].__name__} expected")
-        parsed = cls(**options)
-        if parsed.fusion not in FUSIONS:
-            raise ProgramError(f"program.options.fusion = {parsed.fusion!r}: allowed: {', '.join(FUSIONS)}")
-        if parsed.consensus not in CONSENSUSES:
-            raise ProgramError(
-                f"program.options.consensus = {parsed.consensus!r}: allowed: {', '.join(CONSENSUSES)}"
-            )
-        if not 2 <= parsed.particles <= 100_000:
-            raise ProgramError(f"program.options.particles = {parsed.particles}: 2 to 100000 allowed")
-        for key in ("common_tau_s", "lateral_tau_s", "fusion_interval_s"):
-            if not getattr(parsed, key) > 0:
-                raise ProgramError(f"program.options.{key} = {getattr(parsed, key)}: must be positive")
-        if not 0 <= parsed.self_floor <= 1:
-            raise ProgramError(f"program.options.self_floor = {parsed.self_floor}: 0 to 1 allowed")
-        if not 0 <= parsed.common_sigma_m <= COMMON_LIMIT_M:
-            raise ProgramError(
-                f"program.options.common_sigma_m = {parsed.common_sigma_m}: 0 to {COMMON_LIMIT_M} allowed"
-            )
-        return parsed
+SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.85, 0.97
+"""Shares of the period: within the first every vehicle sends, at the end of the second it computes."""
 
 
 class Estimator:
     """The state of one vehicle's cooperation, without any input or output of its own."""
 
-    def __init__(self, node_id: str, options: Options, lanes: LaneMap, rng: np.random.Generator) -> None:
+    def __init__(
+        self, node_id: str, options: Options, lanes: LaneMap, rng: np.random.Generator, period_ns: int
+    ) -> None:
         self.name = short_name(node_id)
         self.rejected: Counter[str] = Counter()
-        self.stacked_m: Array | None = None
-        self._since_fusion_s = 0.0
+        self.rbpf = Rbpf(options.filter_config(), lanes, rng)
+        self.consensus = _consensus(options.consensus, self.name)
+        self.stacked_m = self.rbpf.estimate_m
+        self.weights: dict[str, float] = {}
+        """The latest fusion weights by node id, its own included."""
+        self.imported = 0
+        self._node_id = node_id
         self._options = options
         self._rng = rng
-        config = RbpfConfig(
-            options.particles,
-            options.common_sigma_m,
-            options.common_tau_s,
-            lateral_tau_s=options.lateral_tau_s,
-        )
-        self.rbpf = Rbpf(config, lanes, rng)
-        self.consensus: Consensus = _consensus(options.consensus, self.name)
+        self._period_ns = period_ns
+        self._since_fusion_s = 0.0
+        self._now_ns = -period_ns
+        self._frames: dict[str, CooperativeFrame] = {}
+        self._newest_ns: dict[str, int] = {}
         self._early: list[tuple[str, CooperativeFrame]] = []
-        self._weights = OptimizedWeights(options.self_floor)
+        self._ids: dict[str, str] = {}
+        self._sightings = Sightings(int(self.name, 16), period_ns)
+        self._optimized = OptimizedWeights(options.self_floor)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
+        self._largest_degree = 0
+        self._said = self._estimate()
+        self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
-    def read(self, packets: Iterable[Packet], now_ns: int, period_ns: int) -> dict[str, CooperativeFrame]:
-        """The newest usable frame of each neighbour, by short name; what is not usable is counted by reason.
+    def read(self, packets: Iterable[Packet], now_ns: int) -> None:
+        """Take in what the radio brought; what is not usable is counted by reason.
 
-        The filter runs one period behind. A vehicle that is late with its work, as in real time it may be, finds
-        frames of this very period: they are kept until it is their turn.
+        In real time a vehicle that is late with its work finds frames of the next period: they wait for it.
         """
-        newest: dict[str, CooperativeFrame] = {}
         waiting, self._early = self._early, []
         for sender, frame in [*waiting, *self._decoded(packets)]:
-            age_ns = now_ns - frame.fix_time_ns
-            if abs(age_ns) > STALE_PERIODS * period_ns:
+            if abs(now_ns - frame.fix_time_ns) > STALE_PERIODS * self._period_ns:
                 self.rejected["stale"] += 1
-            elif frame.epoch > EPOCHS_PER_PERIOD * (1 + now_ns // period_ns):
+            elif frame.epoch > EPOCHS_PER_PERIOD * (1 + now_ns // self._period_ns):
                 self.rejected["absurd"] += 1
-            elif age_ns <= 0:
+            elif frame.fix_time_ns <= self._newest_ns.get(sender, -1) and not self._options.two_frames:
+                self.rejected["old"] += 1
+            elif frame.fix_time_ns > now_ns - now_ns % self._period_ns:
                 self._early.append((sender, frame))
-            elif sender not in newest or frame.fix_time_ns > newest[sender].fix_time_ns:
-                newest[sender] = frame
-        return dict(sorted(newest.items()))
+            else:
+                self._newest_ns[sender] = frame.fix_time_ns
+                self._frames[sender] = frame
+                if self._is_neighbour(sender):
+                    self._sightings.learn(int(sender, 16), frame)
 
     def _decoded(self, packets: Iterable[Packet]) -> Iterator[tuple[str, CooperativeFrame]]:
         for packet in packets:
+            sender = short_name(packet.sender)
+            self._ids[sender] = packet.sender
             try:
-                yield short_name(packet.sender), decode(packet.payload)
+                yield sender, decode(packet.payload)
             except FrameError as error:
                 self.rejected[str(error)] += 1
 
-    def step(self, dt_s: float, own: Fix, frames: Mapping[str, CooperativeFrame]) -> None:
-        """One period, up to the time of the fix `own`, which is the one before the latest."""
-        observations = {self.name: Observation(own.position_m, own.covariance_m2, own.heading_rad)}
-        for sender, frame in frames.items():
-            if frame.fix_time_ns == own.time_ns:
-                observations[sender] = Observation(frame.fix_m, own.covariance_m2, frame.heading_rad)
-        self.rbpf.step(dt_s, observations)
-        self._share = self.consensus.round(self.rbpf.estimate_m, {s: _share(f) for s, f in frames.items()})
+    def _is_neighbour(self, sender: str) -> bool:
+        return self._neighbours is None or sender in self._neighbours
+
+    def filter(self, own: Fix) -> None:
+        """Take all fixes that have come, up to the time of the vehicle's `own`."""
+        dt_s = (own.time_ns - self._now_ns) / NS_PER_S
         self._since_fusion_s += dt_s
-        due = self._since_fusion_s >= self._options.fusion_interval_s - dt_s / 2
-        if due and frames and self._options.fusion != "none":
+        self._now_ns = own.time_ns
+        self._sightings.forget(own.time_ns - round(self.rbpf.config.memory_s * NS_PER_S))
+        observations = dict(self._sightings.observations(own.time_ns, own.covariance_m2))
+        observations[self.name] = Observation(own.position_m, own.covariance_m2, own.heading_rad)
+        self.rbpf.step(dt_s, observations)
+
+    def agree(self) -> None:
+        """A round of consensus, and of coming together, with those whose frames have come since the last."""
+        everybody, self._frames = dict(sorted(self._frames.items())), {}
+        frames = {sender: frame for sender, frame in everybody.items() if self._is_neighbour(sender)}
+        shares = everybody if self._options.consensus == "exact" else frames
+        self._share = self.consensus.round(self.rbpf.estimate_m, {s: _share(f) for s, f in shares.items()})
+        degrees = [frame.largest_degree for frame in frames.values()]
+        self._largest_degree = max([self._largest_degree, len(self._share.heard), *degrees])
+        self.imported = 0
+        half_period_s = self._period_ns / 2 / NS_PER_S
+        if frames and self._since_fusion_s >= self._options.fusion_interval_s - half_period_s:
             self._since_fusion_s = 0.0
-            self.stacked_m = self._fuse(frames)
+            self.stacked_m = self._come_together(frames)
         else:
             self.stacked_m = self.rbpf.estimate_m
+        if self._options.roads_apart:
+            self.rbpf.weigh_roads()
 
-    def _fuse(self, frames: Mapping[str, CooperativeFrame]) -> Array:
-        rbpf = self.rbpf
-        estimates = np.array([rbpf.estimate_m, *(frame.estimate_m for frame in frames.values())])
-        if self._options.fusion == "random":
-            weights = random_weights(len(estimates), self._rng)
-        else:
-            mean = self.consensus.mean_m
-            own_covariance = rbpf.estimate_covariance_m2 + 1e-9 * np.eye(2)  # a collapsed cloud is still a cloud
-            covariances = np.array([own_covariance, *(frame.covariance_m2 for frame in frames.values())])
-            weights = self._weights.solve(estimates, covariances, estimates.mean(axis=0) if mean is None else mean)
-        clouds = [Cloud(frame.cloud_m, frozenset(frame.heard) | {sender}) for sender, frame in frames.items()]
-        return fuse(rbpf, clouds, weights, self._rng)
+    def _come_together(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+        """Fuse with the neighbours; returns the estimate (2,) right afterwards.
+
+        What they say is a period old, and is held against what this vehicle said then.
+        """
+        weights = self._weigh(frames)
+        self.weights = dict(zip([self._node_id, *(self._ids[s] for s in frames)], weights.tolist(), strict=True))
+        if self._options.exchange == "particles":
+            known = [
+                frozenset(frame.heard) | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
+                for sender, frame in frames.items()
+            ]
+            clouds = [Cloud(f.cloud_m, names) for f, names in zip(frames.values(), known, strict=True)]
+            stacked, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
+            return stacked
+        offset = np.array([frame.estimate_m for frame in frames.values()]) - self._said[0]
+        self.rbpf.shift(weights[1:] @ offset)
+        return self.rbpf.estimate_m
+
+    def _weigh(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+        """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
+        count = 1 + len(frames)
+        match self._options.fusion:
+            case "none":
+                return no_fusion_weights(count)
+            case "random":
+                return random_weights(count, self._rng)
+            case "constant":
+                return constant_weights(count, self._options.alpha)
+            case "metropolis":
+                return metropolis_weights(len(frames), [len(frame.heard) for frame in frames.values()])
+            case "max-degree":
+                return max_degree_weights(count, max(self._largest_degree, len(frames)))
+            case _:
+                return self._optimize(frames)
+
+    def _optimize(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+        estimates = np.array([self._said[0], *(frame.estimate_m for frame in frames.values())])
+        covariances = np.array([self._said[1], *(frame.covariance_m2 for frame in frames.values())])
+        if self._options.ridge_m2:
+            covariances = np.tile(self._options.ridge_m2 / 2 * np.eye(2), (len(estimates), 1, 1))
+        mean = self.consensus.mean_m
+        return self._optimized.solve(estimates, covariances, estimates.mean(axis=0) if mean is None else mean)
+
+    def _estimate(self) -> tuple[Array, Array]:
+        # A collapsed cloud is still a cloud: its covariance must stay positive definite.
+        return self.rbpf.estimate_m, self.rbpf.estimate_covariance_m2 + 1e-6 * np.eye(2)
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
         share = self._share
+        self._said = self._estimate()
         heard = {name: name in share.takers for name in sorted(share.heard)[:255]}
-        count = min(self._options.particles, room_for_particles(len(heard), max_payload))
+        left = room(len(heard), max_payload)
+        mixes = self._options.exchange == "particles" and self._options.fusion != "none"
+        count = min(self._options.particles, left // 4) if mixes else 0
+        most = min(RELAY_LIMIT, (left - 4 * count) // RELAYED.itemsize) if self._options.relay else 0
         frame = CooperativeFrame(
             fix.time_ns,
             fix.position_m,
             fix.heading_rad,
-            self.rbpf.estimate_m,
-            self.rbpf.estimate_covariance_m2 + 1e-6 * np.eye(2),
+            *self._said,
             share.epoch,
             share.running_sum,
             heard,
             self.rbpf.sample(count),
+            self._sightings.freshest(fix.time_ns, most),
+            min(self._largest_degree, 255),
         )
         return encode(frame)
 
 
 def _consensus(rule: str, name: str) -> Consensus:
-    return RatioConsensus(name) if rule == "ratio" else AveragingConsensus(name, rule)
+    match rule:
+        case "ratio":
+            return RatioConsensus(name)
+        case "exact":
+            return DirectMean()
+        case _:
+            return AveragingConsensus(name, rule)
 
 
 def _share(frame: CooperativeFrame) -> Share:
@@ -193,24 +231,36 @@ def _share(frame: CooperativeFrame) -> Share:
 
 async def main(node: Node) -> None:
     """Cooperate until the run ends."""
-    estimator = Estimator(node.id, Options.parse(node.options), node.map, node.rng)
+    options = Options.parse(node.options)
+    estimator = Estimator(node.id, options, node.map, node.rng, node.period_ns)
     periods_a_second = max(1, NS_PER_S // node.period_ns)
-    previous: Fix | None = None
+    slot = int(node.rng.integers(options.slots))
+    slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
     async for fix in node.gnss:
-        frames = estimator.read(node.radio.drain(), fix.time_ns, node.period_ns)
-        if previous is not None:
-            dt_s = (fix.time_ns - previous.time_ns) / NS_PER_S
-            estimator.step(dt_s, previous, frames)
+        await _sleep_until(node, fix.time_ns + slot_ns)
+        estimator.read(node.radio.drain(), node.now_ns)
         payload = estimator.frame(fix, node.radio.max_payload)
         await node.radio.broadcast(payload)
-        if previous is not None:
-            with_cloud = (fix.time_ns // node.period_ns) % periods_a_second == 0
-            _report(node, estimator, dt_s, len(frames), len(payload), with_cloud)
-        previous = fix
+        await _sleep_until(node, fix.time_ns + round(LISTENING_SHARE * node.period_ns))
+        packets = node.radio.drain()
+        estimator.read(packets, node.now_ns)
+        estimator.filter(fix)
+        if options.two_frames:
+            await node.radio.broadcast(estimator.frame(fix, node.radio.max_payload))
+            await _sleep_until(node, fix.time_ns + round(REPORTING_SHARE * node.period_ns))
+            estimator.read(node.radio.drain(), node.now_ns)
+        estimator.agree()
+        in_full = (fix.time_ns // node.period_ns) % periods_a_second == 0
+        _report(node, estimator, len(packets), len(payload), in_full)
 
 
-def _report(node: Node, estimator: Estimator, dt_s: float, heard: int, size: int, with_cloud: bool) -> None:
-    """Report the position predicted to now, and what the metrics know of the common error."""
+async def _sleep_until(node: Node, time_ns: int) -> None:
+    if time_ns > node.now_ns:
+        await asyncio.sleep((time_ns - node.now_ns) / NS_PER_S)
+
+
+def _report(node: Node, estimator: Estimator, heard: int, size: int, in_full: bool) -> None:
+    """Report the position, and what the metrics know of the common error; once a second cloud and weights too."""
     rbpf = estimator.rbpf
     position_m, covariance_m2 = rbpf.position_m(estimator.name)
     values: dict[str, Any] = {
@@ -218,12 +268,14 @@ def _report(node: Node, estimator: Estimator, dt_s: float, heard: int, size: int
         "common_error_covariance_m2": rbpf.estimate_covariance_m2,
         "stacked_common_error_m": estimator.stacked_m,
         "heard": heard,
+        "imported": estimator.imported,
         "bytes": size,
         "rejected": estimator.rejected.total(),
     }
     mean_m = estimator.consensus.mean_m
     if mean_m is not None:
         values["mean_m"] = mean_m
-    if with_cloud:
+    if in_full:
         values["cloud_m"] = rbpf.sample(min(CLOUD_REPORT_PARTICLES, rbpf.config.particles))
-    node.report(position_m + dt_s * rbpf.velocity_m_s(estimator.name), covariance_m2, **values)
+        values |= {f"weight.{other}": weight for other, weight in estimator.weights.items()}
+    node.report(position_m, covariance_m2, **values)

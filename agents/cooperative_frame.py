@@ -1,8 +1,8 @@
 """The one frame that a cooperative vehicle broadcasts each period, as bytes and back (MODEL 3).
 
-Fix, estimate, consensus state, whom it hears, and a sample of its hypotheses of the common error in steps of 1 cm.
-Vehicles are named by 4-byte hashes of their ids. Whatever does not decode, or decodes to absurd values, is a
-`FrameError` with a one-word reason: the radio brings anything.
+Fix, estimate, consensus state, whom it hears, a sample of its hypotheses of the common error in steps of 1 cm, and
+fixes of others that it passes on. Vehicles are named by 4-byte hashes of their ids. Whatever does not decode, or
+decodes to absurd values, is a `FrameError` with a one-word reason: the radio brings anything.
 """
 
 from __future__ import annotations
@@ -10,30 +10,43 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vnet.roads.lanes import Array
 
-VERSION = 1
+VERSION = 2
 NAME_BYTES = 4
 COMMON_LIMIT_M = 327.0
 """Larger common errors are absurd; int16 centimetres end here."""
 NO_HEADING = 0xFFFF
 _FULL_TURN = 0xFFFF  # headings in steps of 2π / 65535; the last code means none
 
-# version, heard, particles, heading, fix time, fix x, y (cm), x_i, Cov(x_i), epoch, running sums
-_HEADER = struct.Struct("<BBHHQii2f3fI3d")
+# version, heard, relayed, largest degree, particles, heading, fix time, fix x, y (cm), x_i, Cov(x_i), epoch, sums
+_HEADER = struct.Struct("<BBBBHHQii2f3fI3d")
+RELAYED = np.dtype([("name", "<u4"), ("age", "u1"), ("heading", "<u2"), ("x_cm", "<i4"), ("y_cm", "<i4")])
+"""A fix that is passed on: whose, how many periods older than the frame's own, heading code, position in cm."""
+RELAY_LIMIT = 255
 
 
 class FrameError(ValueError):
     """A payload that is no frame of this program; the message is the reason it is counted under."""
 
 
+def _nothing_relayed() -> NDArray[np.void]:
+    return np.empty(0, dtype=RELAYED)
+
+
 @dataclass(frozen=True)
 class CooperativeFrame:
-    """The contents of a frame. Names are `short_name`s; `heard` says of each whether it is given a share."""
+    """The contents of a frame. Names are `short_name`s; `heard` says of each whether it is given a share.
+
+    `cloud_m` (n, 2) and `relayed` (m,) of `RELAYED` may be empty. `largest_degree` is the most neighbours that any
+    vehicle has, as far as word of it has come.
+    """
 
     fix_time_ns: int
     fix_m: Array
@@ -44,6 +57,13 @@ class CooperativeFrame:
     running_sum: tuple[float, float, float]
     heard: dict[str, bool]
     cloud_m: Array
+    relayed: NDArray[np.void] = field(default_factory=_nothing_relayed)
+    largest_degree: int = 0
+
+    def own_fix(self, code: int) -> NDArray[np.void]:
+        """The sender's own fix, (1,) of `RELAYED`, under its code."""
+        x_cm, y_cm = _cm(self.fix_m)
+        return np.array([(code, 0, _heading_code(self.heading_rad), x_cm, y_cm)], dtype=RELAYED)
 
 
 def short_name(node: str) -> str:
@@ -51,28 +71,28 @@ def short_name(node: str) -> str:
     return hashlib.blake2b(node.encode(), digest_size=NAME_BYTES).hexdigest()
 
 
-def room_for_particles(heard: int, max_payload: int) -> int:
-    """How many hypotheses fit beside `heard` names into `max_payload` bytes."""
-    return max(0, (max_payload - _HEADER.size - heard * NAME_BYTES - (heard + 7) // 8) // 4)
+def name_of_code(code: int) -> str:
+    """The `short_name` that a code in `RELAYED` stands for; `int(name, 16)` is the way back."""
+    return f"{code:0{2 * NAME_BYTES}x}"
+
+
+def room(heard: int, max_payload: int) -> int:
+    """How many bytes are left for hypotheses and relayed fixes beside `heard` names in `max_payload` bytes."""
+    return max(0, max_payload - _HEADER.size - heard * NAME_BYTES - (heard + 7) // 8)
 
 
 def encode(frame: CooperativeFrame) -> bytes:
     """A frame as bytes; hypotheses beyond ±327 m are clipped."""
-    heading = (
-        NO_HEADING
-        if frame.heading_rad is None
-        else int(frame.heading_rad % (2 * math.pi) / (2 * math.pi) * _FULL_TURN)
-    )
-    x_cm, y_cm = np.round(frame.fix_m * 100).astype(int).tolist()
     covariance = frame.covariance_m2
     header = _HEADER.pack(
         VERSION,
         len(frame.heard),
+        len(frame.relayed),
+        frame.largest_degree,
         len(frame.cloud_m),
-        heading,
+        _heading_code(frame.heading_rad),
         frame.fix_time_ns,
-        x_cm,
-        y_cm,
+        *_cm(frame.fix_m),
         *frame.estimate_m,
         covariance[0, 0],
         covariance[0, 1],
@@ -83,25 +103,33 @@ def encode(frame: CooperativeFrame) -> bytes:
     names = bytes.fromhex("".join(frame.heard))
     takes = np.packbits(np.array(list(frame.heard.values()), dtype=bool)).tobytes()
     cloud = np.clip(frame.cloud_m, -COMMON_LIMIT_M, COMMON_LIMIT_M)
-    return header + names + takes + np.round(cloud * 100).astype("<i2").tobytes()
+    return (
+        header
+        + names
+        + takes
+        + frame.relayed.astype(RELAYED).tobytes()
+        + np.round(cloud * 100).astype("<i2").tobytes()
+    )
 
 
+@lru_cache(maxsize=256)  # where many vehicles share a process, a frame is decoded once and not by each who hears it
 def decode(payload: bytes) -> CooperativeFrame:
     """Restore a frame. Raises FrameError: `length`, `version`, `not_finite`, `absurd` or `covariance`."""
     if len(payload) < _HEADER.size:
         raise FrameError("length")
-    (version, heard_count, particles, heading, fix_time_ns, x_cm, y_cm, *rest) = _HEADER.unpack_from(payload)
+    (version, heard_count, relays, degree, particles, *rest) = _HEADER.unpack_from(payload)
     if version != VERSION:
         raise FrameError("version")
     names_end = _HEADER.size + heard_count * NAME_BYTES
     takes_end = names_end + (heard_count + 7) // 8
-    if len(payload) != takes_end + 4 * particles or particles == 0:
+    relays_end = takes_end + relays * RELAYED.itemsize
+    if len(payload) != relays_end + 4 * particles:
         raise FrameError("length")
-    x, y, c_xx, c_xy, c_yy, epoch, *running_sum = rest
+    heading, fix_time_ns, x_cm, y_cm, x, y, c_xx, c_xy, c_yy, epoch, *running_sum = rest
     _check_numbers(x, y, c_xx, c_xy, c_yy, running_sum)
     names = payload[_HEADER.size : names_end].hex()
     takes = np.unpackbits(np.frombuffer(payload[names_end:takes_end], dtype=np.uint8), count=heard_count)
-    steps = np.frombuffer(payload, dtype="<i2", offset=takes_end)
+    steps = np.frombuffer(payload, dtype="<i2", offset=relays_end)
     starts = range(0, len(names), 2 * NAME_BYTES)
     heard = {
         names[i : i + 2 * NAME_BYTES]: take for i, take in zip(starts, takes.astype(bool).tolist(), strict=True)
@@ -109,14 +137,32 @@ def decode(payload: bytes) -> CooperativeFrame:
     return CooperativeFrame(
         fix_time_ns,
         np.array([x_cm / 100, y_cm / 100]),
-        None if heading == NO_HEADING else heading / _FULL_TURN * 2 * math.pi,
+        heading_of_code(heading),
         np.array([x, y]),
         np.array([[c_xx, c_xy], [c_xy, c_yy]]),
         epoch,
         (running_sum[0], running_sum[1], running_sum[2]),
         heard,
         steps.reshape(-1, 2) / 100,
+        np.frombuffer(payload[takes_end:relays_end], dtype=RELAYED),
+        degree,
     )
+
+
+def _cm(position_m: Array) -> tuple[int, int]:
+    x, y = position_m.tolist()
+    return round(x * 100), round(y * 100)
+
+
+def _heading_code(heading_rad: float | None) -> int:
+    if heading_rad is None:
+        return NO_HEADING
+    return int(heading_rad % (2 * math.pi) / (2 * math.pi) * _FULL_TURN)
+
+
+def heading_of_code(code: int) -> float | None:
+    """The heading in radians that a code stands for; None if it stands for none."""
+    return None if code == NO_HEADING else code / _FULL_TURN * 2 * math.pi
 
 
 def _check_numbers(x: float, y: float, c_xx: float, c_xy: float, c_yy: float, running_sum: list[float]) -> None:

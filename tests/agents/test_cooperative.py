@@ -8,15 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative import Estimator, Options
-from agents.cooperative_frame import (
-    CooperativeFrame,
-    FrameError,
-    decode,
-    encode,
-    room_for_particles,
-    short_name,
-)
+from agents.cooperative import Estimator
+from agents.cooperative_frame import RELAYED, CooperativeFrame, FrameError, decode, encode, room, short_name
+from agents.cooperative_options import Options
+from agents.sightings import CAPACITY, Sightings
 from vnet import Fix, Packet
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
@@ -29,7 +24,11 @@ names = st.integers(0, 10_000).map(lambda number: short_name(f"v{number}"))
 def frames(draw: st.DrawFn) -> CooperativeFrame:
     a, b = draw(st.floats(0.01, 10)), draw(st.floats(0.01, 10))
     cross = draw(st.floats(-0.9, 0.9)) * math.sqrt(a * b)
-    cloud = draw(st.lists(st.tuples(reals, reals), min_size=1, max_size=20))
+    cloud = draw(st.lists(st.tuples(reals, reals), max_size=20))
+    centimetres = st.integers(-(2**31), 2**31 - 1)
+    relay = st.tuples(
+        st.integers(0, 2**32 - 1), st.integers(0, 255), st.integers(0, 65535), centimetres, centimetres
+    )
     return CooperativeFrame(
         draw(st.integers(0, 2**63)),
         np.array(draw(st.tuples(st.floats(-2e7, 2e7), st.floats(-2e7, 2e7)))),
@@ -39,7 +38,9 @@ def frames(draw: st.DrawFn) -> CooperativeFrame:
         draw(st.integers(0, 2**32 - 1)),
         draw(st.tuples(reals, reals, st.floats(1, 1e9))),
         draw(st.dictionaries(names, st.booleans(), max_size=30)),
-        np.array(cloud),
+        np.array(cloud).reshape(-1, 2),
+        np.array(draw(st.lists(relay, max_size=20)), dtype=RELAYED),
+        draw(st.integers(0, 255)),
     )
 
 
@@ -53,6 +54,8 @@ def test_a_frame_comes_back_within_its_steps(frame: CooperativeFrame) -> None:
     assert again.estimate_m == pytest.approx(frame.estimate_m, rel=1e-6, abs=1e-6)
     assert again.covariance_m2 == pytest.approx(frame.covariance_m2, rel=1e-6, abs=1e-6)
     assert (again.epoch, again.running_sum, again.heard) == (frame.epoch, frame.running_sum, frame.heard)
+    assert np.array_equal(again.relayed, frame.relayed)
+    assert again.largest_degree == frame.largest_degree
     assert (again.heading_rad is None) == (frame.heading_rad is None)
     if frame.heading_rad is not None:
         assert again.heading_rad == pytest.approx(frame.heading_rad, abs=1e-4)
@@ -83,13 +86,13 @@ def test_damaged_frames_are_refused_or_still_sane(frame: CooperativeFrame, data:
 
 
 def test_two_hundred_particles_and_thirty_neighbours_fit_into_a_frame() -> None:
-    assert room_for_particles(30, 1400) >= 200
-    assert room_for_particles(0, 10) == 0
+    assert room(30, 1400) >= 200 * 4
+    assert room(0, 10) == 0
 
 
 def estimator() -> Estimator:
     lanes = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
-    return Estimator("v1", Options(particles=20), lanes, np.random.default_rng(0))
+    return Estimator("v1", Options(particles=20), lanes, np.random.default_rng(0), PERIOD_NS)
 
 
 def test_old_foreign_and_future_frames_are_counted_and_left_out() -> None:
@@ -104,22 +107,33 @@ def test_old_foreign_and_future_frames_are_counted_and_left_out() -> None:
 
     subject = estimator()
     packets = [packet("v2", 2), packet("v2", 1), packet("v3", 50), packet("v4", -5), Packet("v5", 0, 0, b"beep")]
-    read = subject.read(packets, now_ns, period_ns)
-    assert list(read) == [short_name("v2")]
-    assert read[short_name("v2")].fix_time_ns == now_ns - period_ns, "the newest of each"
+    subject.filter(Fix(now_ns - 2 * period_ns, np.array([1.0, 1.0]), np.eye(2), 0.0))
+    subject.filter(Fix(now_ns - period_ns, np.array([1.0, 1.0]), np.eye(2), 0.0))
+    subject.read(packets, now_ns)
+    subject.filter(Fix(now_ns, np.array([1.0, 1.0]), np.eye(2), 0.0))
+    assert sorted(subject.rbpf.vehicles) == sorted([subject.name, short_name("v2")])
     assert subject.rejected == {"stale": 2, "length": 1}
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fusoin": "none"}, "program.options.fusoin: unknown; allowed: common_sigma_m"),
-        ({"fusion": "magic"}, "program.options.fusion = 'magic': allowed: optimized, random, none"),
-        ({"consensus": "exact"}, "program.options.consensus = 'exact': allowed: ratio, metropolis, max-degree"),
+        ({"fusoin": "none"}, "program.options.fusoin: unknown; allowed: alpha, common_sigma_m"),
+        (
+            {"fusion": "magic"},
+            "program.options.fusion = 'magic': allowed: optimized, random, metropolis, max-degree, constant, none",
+        ),
+        ({"consensus": "exactly"}, "program.options.consensus = 'exactly': allowed: ratio, metropolis, max-degree"),
+        ({"profile": "mine"}, "program.options.profile = 'mine': allowed: default, paper"),
+        ({"relay": 1}, "program.options.relay = 1: bool expected"),
+        ({"alpha": 1.01}, "program.options.alpha = 1.01: 0 to 1 allowed"),
+        ({"start_m": [1.0]}, "program.options.start_m = [1.0]: two numbers"),
+        ({"hears": {"v1": ["v2"]}}, 'only with consensus = "exact"'),
+        ({"hears": {"v1": "v2"}}, "program.options.hears.v1 = 'v2': a list of node ids expected"),
         ({"common_sigma_m": float("inf")}, "program.options.common_sigma_m = inf: 0 to 327.0 allowed"),
         ({"self_floor": 1.5}, "program.options.self_floor = 1.5: 0 to 1 allowed"),
         ({"particles": "many"}, "program.options.particles = 'many': int expected"),
-        ({"particles": 1}, "program.options.particles = 1: 2 to 100000 allowed"),
+        ({"particles": 0}, "program.options.particles = 0: 1 to 100000 allowed"),
         ({"lateral_tau_s": 0.0}, "program.options.lateral_tau_s = 0.0: must be positive"),
         ({"common_tau_s": float("nan")}, "program.options.common_tau_s = nan: must be positive"),
     ],
@@ -155,20 +169,18 @@ def said(
 
 def drive(subject: Estimator, periods: int, packets: Callable[[int], list[Packet]]) -> None:
     """Let a vehicle work `periods` long on what `packets` brings at each time."""
-    previous: Fix | None = None
     for period in range(periods):
         fix = Fix(period * PERIOD_NS, ONE, np.eye(2), 0.0)
-        read = subject.read(packets(fix.time_ns), fix.time_ns, PERIOD_NS)
-        if previous is not None:
-            subject.step(0.1, previous, read)
         subject.frame(fix, 1400)
-        previous = fix
+        subject.read(packets(fix.time_ns), fix.time_ns)
+        subject.filter(fix)
+        subject.agree()
 
 
-def test_a_vehicle_late_with_its_work_uses_the_frames_of_this_very_period_in_the_next() -> None:
+def test_a_vehicle_late_with_its_work_uses_the_frames_of_the_next_period_then() -> None:
     """In real time: the neighbours' newest frames are already there when this vehicle looks."""
     subject = estimator()
-    drive(subject, 5, lambda now_ns: [Packet("v2", now_ns, now_ns, encode(said(now_ns)))])
+    drive(subject, 5, lambda now_ns: [Packet("v2", now_ns, now_ns, encode(said(now_ns + PERIOD_NS)))])
     assert short_name("v2") in subject.rbpf.vehicles
     assert not subject.rejected
 
@@ -192,7 +204,7 @@ def test_an_absurd_epoch_is_refused_and_does_not_spread() -> None:
 
     drive(subject, 60, liar)
     assert subject.rejected == {"absurd": 10}
-    assert decode(subject.frame(Fix(0, ONE, np.eye(2), 0.0), 1400)).epoch < 10
+    assert decode(subject.frame(Fix(60 * PERIOD_NS, ONE, np.eye(2), 0.0), 1400)).epoch < 10
 
 
 @pytest.mark.parametrize("running_sum", [(1e308, 0.0, 1.0), (0.0, -400.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)])
@@ -215,21 +227,17 @@ def cooperate(options: Options, seconds: float = 15.0, loss: float = 0.2, seed: 
     ids = [f"v{i}" for i in range(8)]
     rng = np.random.default_rng(seed)
     common = np.array([3.0, -2.0])
-    vehicles = [Estimator(name, options, lanes, np.random.default_rng(i)) for i, name in enumerate(ids)]
-    air: list[Packet] = []
-    previous: list[Fix] | None = None
+    vehicles = [Estimator(name, options, lanes, np.random.default_rng(i), PERIOD_NS) for i, name in enumerate(ids)]
     for period in range(int(seconds * 10)):
         now_ns = period * PERIOD_NS
         noisy = place + common + rng.normal(size=place.shape)
         fixes = [Fix(now_ns, noisy[i], np.eye(2), float(lanes.heading_rad[i])) for i in range(8)]
-        for i, vehicle in enumerate(vehicles):
-            heard = [p for j, p in enumerate(air) if 0 < abs(i - j) <= 2 and rng.random() >= loss]
-            frames = vehicle.read(heard, now_ns, PERIOD_NS)
-            if previous is not None:
-                vehicle.step(0.1, previous[i], frames)
         air = [Packet(ids[i], now_ns, now_ns, vehicles[i].frame(fixes[i], 1400)) for i in range(8)]
         assert all(len(packet.payload) <= 1400 for packet in air)
-        previous = fixes
+        for i, vehicle in enumerate(vehicles):
+            vehicle.read([p for j, p in enumerate(air) if 0 < abs(i - j) <= 2 and rng.random() >= loss], now_ns)
+            vehicle.filter(fixes[i])
+            vehicle.agree()
     assert all(not vehicle.rejected for vehicle in vehicles)
     return np.array([np.linalg.norm(vehicle.rbpf.estimate_m - common) for vehicle in vehicles])
 
@@ -238,6 +246,63 @@ def cooperate(options: Options, seconds: float = 15.0, loss: float = 0.2, seed: 
 def test_together_they_find_the_common_error_whatever_the_consensus(consensus: str) -> None:
     errors = cooperate(Options(particles=100, consensus=consensus))
     assert errors.max() < 1.0, "the prior's deviation is 3 m an axis"
+
+
+@pytest.mark.parametrize("fusion", ["random", "metropolis", "max-degree", "constant"])
+@pytest.mark.parametrize("exchange", ["estimates", "particles"])
+def test_every_rule_of_fusion_works_in_both_ways_of_exchange(fusion: str, exchange: str) -> None:
+    options = Options(particles=50, fusion=fusion, exchange=exchange, relay=exchange == "estimates")
+    assert cooperate(options, seconds=6.0).max() < 2.0
+
+
+def test_relayed_fixes_reach_vehicles_that_cannot_hear_each_other() -> None:
+    """In a line of 8 that hear two a side, everybody comes to track everybody; without relay nobody does."""
+    for relay, expected in ((True, 8), (False, 5)):
+        lanes, place = town(8, 11)
+        vehicles = [
+            Estimator(f"v{i}", Options(particles=20, relay=relay), lanes, np.random.default_rng(i), PERIOD_NS)
+            for i in range(8)
+        ]
+        for period in range(20):
+            fixes = [
+                Fix(period * PERIOD_NS, p, np.eye(2), float(h))
+                for p, h in zip(place, lanes.heading_rad, strict=True)
+            ]
+            air = [Packet(f"v{i}", 0, 0, v.frame(fixes[i], 1400)) for i, v in enumerate(vehicles)]
+            for i, vehicle in enumerate(vehicles):
+                vehicle.read([p for j, p in enumerate(air) if 0 < abs(i - j) <= 2], period * PERIOD_NS)
+                vehicle.filter(fixes[i])
+                vehicle.agree()
+        assert len(vehicles[3].rbpf.vehicles) == expected
+
+
+def test_only_the_newest_word_of_a_vehicle_counts_and_old_word_is_forgotten() -> None:
+    sightings = Sightings(1, PERIOD_NS)
+
+    def word(time_ns: int, age: int, x_cm: int) -> CooperativeFrame:
+        relayed = np.array([(7, age, 0, x_cm, 0), (1, 0, 0, 5, 5)], dtype=RELAYED)
+        return CooperativeFrame(time_ns, ONE, 0.0, ONE, np.eye(2), 0, (0.0, 0.0, 0.0), {}, ONE[None], relayed)
+
+    now_ns = 10 * PERIOD_NS
+    sightings.learn(2, word(now_ns, 1, 100))
+    sightings.learn(3, word(now_ns, 2, 999))
+    seen = dict(sightings.observations(now_ns, np.eye(2)))
+    assert sorted(seen) == ["00000002", "00000003", "00000007"], "its own fix is no news"
+    assert seen["00000007"].position_m.tolist() == [1.0, 0.0]
+    assert seen["00000007"].age_s == pytest.approx(0.1)
+    fresh = sightings.freshest(now_ns, 2)
+    assert fresh["name"].tolist() == [2, 3], "the newest first"
+    sightings.forget(now_ns)
+    assert sorted(dict(sightings.observations(now_ns, np.eye(2)))) == ["00000002", "00000003"]
+
+
+def test_a_liar_cannot_fill_the_memory() -> None:
+    sightings = Sightings(0, PERIOD_NS)
+    for start in range(0, 2 * CAPACITY, 250):
+        relayed = np.array([(1 + start + i, 0, 0, 0, 0) for i in range(250)], dtype=RELAYED)
+        frame = CooperativeFrame(0, ONE, 0.0, ONE, np.eye(2), 0, (0.0, 0.0, 0.0), {}, ONE[None], relayed)
+        sightings.learn(2**32 - 1, frame)
+    assert len(dict(sightings.observations(0, np.eye(2)))) == CAPACITY
 
 
 def test_fusion_brings_estimates_closer_than_none() -> None:

@@ -15,24 +15,29 @@ def observation(position: np.ndarray, heading: float = 0.3) -> Observation:
     return Observation(np.asarray(position, dtype=float), np.eye(2), heading)
 
 
-def textbook(fixes: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
-    """A Kalman filter on [x, y, ẋ, ẏ] with white acceleration 1 m²/s⁴ along, 0.01 across, written out."""
+def moving(t: float, heading: float) -> tuple[np.ndarray, np.ndarray]:
+    """Transition and process noise over `t`: white acceleration 1 m²/s⁴ along the lane, 0.01 across."""
     along, across = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
     acceleration = np.outer(along, along) + 0.01 * np.outer(across, across)
     process = np.block(
-        [
-            [DT_S**4 / 4 * acceleration, DT_S**3 / 2 * acceleration],
-            [DT_S**3 / 2 * acceleration, DT_S**2 * acceleration],
-        ]
+        [[t**4 / 4 * acceleration, t**3 / 2 * acceleration], [t**3 / 2 * acceleration, t**2 * acceleration]]
     )
-    transition = np.block([[np.eye(2), DT_S * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]])
+    return np.block([[np.eye(2), t * np.eye(2)], [np.zeros((2, 2)), np.eye(2)]]), process
+
+
+def textbook(fixes: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
+    """A Kalman filter on [x, y, ẋ, ẏ], written out; where fixes are missing it moves further in one step."""
+    elapsed_s = 0.0
     observe = np.hstack([np.eye(2), np.zeros((2, 2))])
     state = np.concatenate([fixes[0], [0, 0]])
     covariance = np.diag([1.0, 1.0, REST_SPEED_M_S**2, REST_SPEED_M_S**2])
     for fix in fixes[1:]:
-        state, covariance = transition @ state, transition @ covariance @ transition.T + process
+        elapsed_s += DT_S
         if np.isnan(fix).any():
             continue
+        transition, process = moving(elapsed_s, heading)
+        elapsed_s = 0.0
+        state, covariance = transition @ state, transition @ covariance @ transition.T + process
         gain = covariance @ observe.T @ np.linalg.inv(observe @ covariance @ observe.T + np.eye(2))
         state = state + gain @ (fix - observe @ state)
         covariance = (np.eye(4) - gain @ observe) @ covariance
@@ -105,19 +110,63 @@ def test_systematic_resampling_is_within_one_of_what_is_expected() -> None:
 def test_a_collapsed_cloud_supplies_means_with_slope_minus_one() -> None:
     rbpf = known_error((1.0, 1.0), particles=20)
     rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    _, slope, centre = rbpf.regression()
-    assert np.array_equal(slope[0, :2], -np.eye(2))
-    assert centre == pytest.approx([1.0, 1.0])
-    supplied, _ = rbpf.supply(np.array([[2.0, 1.0]]))
+    assert np.array_equal(rbpf.slopes()[0][0, :2], -np.eye(2))
+    supplied, _, _ = rbpf.supply(np.array([[2.0, 1.0]]))
     assert supplied[0, :2, 0] == pytest.approx([1.0, 3.0])
 
 
 def test_regression_finds_that_a_new_vehicle_is_where_its_fix_says_less_c() -> None:
     rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
     rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    mean, slope, centre = rbpf.regression()
-    assert slope[0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
-    assert mean[0, :2] == pytest.approx(np.array([3.0, 4.0]) - centre)
+    assert rbpf.slopes()[0][0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
+    supplied, past, _ = rbpf.supply(np.array([[1.0, 1.0]] * 5))
+    assert pytest.approx(np.array([[2.0, 3.0]] * 5)) == supplied[0, :2].T
+    assert pytest.approx(np.array([[1.0, 1.0]] * 5)) == past[0].T
+
+
+def test_an_old_fix_is_held_against_the_common_error_of_its_own_time() -> None:
+    """The error jumps; who knows when a fix was taken is not misled by it."""
+    rbpf = known_error((0.0, 0.0))
+    here = np.array([5.0, 5.0])
+    for step in range(40):
+        if step == 20:
+            rbpf.common_m[:] = np.array([100.0, 0.0])[:, None]
+        rbpf.step(DT_S, {"v": Observation(here + ([100.0, 0.0] if step >= 23 else 0.0), np.eye(2), 0.3, age_s=0.3)})
+    assert rbpf.position_m("v")[0] == pytest.approx(here, abs=1e-6)
+
+
+def test_a_fix_that_is_not_new_or_too_old_changes_nothing() -> None:
+    rbpf = known_error((0.0, 0.0))
+    for _ in range(10):
+        rbpf.step(DT_S, {"v": observation([0.0, 0.0])})
+    before = rbpf.covariance.copy()
+    rbpf.step(DT_S, {"v": Observation(np.zeros(2), np.eye(2), 0.3, age_s=0.1)})
+    rbpf.step(DT_S, {"v": Observation(np.zeros(2), np.eye(2), 0.3, age_s=0.5)})
+    rbpf.step(DT_S, {"w": Observation(np.zeros(2), np.eye(2), 0.3, age_s=100.0)})
+    assert np.array_equal(rbpf.covariance, before)
+    assert rbpf.vehicles == ["v"]
+
+
+def test_a_shift_moves_the_cloud_and_the_vehicles_the_other_way() -> None:
+    rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
+    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
+    estimate, place = rbpf.estimate_m, rbpf.position_m("v")[0]
+    covariance = rbpf.estimate_covariance_m2
+    by = np.array([0.5, -0.25])
+    rbpf.shift(by)
+    assert rbpf.estimate_m == pytest.approx(estimate + by)
+    assert rbpf.position_m("v")[0] == pytest.approx(place - by)
+    assert rbpf.estimate_covariance_m2 == pytest.approx(covariance)
+
+
+def test_lanes_bounded_on_one_side_let_a_vehicle_walk_off_on_the_other() -> None:
+    """The paper's half-plane: on the right of the lane a vehicle is caught, on the left it is not."""
+    lane = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)  # heading east: the right is south
+    for one_sided, north_m, expected in ((True, 5.0, True), (True, -5.0, False), (False, 5.0, False)):
+        rbpf = Rbpf(RbpfConfig(2, one_sided=one_sided, start_sigma_m=0.0), lane, np.random.default_rng(0))
+        rbpf.step(DT_S, {"v": Observation(np.array([0.0, north_m]), 0.01 * np.eye(2), 0.0)})
+        likely = float(rbpf.own_log_road.max()) > -1.0
+        assert likely == expected
 
 
 def crossing_error(vehicles: int, parallel: bool, seed: int) -> float:
@@ -168,7 +217,7 @@ def test_the_common_error_is_a_gauss_markov_process_or_a_random_walk(
     walk_m: float | None, variance_m2: float
 ) -> None:
     """Ten steps: the Gauss-Markov process keeps its variance, a walk of 0.5 m a step gains 0.25 m² each."""
-    config = RbpfConfig(particles=40_000, common_walk_m=walk_m, common_tau_s=1.0)
+    config = RbpfConfig(particles=40_000, common_walk_m=walk_m, common_tau_s=1.0, start_sigma_m=3.0)
     rbpf = Rbpf(config, NOWHERE, np.random.default_rng(0))
     start = rbpf.common_m.copy()
     for _ in range(10):
@@ -179,5 +228,13 @@ def test_the_common_error_is_a_gauss_markov_process_or_a_random_walk(
 
 
 def test_a_filter_needs_particles() -> None:
-    with pytest.raises(VnetError, match="particles = 1: at least 2"):
-        RbpfConfig(particles=1)
+    with pytest.raises(VnetError, match="particles = 0: at least 1"):
+        RbpfConfig(particles=0)
+
+
+def test_one_particle_is_enough_to_run() -> None:
+    rbpf = Rbpf(RbpfConfig(particles=1), NOWHERE, np.random.default_rng(0))
+    for _ in range(20):
+        rbpf.step(DT_S, {"v": observation([1.0, 1.0])})
+    assert np.isfinite(rbpf.estimate_m).all()
+    assert rbpf.common_m.shape == (2, 1)

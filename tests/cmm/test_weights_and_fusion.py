@@ -141,8 +141,10 @@ ALL = frozenset({"a", "b"})
 def test_all_weight_on_oneself_keeps_ones_own_hypotheses() -> None:
     rbpf = settled()
     before = rbpf.estimate_m
-    stacked = fuse(rbpf, [Cloud(np.full((10, 2), 99.0), ALL)], np.array([1.0, 0.0]), np.random.default_rng(2))
+    far = Cloud(np.full((10, 2), 99.0), ALL)
+    stacked, imported = fuse(rbpf, [far], np.array([1.0, 0.0]), np.random.default_rng(2))
     assert stacked == pytest.approx(before)
+    assert imported == 0
     assert np.abs(rbpf.common_m).max() < 20
 
 
@@ -151,8 +153,9 @@ def test_the_stacked_estimate_is_the_weighted_mean_of_the_clouds() -> None:
     rbpf.resample()
     own = rbpf.estimate_m
     cloud = Cloud(np.tile([1.0, 1.0], (50, 1)), ALL)
-    stacked = fuse(rbpf, [cloud], np.array([0.5, 0.5]), np.random.default_rng(2))
+    stacked, imported = fuse(rbpf, [cloud], np.array([0.5, 0.5]), np.random.default_rng(2))
     assert stacked == pytest.approx((own + 1.0) / 2, abs=0.05)
+    assert imported == 50
     assert rbpf.common_m.shape == (2, 100)
     assert rbpf.mean.shape == (2, 4, 100)
 

@@ -174,6 +174,28 @@ class RatioConsensus:
             self._mass = self._mass - share * len(self._takers)
 
 
+class DirectMean:
+    """The mean of everybody's x, heard from everybody: for comparisons, where all hear all."""
+
+    def __init__(self) -> None:
+        self._said: Array | None = None
+        self._mean: Array | None = None
+
+    @property
+    def mean_m(self) -> Array | None:
+        """The mean (2,) of what all said last; None before the first round."""
+        return self._mean
+
+    def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
+        """Take what everybody said last, and say the input x (2,)."""
+        said = [np.array(shares[peer].running_sum[:2]) for peer in sorted(shares) if shares[peer].running_sum[2]]
+        own = value if self._said is None else self._said
+        self._mean = np.mean([own, *said], axis=0)
+        self._said = np.array(value, dtype=float)
+        x, y = self._said.tolist()
+        return Share(0, (x, y, 1.0), frozenset(), frozenset(shares))
+
+
 AVERAGING_RULES = ("metropolis", "max-degree")
 
 

@@ -26,23 +26,31 @@ class Cloud:
     known: frozenset[str]
 
 
-def fuse(rbpf: Rbpf, clouds: Sequence[Cloud], weights: Array, rng: np.random.Generator) -> Array:
+def fuse(rbpf: Rbpf, clouds: Sequence[Cloud], weights: Array, rng: np.random.Generator) -> tuple[Array, int]:
     """Mix `clouds` into the filter by `weights` (1 + n,), its own first; the filter is changed in place.
 
-    Returns the estimate (2,) right after stacking, before the roads weigh the imported hypotheses.
+    Returns the estimate (2,) right after stacking, before any road weighs the stack, and how many hypotheses were
+    imported. Where the filter leaves the roads apart, none are looked at here either.
     """
     counts = largest_remainder(weights, rbpf.config.particles)
-    own = systematic(rbpf.weight, int(counts[0]), rng) if counts[0] else np.empty(0, dtype=np.intp)
     used = [(cloud, int(count)) for cloud, count in zip(clouds, counts[1:], strict=True) if count]
+    used = [(cloud, count) for cloud, count in used if len(cloud.common_m)]
+    imported = sum(count for _, count in used)
     if not used:
-        return rbpf.estimate_m
+        return rbpf.estimate_m, 0
+    kept = rbpf.config.particles - imported
+    own = systematic(rbpf.weight, kept, rng) if kept else np.empty(0, dtype=np.intp)
     common = np.concatenate([_evenly(cloud.common_m, count, rng) for cloud, count in used])
     stacked = (rbpf.common_m[:, own].sum(axis=1) + common.sum(axis=0)) / rbpf.config.particles
-    supplied, log_road = rbpf.supply(common)
-    batch = np.repeat(np.arange(len(used)), [count for _, count in used])
-    log_weight = _evidence(rbpf, [cloud for cloud, _ in used], batch, log_road)
-    rbpf.replace(own, common, supplied, log_road, log_weight)
-    return np.asarray(stacked)
+    supplied = rbpf.supply(common)
+    if rbpf.config.roads_apart:
+        log_weight = np.zeros(kept + imported)
+    else:
+        batch = np.repeat(np.arange(len(used)), [count for _, count in used])
+        evidence = _evidence(rbpf, [cloud for cloud, _ in used], batch, supplied[2])
+        log_weight = np.concatenate([np.zeros(kept), evidence])
+    rbpf.replace(own, common, supplied, log_weight)
+    return np.asarray(stacked), imported
 
 
 def _evidence(rbpf: Rbpf, clouds: Sequence[Cloud], batch: NDArray[np.intp], log_road: Array) -> Array:

@@ -44,6 +44,11 @@ def log_on_lane(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
     return np.asarray(result)
 
 
+def log_left_of_edge(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
+    """log P(not beyond the right-hand edge): the paper bounds a lane by the half-plane n·(p − p_lane) < h only."""
+    return np.asarray(log_ndtr((half_width_m - offset_m) / sigma_m))
+
+
 def candidate_lanes(
     lanes: LaneMap,
     position_m: Array,

@@ -4,6 +4,11 @@ Particle k is a hypothesis c^k of the common GNSS error; given it, every tracked
 [x, y, ẋ, ẏ]. Its covariance P_j, innovation covariance S and gain K do not depend on k, so that a vehicle has one
 gain and all particles are one matrix product: means are kept as (M, 4, K) with the particles contiguous.
 
+A fix may be old: a neighbour's has crossed the radio, another's has been passed on. So each vehicle's Kalman filter
+stands at the time of its own latest fix, and particles remember the c of the last seconds: an old fix is held
+against the c of its own time. Given a particle's trajectory that is exact; nothing is approximated but that the
+trajectory was drawn without it.
+
 The road is evidence about a vehicle's offset in its lane, which changes over many seconds. Counting it anew ten
 times a second would make the filter far too sure of itself. So what counts of the log-likelihood L of being on the
 road is its *change*, log w += L_t − (1 − ρ) L_{t−1}: the latest look replaces the one before, and a share
@@ -18,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.map_matching import candidate_lanes, log_on_lane
+from vnet.cmm.map_matching import candidate_lanes, log_left_of_edge, log_on_lane
 from vnet.errors import VnetError
 from vnet.roads.lanes import Array, LaneMap
 
@@ -31,7 +36,9 @@ class RbpfConfig:
     random walk that strays so far in a second (the paper's 0.5 m in 0.1 s are 0.5 / √0.1). `acceleration_m2_s4`:
     white acceleration along the lane, a hundredth of it across. `lateral_tau_s`: how long a vehicle keeps its
     offset in the lane (see the module's text). `gate_sigmas`: fixes further off are outliers. `forget_s`: vehicles
-    not heard for that long are dropped.
+    not heard for that long are dropped. `memory_s`: how old a fix may be. `start_m`, `start_sigma_m`: where the
+    cloud starts, else around 0 with `common_sigma_m`. The paper's: `one_sided` lanes are bounded on the right only;
+    with `roads_apart` a step does not look at roads, `weigh_roads` does.
     """
 
     particles: int = 200
@@ -42,19 +49,25 @@ class RbpfConfig:
     lateral_tau_s: float = 20.0
     gate_sigmas: float = 5.0
     forget_s: float = 2.0
+    memory_s: float = 1.5
+    start_m: tuple[float, float] = (0.0, 0.0)
+    start_sigma_m: float | None = None
+    one_sided: bool = False
+    roads_apart: bool = False
 
     def __post_init__(self) -> None:
-        if self.particles < 2:
-            raise VnetError(f"particles = {self.particles}: at least 2 are needed")
+        if self.particles < 1:
+            raise VnetError(f"particles = {self.particles}: at least 1 is needed")
 
 
 @dataclass(frozen=True)
 class Observation:
-    """A fix of one vehicle: `position_m` (2,) as the receiver says it, noise covariance, heading if known."""
+    """A fix of one vehicle: `position_m` (2,) as the receiver says it, noise covariance, heading if known, age."""
 
     position_m: Array
     covariance_m2: Array
     heading_rad: float | None
+    age_s: float = 0.0
 
 
 class Rbpf:
@@ -65,32 +78,60 @@ class Rbpf:
         self._lanes = lanes
         self._normal, self._offset_m = lanes.normal, lanes.offset_m
         self._rng = rng
-        count = config.particles
-        self.common_m = config.common_sigma_m * rng.standard_normal((2, count))
+        self._starting_s = START_S if config.start_sigma_m is None else 0.0
+        count = config.particles * (START_FACTOR if self._starting_s else 1)
+        sigma_m = config.common_sigma_m if config.start_sigma_m is None else config.start_sigma_m
+        self.common_m = np.array(config.start_m)[:, None] + sigma_m * rng.standard_normal((2, count))
         self.log_weight = np.zeros(count)
         self.vehicles: list[str] = []
         self.mean = np.empty((0, 4, count))
         self.covariance = np.empty((0, 4, 4))
-        self._process = np.empty((0, 4, 4))
+        self._acceleration = np.empty((0, 2, 2))  # white acceleration, by vehicle
+        self._age_s = np.empty(0)  # how far each vehicle's filter is behind
         self._unseen_s = np.empty(0)
         self._lane_vehicle = np.empty(0, dtype=np.intp)  # one entry a (vehicle, candidate lane)
         self._lane = np.empty(0, dtype=np.intp)
-        self._log_road = np.zeros((0, count))  # L of the step before, a row a vehicle
+        self._log_road = np.zeros((0, count))  # L at each vehicle's latest fix
+        self._past_age_s = np.zeros(1)
+        self._past_m = self.common_m[None].copy()  # c of the last seconds, the newest first
 
     # One period.
 
     def step(self, dt_s: float, observations: Mapping[str, Observation]) -> None:
-        """Advance by `dt_s` and take the fixes of one instant, by vehicle. Vehicles without one are predicted."""
+        """Advance by `dt_s` and take at most one fix of each vehicle.
+
+        Fixes that are not newer than the vehicle's latest, or older than `memory_s`, are left out.
+        """
         self._predict(dt_s)
-        self._unseen_s += dt_s
-        self._update({name: observations[name] for name in self.vehicles if name in observations})
+        fresh = {
+            name: observations[name]
+            for row, name in enumerate(self.vehicles)
+            if name in observations
+            and observations[name].age_s < self._age_s[row] - SAME_TIME_S
+            and self._remembers(observations[name].age_s)
+        }
+        rows, elapsed_s = self._update(fresh)
+        known = len(self.vehicles)
         for name in sorted(observations.keys() - set(self.vehicles)):
-            self._add(name, observations[name], dt_s)
+            if self._remembers(observations[name].age_s):
+                self._add(name, observations[name])
+        rows = np.concatenate([rows, np.arange(known, len(self.vehicles))])
+        if not self.config.roads_apart:
+            self._match_map(rows, np.concatenate([elapsed_s, np.full(len(rows) - len(elapsed_s), np.inf)]))
         self._forget()
-        self._match_map(dt_s)
         self.log_weight -= self.log_weight.max()
-        if self.effective_sample_size < self.config.particles / 2:
-            self.resample()
+        self._resample_if_due(dt_s)
+
+    def _resample_if_due(self, dt_s: float) -> None:
+        count = self.config.particles
+        if self._starting_s > 0:
+            self._starting_s -= dt_s
+            count *= START_FACTOR if self._starting_s > 0 else 1
+        if len(self.log_weight) != count or self.effective_sample_size < count / 2:
+            self._resample_to(count)
+
+    def _remembers(self, age_s: float) -> bool:
+        return bool(age_s <= self._past_age_s[-1] + SAME_TIME_S)
 
     def _predict(self, dt_s: float) -> None:
         config = self.config
@@ -101,51 +142,68 @@ class Rbpf:
         else:
             spread_m = config.common_walk_m * np.sqrt(dt_s)
         self.common_m += spread_m * self._rng.standard_normal(self.common_m.shape)
-        self.mean[:, :2] += dt_s * self.mean[:, 2:]
-        transition = np.eye(4)
-        transition[0, 2] = transition[1, 3] = dt_s
-        self.covariance = transition @ self.covariance @ transition.T + self._process
+        self._age_s += dt_s
+        self._unseen_s += dt_s
+        past_age_s = self._past_age_s + dt_s
+        kept = past_age_s <= config.memory_s
+        self._past_age_s = np.concatenate([[0.0], past_age_s[kept]])
+        self._past_m = np.concatenate([self.common_m[None], self._past_m[kept]])
 
-    def _update(self, observations: Mapping[str, Observation]) -> None:
-        if not observations:
-            return
-        rows = [self.vehicles.index(name) for name in observations]
+    def _update(self, observations: Mapping[str, Observation]) -> tuple[NDArray[np.intp], Array]:
+        """Move vehicles to the time of their fix and take it; returns their rows, and by how long each moved."""
+        rows = np.array([self.vehicles.index(name) for name in observations], dtype=np.intp)
+        if not len(rows):
+            return rows, np.empty(0)
         whole = len(rows) == len(self.vehicles)
+        age_s = np.array([o.age_s for o in observations.values()])
+        elapsed_s = self._age_s[rows] - age_s
         fix = np.array([o.position_m for o in observations.values()])
         noise = np.array([o.covariance_m2 for o in observations.values()])
         mean = self.mean if whole else self.mean[rows]
-        covariance = self.covariance if whole else self.covariance[rows]
-        innovation = fix[:, :, None] - self.common_m
-        innovation -= mean[:, :2]
+        mean[:, :2] += elapsed_s[:, None, None] * mean[:, 2:]
+        covariance = _moved(self.covariance[rows], self._acceleration[rows], elapsed_s)
+        innovation = fix[:, :, None] - mean[:, :2]
+        innovation -= self._common_at(age_s)
         expected = covariance[:, :2, :2] + noise
         inverse = _inverse_2x2(expected)
         gain = covariance[:, :, :2] @ inverse
         kept = self._inside_gate(innovation, expected)
         gain[~kept] = 0
         inverse[~kept] = 0
-        mean += gain @ innovation
-        weighted = inverse @ innovation
-        weighted *= innovation
-        self.log_weight -= 0.5 * weighted.reshape(-1, weighted.shape[2]).sum(axis=0)
+        x, y = innovation[:, 0], innovation[:, 1]
+        mean += gain[:, :, :1] * x[:, None] + gain[:, :, 1:] * y[:, None]
+        self.log_weight -= 0.5 * (
+            inverse[:, 0, 0] @ (x * x) + inverse[:, 1, 1] @ (y * y) + (2 * inverse[:, 0, 1]) @ (x * y)
+        )
         covariance = covariance - gain @ covariance[:, :2, :]
-        self.mean[rows] = mean
+        if not whole:
+            self.mean[rows] = mean
         self.covariance[rows] = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-        self._unseen_s[np.array(rows)[kept]] = 0.0
+        self._age_s[rows] = age_s
+        self._unseen_s[rows[kept]] = age_s[kept]
+        return rows, elapsed_s
+
+    def _common_at(self, age_s: Array) -> Array:
+        """The particles' c of so long ago: (2, K) if that is now for all, else (m, 2, K)."""
+        if not age_s.any():
+            return self.common_m
+        return np.asarray(self._past_m[np.abs(self._past_age_s - age_s[:, None]).argmin(axis=1)])
 
     def _inside_gate(self, innovation: Array, covariance: Array) -> NDArray[np.bool_]:
         """Per vehicle, not per particle: the gain must stay the same for all particles."""
         weight = self.weight
         middle = innovation @ weight
-        square = (innovation * weight) @ innovation.transpose(0, 2, 1)
-        total = covariance + square - middle[:, :, None] * middle[:, None, :]
+        x, y = innovation[:, 0], innovation[:, 1]
+        square = np.array([[(x * x) @ weight, (x * y) @ weight], [(x * y) @ weight, (y * y) @ weight]])
+        total = covariance + square.transpose(2, 0, 1) - middle[:, :, None] * middle[:, None, :]
         distance = np.einsum("mi,mij,mj->m", middle, _inverse_2x2(total), middle)
         return np.asarray(distance <= self.config.gate_sigmas**2)
 
-    def _add(self, name: str, observation: Observation, dt_s: float) -> None:
+    def _add(self, name: str, observation: Observation) -> None:
         """Track a vehicle from its first fix: m = z − c, at rest, with the fix's covariance."""
-        count = self.config.particles
+        count = len(self.log_weight)
         mean = np.zeros((1, 4, count))
-        mean[0, :2] = observation.position_m[:, None] - self.common_m
+        mean[0, :2] = observation.position_m[:, None] - self._common_at(np.array([observation.age_s]))
         covariance = np.zeros((1, 4, 4))
         covariance[0, :2, :2] = observation.covariance_m2
         covariance[0, 2:, 2:] = np.eye(2) * REST_SPEED_M_S**2
@@ -159,9 +217,10 @@ class Rbpf:
         self.vehicles.append(name)
         self.mean = np.concatenate([self.mean, mean])
         self.covariance = np.concatenate([self.covariance, covariance])
-        process = _process_noise(heading, self.config.acceleration_m2_s4, dt_s)
-        self._process = np.concatenate([self._process, process[None]])
-        self._unseen_s = np.append(self._unseen_s, 0.0)
+        acceleration = _acceleration(heading, self.config.acceleration_m2_s4)
+        self._acceleration = np.concatenate([self._acceleration, acceleration[None]])
+        self._age_s = np.append(self._age_s, observation.age_s)
+        self._unseen_s = np.append(self._unseen_s, observation.age_s)
         self._lane_vehicle = np.append(self._lane_vehicle, np.full(len(lanes), row))
         self._lane = np.append(self._lane, lanes)
         self._log_road = np.concatenate([self._log_road, np.zeros((1, count))])
@@ -173,38 +232,63 @@ class Rbpf:
         kept = np.flatnonzero(~gone)
         self.vehicles = [self.vehicles[row] for row in kept]
         self.mean, self.covariance = self.mean[kept], self.covariance[kept]
-        self._process, self._unseen_s = self._process[kept], self._unseen_s[kept]
+        self._acceleration = self._acceleration[kept]
+        self._age_s, self._unseen_s = self._age_s[kept], self._unseen_s[kept]
         self._log_road = self._log_road[kept]
         new_row = np.cumsum(~gone) - 1
         still = ~gone[self._lane_vehicle]
         self._lane_vehicle, self._lane = new_row[self._lane_vehicle[still]], self._lane[still]
 
-    def _match_map(self, dt_s: float) -> None:
-        if not len(self._lane):
+    def _match_map(self, rows: NDArray[np.intp], elapsed_s: Array) -> None:
+        """Weigh the particles by what the roads say of the vehicles in `rows`, `elapsed_s` after the last look."""
+        if not len(rows) or not len(self._lane):
             return
-        log_road = self.log_road(self.mean, self.covariance)
-        fresh = min(1.0, dt_s / self.config.lateral_tau_s)
-        self.log_weight += log_road.sum(axis=0) - (1 - fresh) * self._log_road.sum(axis=0)
-        self._log_road = log_road
+        log_road = self.log_road(self.mean, self.covariance, rows)
+        stays = np.maximum(0.0, 1 - elapsed_s / self.config.lateral_tau_s)
+        self.log_weight += log_road.sum(axis=0) - stays @ self._log_road[rows]
+        self._log_road[rows] = log_road
 
-    def log_road(self, mean: Array, covariance: Array) -> Array:
-        """log P(vehicle on a road) as (M, K) for means (M, 4 or 2, K): the candidate lanes as a mixture."""
-        one_each = np.array_equal(self._lane_vehicle, np.arange(len(self.vehicles)))
-        position = mean if one_each else mean[self._lane_vehicle]
-        normal = self._normal[self._lane]
+    def weigh_roads(self) -> None:
+        """Weigh the particles by the roads of all vehicles, and resample: the paper's order, after stacking."""
+        self._log_road = self.log_road(self.mean, self.covariance)
+        self.log_weight = self.log_weight + self._log_road.sum(axis=0)
+        self.resample()
+
+    def log_road(self, mean: Array, covariance: Array, rows: NDArray[np.intp] | None = None) -> Array:
+        """log P(vehicle on a road) as (M, K) for means (M, 4, K): the candidate lanes as a mixture.
+
+        With `rows` only of those vehicles, (len(rows), K). A vehicle without a lane scores 0.
+        """
+        if rows is None:
+            rows = np.arange(len(self.vehicles))
+        entry, index = self._lanes_of(rows)
+        row, lane = self._lane_vehicle[entry], self._lane[entry]
+        normal = self._normal[lane]
+        whole = len(row) == len(mean) and np.array_equal(row, np.arange(len(mean)))
+        position = mean if whole else mean[row, :2]
         offset = normal[:, 0, None] * position[:, 0]
         offset += normal[:, 1, None] * position[:, 1]
-        offset -= self._offset_m[self._lane][:, None]
-        across = np.einsum("pi,pij,pj->p", normal, covariance[self._lane_vehicle, :2, :2], normal)
-        score = log_on_lane(offset, np.sqrt(across)[:, None], self._lanes.half_width_m)
-        if one_each:
+        offset -= self._offset_m[lane][:, None]
+        across = np.einsum("pi,pij,pj->p", normal, covariance[row, :2, :2], normal)
+        sigma_m = np.sqrt(across)[:, None]
+        if self.config.one_sided:
+            score = log_left_of_edge(offset, sigma_m, self._lanes.half_width_m)
+        else:
+            score = log_on_lane(offset, sigma_m, self._lanes.half_width_m)
+        if len(index) == len(rows) and np.array_equal(index, np.arange(len(rows))):
             return score
-        result = np.zeros((len(self.vehicles), score.shape[1]))
-        for row in range(len(self.vehicles)):
-            own = score[self._lane_vehicle == row]
-            if len(own):
-                result[row] = np.logaddexp.reduce(own, axis=0)
+        result = np.zeros((len(rows), score.shape[1]))
+        if len(index):  # entries of a vehicle stand together
+            first = np.flatnonzero(np.diff(index, prepend=-1))
+            result[index[first]] = np.logaddexp.reduceat(score, first, axis=0)
         return result
+
+    def _lanes_of(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Entries of `_lane` for the vehicles `rows`, and which of `rows` each is of."""
+        position = np.full(len(self.vehicles), -1, dtype=np.intp)
+        position[rows] = np.arange(len(rows))
+        entry = np.flatnonzero(position[self._lane_vehicle] >= 0)
+        return entry, position[self._lane_vehicle[entry]]
 
     # What the filter believes.
 
@@ -243,12 +327,14 @@ class Rbpf:
         return np.asarray((spread * self.weight) @ spread.T)
 
     def position_m(self, vehicle: str) -> tuple[Array, Array]:
-        """Position (2,) of a tracked vehicle and its covariance (2, 2), over c as well."""
+        """Position (2,) of a tracked vehicle now and its covariance (2, 2), over c as well."""
         row = self.vehicles.index(vehicle)
         weight = self.weight
-        mean = self.mean[row, :2] @ weight
-        spread = self.mean[row, :2] - mean[:, None]
-        return mean, self.covariance[row, :2, :2] + (spread * weight) @ spread.T
+        position = self.mean[row, :2] + self._age_s[row] * self.mean[row, 2:]
+        mean = position @ weight
+        spread = position - mean[:, None]
+        covariance = _moved(self.covariance[row : row + 1], self._acceleration[row : row + 1], self._age_s[row])
+        return mean, covariance[0, :2, :2] + (spread * weight) @ spread.T
 
     def velocity_m_s(self, vehicle: str) -> Array:
         """Velocity (2,) of a tracked vehicle."""
@@ -258,44 +344,56 @@ class Rbpf:
 
     def resample(self) -> None:
         """Systematic resampling (Kitagawa 1996) to equal weights."""
-        self._take(systematic(self.weight, self.config.particles, self._rng))
+        self._resample_to(self.config.particles)
 
-    def _take(self, index: NDArray[np.intp]) -> None:
-        self.common_m = self.common_m[:, index]
-        self.mean = self.mean[:, :, index]
-        self._log_road = self._log_road[:, index]
+    def _resample_to(self, count: int) -> None:
+        index = systematic(self.weight, count, self._rng)
+        # np.take, and not [..., index], which would leave the particles scattered in memory
+        self.common_m = self.common_m.take(index, axis=-1)
+        self._past_m = self._past_m.take(index, axis=-1)
+        self.mean = self.mean.take(index, axis=-1)
+        self._log_road = self._log_road.take(index, axis=-1)
         self.log_weight = np.zeros(len(index))
+
+    def shift(self, by_m: Array) -> None:
+        """Move the cloud by (2,), and what goes with it along the regression on c. Nothing is resampled."""
+        mean, past, log_road = self.slopes()
+        self.common_m = self.common_m + by_m[:, None]
+        self.mean += (mean @ by_m)[..., None]
+        self._past_m += (past @ by_m)[..., None]
+        self._log_road += (log_road @ by_m)[..., None]
 
     def sample(self, count: int) -> Array:
         """`count` equally likely hypotheses of c as (count, 2), for others."""
         return np.asarray(self.common_m[:, systematic(self.weight, count, self._rng)].T)
 
-    def regression(self) -> tuple[Array, Array, Array]:
-        """Conditional means on c: (m̄ (M, 4), B (M, 4, 2), c̄ (2,)) with m_j(c) = m̄_j + B_j (c − c̄).
+    def supply(self, common_m: Array) -> tuple[Array, Array, Array]:
+        """What this filter makes of hypotheses (n, 2): means (M, 4, n), past (L, 2, n), log P on road (M, n).
 
-        B_j = Cov(m_j, c) Cov(c)⁻¹; where the cloud has collapsed, −I for positions: a vehicle is where its fix
-        says, less c.
+        Each hypothesis is paired with a particle of this filter, whose vehicles and past are moved along the
+        regression on c: so that what c does not determine keeps its spread, and its correlations.
         """
-        weight = self.weight
-        centre = self.common_m @ weight
-        spread = self.common_m - centre[:, None]
-        covariance = (spread * weight) @ spread.T
-        mean = self.mean @ weight
+        count = len(common_m)
+        partner = self._rng.permutation(systematic(self.weight, count, self._rng))
+        by_m = common_m.T - self.common_m[:, partner]
+        mean_slope, past_slope, _ = self.slopes()
+        mean = self.mean.take(partner, axis=-1) + mean_slope @ by_m
+        past = self._past_m.take(partner, axis=-1) + past_slope @ by_m
+        return mean, past, self.log_road(mean, self.covariance)
+
+    def slopes(self) -> tuple[Array, Array, Array]:
+        """Regression on c, Cov(·, c) Cov(c)⁻¹: of the means (M, 4, 2), of the past (L, 2, 2), of log_road (M, 2).
+
+        Where the cloud has collapsed: −I for positions (a vehicle is where its fix says, less c), I, and 0.
+        """
+        covariance = self.estimate_covariance_m2
         eigenvalues = np.linalg.eigvalsh(covariance)
         if eigenvalues[0] < COLLAPSED_M2 or eigenvalues[0] < 1e-6 * eigenvalues[1]:
-            slope = np.zeros((len(self.vehicles), 4, 2))
-            slope[:, 0, 0] = slope[:, 1, 1] = -1.0
-            return mean, slope, centre
-        cross = (self.mean - mean[:, :, None]) @ (spread * weight).T
-        return mean, cross @ np.linalg.inv(covariance), centre
-
-    def supply(self, common_m: Array) -> tuple[Array, Array]:
-        """What this filter makes of hypotheses (n, 2): conditional means (M, 4, n), log P on road (M, n)."""
-        mean, slope, centre = self.regression()
-        supplied = mean[:, :, None] + slope @ (common_m.T - centre[:, None])
-        if not len(self._lane):
-            return supplied, np.zeros((len(mean), len(common_m)))
-        return supplied, self.log_road(supplied, self.covariance)
+            mean = np.zeros((len(self.vehicles), 4, 2))
+            mean[:, 0, 0] = mean[:, 1, 1] = -1.0
+            return mean, np.tile(np.eye(2), (len(self._past_m), 1, 1)), np.zeros((len(self.vehicles), 2))
+        project = ((self.common_m - self.estimate_m[:, None]) * self.weight).T @ np.linalg.inv(covariance)
+        return self.mean @ project, self._past_m @ project, self._log_road @ project
 
     @property
     def own_log_road(self) -> Array:
@@ -303,27 +401,36 @@ class Rbpf:
         return self._log_road
 
     def replace(
-        self, own: NDArray[np.intp], common_m: Array, supplied: Array, log_road: Array, log_weight: Array
+        self,
+        own: NDArray[np.intp],
+        common_m: Array,
+        supplied: tuple[Array, Array, Array],
+        log_weight: Array,
     ) -> None:
-        """Go on with the particles `own` (indices) and hypotheses (n, 2) as `supply` made them, resampled to K.
+        """Go on with the particles `own` (indices, m of them) and hypotheses (n, 2) as `supply` made them.
 
-        `log_weight` (n,) are the weights of the hypotheses relative to own particles.
+        `log_weight` (m + n,) are their weights, own first; resampled to K.
         """
         count = self.config.particles
-        weight = np.concatenate([np.ones(len(own)), np.exp(log_weight - max(0.0, log_weight.max()))])
-        weight[: len(own)] *= np.exp(-max(0.0, log_weight.max()))
+        weight = np.exp(log_weight - log_weight.max())
         index = systematic(weight / weight.sum(), count, self._rng)
         from_own = own[index[index < len(own)]]
         imported = index[index >= len(own)] - len(own)
+        mean, past, log_road = supplied
+        self._past_m = np.concatenate([self._past_m[:, :, from_own], past[:, :, imported]], axis=2)
         self.common_m = np.concatenate([self.common_m[:, from_own], common_m[imported].T], axis=1)
-        self.mean = np.concatenate([self.mean[:, :, from_own], supplied[:, :, imported]], axis=2)
+        self.mean = np.concatenate([self.mean[:, :, from_own], mean[:, :, imported]], axis=2)
         self._log_road = np.concatenate([self._log_road[:, from_own], log_road[:, imported]], axis=1)
         self.log_weight = np.zeros(count)
 
 
 REST_SPEED_M_S = 0.5
 """Deviation of a vehicle's speed at its first fix."""
+START_FACTOR, START_S = 10, 0.45
+"""So many times the particles at first: few of those that the prior spreads over metres survive the first fixes."""
 COLLAPSED_M2 = 1e-6
+SAME_TIME_S = 1e-7
+"""Times closer than this are the same: they come from whole nanoseconds."""
 
 
 def systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -333,16 +440,25 @@ def systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[n
     return np.asarray(np.minimum(index, len(weight) - 1))
 
 
-def _process_noise(heading_rad: float | None, acceleration_m2_s4: float, dt_s: float) -> Array:
-    """White acceleration over `dt_s`, (4, 4): along the lane, and a hundredth of it across."""
+def _acceleration(heading_rad: float | None, acceleration_m2_s4: float) -> Array:
+    """White acceleration (2, 2): along the lane, and a hundredth of it across."""
     if heading_rad is None:
-        shape = np.eye(2) * acceleration_m2_s4
-    else:
-        along = np.array([np.cos(heading_rad), np.sin(heading_rad)])
-        across = np.array([-along[1], along[0]])
-        shape = acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across))
-    push = np.array([dt_s**2 / 2, dt_s])
-    return np.asarray(np.kron(np.outer(push, push), shape))
+        return np.eye(2) * acceleration_m2_s4
+    along = np.array([np.cos(heading_rad), np.sin(heading_rad)])
+    across = np.array([-along[1], along[0]])
+    return np.asarray(acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across)))
+
+
+def _moved(covariance: Array, acceleration: Array, elapsed_s: Array) -> Array:
+    """Covariances (M, 4, 4) after `elapsed_s` (M,) or (): constant velocity and white acceleration (M, 2, 2)."""
+    t = np.broadcast_to(elapsed_s, len(covariance))[:, None, None]
+    moved = np.empty_like(covariance)
+    cross = covariance[:, :2, 2:] + t * covariance[:, 2:, 2:]
+    moved[:, :2, :2] = covariance[:, :2, :2] + t * (covariance[:, 2:, :2] + cross) + t**4 / 4 * acceleration
+    moved[:, :2, 2:] = cross + t**3 / 2 * acceleration
+    moved[:, 2:, :2] = moved[:, :2, 2:].transpose(0, 2, 1)
+    moved[:, 2:, 2:] = covariance[:, 2:, 2:] + t**2 * acceleration
+    return moved
 
 
 def _inverse_2x2(matrix: Array) -> Array:

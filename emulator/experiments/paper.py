@@ -1,0 +1,187 @@
+"""The cells of the paper's tables, and the same questions asked of vnet's own profile.
+
+Table I: four vehicles at a crossing, each hearing the next on a directed ring. Table II: the published networks, or
+generated ones of the same character. In the paper's profile the filters start at the true common error, the
+network's mean is exact and lanes are bounded on one side; the constants are in `agents/cooperative_options.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.experiments.cells import Cell
+from emulator.world.networks import generate_network, load_network
+from emulator.world.world import build_world, components
+from vnet.errors import VnetError
+from vnet.scenario import Scenario
+
+NETWORKS = {"n1": 50, "n2": 38, "n3": 24}
+RANGE_M = 3000.0
+PAPER_S = 10.0
+DEFAULT_S, SETTLED_S = 100.0, 20.0
+CENTRALIZED_PARTICLES = 2000
+ALPHAS = (0.05, 0.1, 0.2, 0.4, 0.5, 0.6, 0.8, 0.9, 0.95)
+RING = ((0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1), (1, 0, 0, 0))
+"""Row i hears column j: vehicle 1 hears 2, 2 hears 3, …"""
+DEFAULT_ROWS: dict[str, dict[str, Any]] = {
+    "optimized": {"fusion": "optimized"},
+    "random": {"fusion": "random"},
+    "none": {"fusion": "none"},
+}
+ONE_HOP_ROWS: dict[str, dict[str, Any]] = {
+    f"{name}, one hop": {"relay": False, "exchange": "particles", "fusion_interval_s": 0.5} | options
+    for name, options in DEFAULT_ROWS.items()
+}
+
+
+def network_sections(folder: Path | None) -> dict[str, dict[str, Any]]:
+    """`[network]` of N1, N2 and N3: the files network_n1.csv … of `folder`, or generated ones."""
+    if folder is None:
+        return {name: {"kind": "generated", "vehicles": count} for name, count in NETWORKS.items()}
+    sections = {}
+    for name in NETWORKS:
+        path = (folder / f"network_{name}.csv").resolve()
+        if not path.is_file():
+            raise VnetError(f"--networks {folder}: no file {path.name} in it")
+        sections[name] = {"kind": "file", "path": str(path)}
+    return sections
+
+
+def table2_cells(networks: dict[str, dict[str, Any]], seeds: Sequence[int]) -> list[Cell]:
+    """The paper's profile: centralized, optimized, random and none; lanes bounded on one side, and on two."""
+    cells = []
+    for network, section in networks.items():
+        for sides in (1, 2):
+            for mechanism in ("centralized", "optimized", "random", "none"):
+                for seed in seeds:
+                    labels = {"network": network, "sides": sides, "mechanism": mechanism, "seed": seed}
+                    scenario = paper_scenario(section, seed, mechanism, sides)
+                    cells.append(Cell(labels, scenario))
+    return cells
+
+
+def default_cells(
+    networks: dict[str, dict[str, Any]], seeds: Sequence[int], rows: dict[str, dict[str, Any]] | None = None
+) -> list[Cell]:
+    """vnet's own profile on the same networks: centralized, the limit of each component, and the mechanisms."""
+    cells = []
+    for network, section in networks.items():
+        for seed in seeds:
+            for mechanism in ("centralized", "limit"):
+                labels = {"network": network, "mechanism": mechanism, "seed": seed}
+                cells.append(Cell(labels, bound_scenario(section, seed, mechanism == "limit"), SETTLED_S))
+            for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
+                labels = {"network": network, "mechanism": mechanism, "seed": seed}
+                cells.append(Cell(labels, default_scenario(section, seed, options), SETTLED_S))
+    return cells
+
+
+def table1_cells(seeds: Sequence[int], network: Path) -> list[Cell]:
+    """Constant α on the ring, and the optimized weights beside them. `network` is the crossing's file."""
+    section = {"kind": "file", "path": str(network.resolve())}
+    rules: list[tuple[str, dict[str, Any]]] = [("optimized", {"fusion": "optimized"})]
+    rules += [(f"{alpha:g}", {"fusion": "constant", "alpha": alpha}) for alpha in ALPHAS]
+    return [
+        Cell(
+            {"weights": name, "seed": seed},
+            _paper(section, seed, {"profile": "paper", **options}, np.array(RING)),
+        )
+        for name, options in rules
+        for seed in seeds
+    ]
+
+
+def write_crossing(path: Path) -> None:
+    """The four vehicles of Table I: two on a road from south to north, two on one from west to east."""
+    rows = [(0.0, -60.0, 90), (0.0, 60.0, 270), (-60.0, 0.0, 0), (60.0, 0.0, 180)]
+    lines = [f"{i + 1},{x},{y},{np.deg2rad(angle):.9f}" for i, (x, y, angle) in enumerate(rows)]
+    path.write_text("\n".join(["id,x_m,y_m,heading_rad", *lines]) + "\n")
+
+
+def default_scenario(network: dict[str, Any], seed: int, options: dict[str, Any]) -> Scenario:
+    """A cooperative run in the default world, 10 % loss."""
+    return Scenario.model_validate(
+        {
+            "run": {"name": "cell", "seed": seed, "duration_s": DEFAULT_S},
+            "network": network,
+            "radio": {"range_m": RANGE_M, "loss": 0.1},
+            "program": {"entry": "agents.cooperative:main", "options": options},
+        }
+    )
+
+
+def bound_scenario(network: dict[str, Any], seed: int, by_component: bool) -> Scenario:
+    """One filter that hears every fix without loss; or one a connected component."""
+    world = build_world(default_scenario(network, seed, {}))
+    label = components(world.at(0).position_m, RANGE_M) if by_component else np.zeros(len(world.node_ids))
+    return Scenario.model_validate(
+        {
+            "run": {"name": "cell", "seed": seed, "duration_s": DEFAULT_S},
+            "network": network,
+            "radio": _everybody(label[:, None] == label[None, :]),
+            "program": {
+                "entry": "agents.centralized:main",
+                "options": {"particles": CENTRALIZED_PARTICLES},
+            },
+        }
+    )
+
+
+def paper_scenario(network: dict[str, Any], seed: int, mechanism: str, sides: int = 1) -> Scenario:
+    """One cell of Table II: `mechanism` is centralized or a rule of fusion; lanes are bounded on so many sides."""
+    options: dict[str, Any] = {"profile": "paper", "one_sided": sides == 1}
+    if mechanism == "centralized":
+        return _paper(network, seed, options | {"particles": CENTRALIZED_PARTICLES}, None)
+    positions = build_world(Scenario.model_validate({"network": network})).at(0).position_m
+    offset = positions[:, None] - positions[None]
+    hears = np.hypot(offset[..., 0], offset[..., 1]) <= RANGE_M
+    np.fill_diagonal(hears, False)
+    return _paper(network, seed, options | {"fusion": mechanism}, hears)
+
+
+def _paper(network: dict[str, Any], seed: int, options: dict[str, Any], hears: Any) -> Scenario:
+    """The paper's world: constant errors and offsets. Everybody hears everybody, and `hears` says who counts."""
+    data: dict[str, Any] = {
+        "run": {"name": "cell", "seed": seed, "duration_s": PAPER_S},
+        "network": network,
+        "world": {
+            "common_error": {"sigma_m": 3.0, "tau_s": 1e9},
+            "lateral": {"sigma_m": 0.5, "tau_s": 1e9},
+        },
+        "program": {"entry": f"agents.{'centralized' if hears is None else 'cooperative'}:main"},
+    }
+    world = build_world(Scenario.model_validate(data))
+    options = options | {"start_m": world.at(0).common_error_m.tolist()}
+    if hears is not None:
+        options["hears"] = {
+            node: [other for other, heard in zip(world.node_ids, row, strict=True) if heard]
+            for node, row in zip(world.node_ids, hears, strict=True)
+        }
+    data["program"]["options"] = options
+    data["radio"] = _everybody(np.ones((len(world.node_ids),) * 2))
+    return Scenario.model_validate(data)
+
+
+def _everybody(linked: Any) -> dict[str, Any]:
+    """A radio without loss or cap on which `linked` (N, N) hear each other."""
+    links = np.asarray(linked).astype(int).tolist()
+    return {
+        "links": links,
+        "max_peers": len(links),
+        "loss": 0.0,
+        "max_payload_bytes": 65_000,
+        "bitrate_mbps": 1000.0,
+    }
+
+
+def load_positions(section: dict[str, Any]) -> Any:
+    """Positions (N, 2) and headings (N,) of a network section, for figures."""
+    if section["kind"] == "file":
+        network = load_network(Path(section["path"]))
+    else:
+        network = generate_network("urban", section["vehicles"], section.get("seed", 1))
+    return network.position_m, network.heading_rad
