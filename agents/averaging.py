@@ -1,0 +1,138 @@
+"""Plain consensus: each vehicle holds one fixed input, and all look for the mean of all inputs.
+
+One round and one broadcast a period, and no filter around it: what is measured is the consensus alone. A round
+takes the newest frame of each peer that has come since the last, so that with a latency below a period and no loss
+round t is step t of the linear iteration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import msgspec
+
+from agents.cooperative_frame import short_name
+from vnet import Node, Packet
+from vnet.cmm.consensus import AVERAGING_RULES, AveragingConsensus, Consensus, RatioConsensus, Share
+from vnet.errors import ProgramError
+from vnet.roads.lanes import Array
+
+NS_PER_S = 1_000_000_000
+RULES = ("ratio", *AVERAGING_RULES)
+
+
+class AveragingFrame(msgspec.Struct, array_like=True):
+    """One broadcast: a `Share` with its sets as sorted lists of short names."""
+
+    epoch: int
+    running_sum: tuple[float, float, float]
+    takers: list[str]
+    heard: list[str]
+
+
+@dataclass(frozen=True)
+class Options:
+    """`rule` of the consensus, and who is `silent` when: [from_s, to_s) by node id, in seconds of the run."""
+
+    rule: str = "ratio"
+    silent: dict[str, list[float]] = field(default_factory=dict)
+
+    @classmethod
+    def parse(cls, options: Mapping[str, Any]) -> Options:
+        """Options from a scenario. Raises ProgramError that names the key, the value and what is allowed."""
+        allowed = [f.name for f in fields(cls)]
+        for key in options:
+            if key not in allowed:
+                raise ProgramError(f"program.options.{key}: unknown; allowed: {', '.join(allowed)}")
+        parsed = cls(**options)
+        if parsed.rule not in RULES:
+            raise ProgramError(f"program.options.rule = {parsed.rule!r}: allowed: {', '.join(RULES)}")
+        if not isinstance(parsed.silent, dict):
+            raise ProgramError(f"program.options.silent = {parsed.silent!r}: a table of [from_s, to_s] expected")
+        for node, span in parsed.silent.items():
+            if not _is_span(span):
+                raise ProgramError(f"program.options.silent.{node} = {span!r}: [from_s, to_s] expected, from first")
+        return parsed
+
+    def is_silent(self, node: str, time_ns: int) -> bool:
+        """Whether `node` is away at `time_ns`."""
+        if node not in self.silent:
+            return False
+        from_s, to_s = self.silent[node]
+        return from_s <= time_ns / NS_PER_S < to_s
+
+
+def _is_span(span: object) -> bool:
+    numbers = isinstance(span, (list, tuple)) and all(type(x) in (int, float) and math.isfinite(x) for x in span)
+    return numbers and len(span) == 2 and span[0] <= span[1]  # type: ignore[arg-type,index]
+
+
+class Averager:
+    """The consensus of one vehicle with the fixed input `value` (2,), without any radio of its own."""
+
+    def __init__(self, node_id: str, rule: str, value: Array) -> None:
+        self.value = value
+        self.consensus: Consensus = _consensus(short_name(node_id), rule)
+        self.rejected = 0
+        """Frames that could not be read."""
+        self._newest_ns: dict[str, int] = {}
+
+    def round(self, packets: Iterable[Packet]) -> bytes:
+        """One round with the newest frame of each peer; returns the frame to broadcast."""
+        shares: dict[str, Share] = {}
+        for packet in packets:
+            sender = short_name(packet.sender)
+            if packet.sent_ns <= self._newest_ns.get(sender, -1):
+                continue
+            try:
+                shares[sender] = decode(packet.payload)
+            except ValueError:
+                self.rejected += 1
+            else:
+                self._newest_ns[sender] = packet.sent_ns
+        return encode(self.consensus.round(self.value, shares))
+
+
+def _consensus(name: str, rule: str) -> Consensus:
+    return RatioConsensus(name) if rule == "ratio" else AveragingConsensus(name, rule)
+
+
+def encode(share: Share) -> bytes:
+    """A share as the bytes of a frame."""
+    frame = AveragingFrame(share.epoch, share.running_sum, sorted(share.takers), sorted(share.heard))
+    return msgspec.msgpack.encode(frame)
+
+
+def decode(payload: bytes) -> Share:
+    """The share in a frame. Raises ValueError for bytes that are none, or numbers that are not finite."""
+    frame = msgspec.msgpack.decode(payload, type=AveragingFrame)  # its errors are ValueErrors
+    if not all(map(math.isfinite, frame.running_sum)) or frame.epoch < 0:
+        raise ValueError("numbers out of bounds")
+    return Share(frame.epoch, frame.running_sum, frozenset(frame.takers), frozenset(frame.heard))
+
+
+async def main(node: Node) -> None:
+    """Average until the run ends; away while `silent`, and afresh (with the same input) on return."""
+    options = Options.parse(node.options)
+    value = node.rng.standard_normal(2)
+    averager = Averager(node.id, options.rule, value)
+    async for fix in node.gnss:
+        packets = node.radio.drain()
+        if options.is_silent(node.id, fix.time_ns):
+            averager = Averager(node.id, options.rule, value)
+            continue
+        payload = averager.round(packets)
+        await node.radio.broadcast(payload)
+        _report(node, averager, len(payload))
+
+
+def _report(node: Node, averager: Averager, size: int) -> None:
+    """The input is the `common_error_m` of the metrics, so that they find out how far the mean is off."""
+    values: dict[str, Any] = {"common_error_m": averager.value, "bytes": size, "rejected": averager.rejected}
+    mean_m = averager.consensus.mean_m
+    if mean_m is not None:
+        values["mean_m"] = mean_m
+    node.report(**values)

@@ -1,0 +1,278 @@
+"""A network by itself: its graph, and what the linear model says of each weight rule on it; no run is needed.
+
+The graph is that of vehicles that hear each other, because consensus exchanges only there; the peer cap and
+`radio.links` are taken into account, loss is not. Fastest-mixing weights (Xiao and Boyd 2004) are a bound for
+symmetric weights, found by semidefinite programming with the optional cvxpy (`pip install vnet-emulator[sdp]`).
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+from scipy.sparse.csgraph import connected_components, shortest_path
+
+from emulator.channel.stages import Topology
+from emulator.world.world import build_world, components
+from vnet.cmm.linear_model import convergence_factor, deviation_covariance
+from vnet.cmm.weights import max_degree_weights, metropolis_weights
+from vnet.errors import VnetError
+from vnet.roads.lanes import Array
+from vnet.scenario import Scenario
+
+Links = NDArray[np.bool_]
+FASTEST = "fastest-mixing"
+NO_CVXPY = "fastest-mixing weights left out: cvxpy is not installed (pip install 'vnet-emulator[sdp]')"
+
+
+def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
+    """What can be said of the scenario's network beforehand, as plain numbers; `analysis_table` prints it.
+
+    `components` are sizes, largest first, of who is linked both ways (`weak_components` counts links of one
+    direction as well, as the metrics of a run do). Of each of the `rules`: `convergence_factor` (r_asym, 1.0 where
+    the network does not come together), `spectral_gap` (1 less that), `deviation_variance`, the steady variance
+    per axis of x_i − x̄, a mean over vehicles, with noise of unit variance a round (None where it grows for ever),
+    and both for each component by itself, where x̄ is the component's mean. `run`, a run's folder, adds `measured`.
+    Raises VnetError where the network or the run cannot be used.
+    """
+    hears = hears_matrix(scenario)
+    world = build_world(scenario)
+    weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
+    result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
+    if run is not None:
+        result["measured"] = _measured(run, result["rules"])
+    return result
+
+
+def analyze_graph(hears: Links) -> dict[str, Any]:
+    """The same from the matrix of who (row) hears whom (column), (N, N)."""
+    linked = mutual(hears)
+    degree = linked.sum(axis=1)
+    values, counts = np.unique(degree, return_counts=True)
+    reach = shortest_path(linked.astype(float), unweighted=True)
+    laplacian = np.diag(degree) - linked.astype(float)
+    label = _labels(linked)
+    groups = [np.flatnonzero(label == number) for number in np.argsort(-np.bincount(label), kind="stable")]
+    return {
+        "vehicles": len(linked),
+        "components": [len(group) for group in groups],
+        "links": int(degree.sum()) // 2,
+        "one_way_links": int((hears & ~hears.T).sum()),
+        "degree": {"min": int(degree.min()), "median": float(np.median(degree)), "max": int(degree.max())},
+        "degree_histogram": dict(zip(values.tolist(), counts.tolist(), strict=True)),
+        "diameter": int(reach[np.isfinite(reach)].max()),
+        "algebraic_connectivity": float(max(0.0, np.linalg.eigvalsh(laplacian)[1])) if len(linked) > 1 else None,
+        "rules": {name: _rule_figures(make(linked), groups) for name, make in weight_rules().items()},
+        "left_out": [] if has_cvxpy() else [NO_CVXPY],
+    }
+
+
+def _rule_figures(weights: Array, groups: list[NDArray[np.intp]]) -> dict[str, Any]:
+    blocks = [weights[np.ix_(group, group)] for group in groups]
+    factors = [convergence_factor(block) for block in blocks]
+    variances = [float(np.trace(deviation_covariance(b, np.eye(len(b)))) / len(b)) for b in blocks]
+    factor = factors[0] if len(blocks) == 1 else 1.0
+    return {
+        "convergence_factor": factor,
+        "spectral_gap": 1 - factor,
+        "deviation_variance": variances[0] if len(blocks) == 1 else None,
+        "component_convergence_factor": factors,
+        "component_deviation_variance": variances,
+    }
+
+
+def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
+    """The run's deviation (root of mean squares, in metres, after its first fifth) and what noise would explain it.
+
+    `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
+    """
+    path = run / "metrics.parquet"
+    if not path.is_file():
+        raise VnetError(f"{run}: no metrics.parquet in it; the folder of a finished run is needed")
+    values = pq.read_table(path, columns=["deviation_m"])["deviation_m"].to_pylist()
+    settled = [value for value in values[len(values) // 5 :] if value is not None]
+    if not settled:
+        raise VnetError(f"{path}: no deviation in it; its program reported no common error")
+    deviation = float(np.sqrt(np.mean(np.square(settled))))
+    variance = {name: figures["deviation_variance"] for name, figures in rules.items()}
+    noise = {name: deviation / float(np.sqrt(2 * value)) for name, value in variance.items() if value}
+    return {"deviation_m": deviation, "noise_m": noise}
+
+
+# Graphs.
+
+
+def hears_matrix(scenario: Scenario) -> Links:
+    """Who (row) hears whom (column) at the start, (N, N): range or links, and the peer cap."""
+    world = build_world(scenario)
+    radio = scenario.radio
+    topology = Topology(world.at(0).position_m, radio.range_m, radio.max_peers, world.links)
+    return np.asarray(topology.admitted.T)
+
+
+def mutual(hears: Links) -> Links:
+    """Who hears each other, (N, N), nobody itself."""
+    linked: Links = hears & hears.T
+    np.fill_diagonal(linked, False)
+    return linked
+
+
+def is_connected(linked: Links) -> bool:
+    """Whether everybody is reached from everybody."""
+    return bool(_labels(linked).max() == 0)
+
+
+def _labels(linked: Links) -> NDArray[np.intp]:
+    _, label = connected_components(linked, directed=False)
+    return np.asarray(label, dtype=np.intp)
+
+
+def _sizes(label: NDArray[np.intp]) -> list[int]:
+    return sorted(np.bincount(label).tolist(), reverse=True)
+
+
+# Weight rules: matrices A (N, N) of x(t+1) = A x(t) on the links (N, N) of a graph.
+
+
+def weight_rules() -> dict[str, Callable[[Links], Array]]:
+    """By name; fastest-mixing only where cvxpy is installed."""
+    rules: dict[str, Callable[[Links], Array]] = {
+        "constant": constant_matrix,
+        "metropolis": metropolis_matrix,
+        "max-degree": max_degree_matrix,
+    }
+    return rules | {FASTEST: fastest_mixing_matrix} if has_cvxpy() else rules
+
+
+def constant_matrix(linked: Links) -> Array:
+    """1/(d_max + 1) on each link, with the largest degree of the whole network."""
+    largest = int(linked.sum(axis=1).max())
+    return _assemble(linked, lambda _, peers: max_degree_weights(1 + len(peers), largest))
+
+
+def max_degree_matrix(linked: Links) -> Array:
+    """1/(d_max + 1) on each link, with the largest degree of the component: as far as word of it comes."""
+    degree, label = linked.sum(axis=1), _labels(linked)
+    largest = [int(degree[label == label[i]].max()) for i in range(len(linked))]
+    return _assemble(linked, lambda i, peers: max_degree_weights(1 + len(peers), largest[i]))
+
+
+def metropolis_matrix(linked: Links) -> Array:
+    """1/(1 + max(d_i, d_j)) on each link."""
+    degree = linked.sum(axis=1)
+    return _assemble(linked, lambda _, peers: metropolis_weights(len(peers), degree[peers].tolist()))
+
+
+def ratio_matrix(linked: Links) -> Array:
+    """What a round of ratio consensus does to mass: A_ij = 1/(d_j + 1). Its columns add up to 1, not its rows."""
+    return np.asarray((linked + np.eye(len(linked))) / (linked.sum(axis=0) + 1))
+
+
+def _assemble(linked: Links, weigh: Callable[[int, NDArray[np.intp]], Array]) -> Array:
+    weights = np.zeros(linked.shape)
+    for i, row in enumerate(linked):
+        peers = np.flatnonzero(row)
+        weights[i, [i, *peers]] = weigh(i, peers)
+    return weights
+
+
+def has_cvxpy() -> bool:
+    """Whether fastest-mixing weights can be had."""
+    return importlib.util.find_spec("cvxpy") is not None
+
+
+def fastest_mixing_matrix(linked: Links) -> Array:
+    """Symmetric weights with the smallest convergence factor, component by component; some may be negative.
+
+    min ‖I − B diag(w) Bᵀ − 11ᵀ/N‖₂ over the weights w of the links (Xiao and Boyd 2004, 3.1 and 5.1). Raises
+    VnetError without cvxpy, and where its solver finds no optimum.
+    """
+    if not has_cvxpy():
+        raise VnetError(NO_CVXPY)
+    label = _labels(linked)
+    weights = np.eye(len(linked))
+    for number in range(int(label.max()) + 1):
+        group = np.flatnonzero(label == number)
+        if len(group) > 1:
+            weights[np.ix_(group, group)] = _solve_sdp(linked[np.ix_(group, group)])
+    return weights
+
+
+def _solve_sdp(linked: Links) -> Array:
+    cp: Any = importlib.import_module("cvxpy")
+    count = len(linked)
+    first, second = np.nonzero(np.triu(linked))
+    incidence = np.zeros((count, len(first)))
+    incidence[first, np.arange(len(first))] = 1
+    incidence[second, np.arange(len(first))] = -1
+    weight, bound = cp.Variable(len(first)), cp.Variable()
+    away = np.eye(count) - 1 / count - incidence @ cp.diag(weight) @ incidence.T
+    problem = cp.Problem(cp.Minimize(bound), [bound * np.eye(count) >> away, away >> -bound * np.eye(count)])
+    problem.solve(solver="CLARABEL")
+    if problem.status != "optimal":
+        raise VnetError(f"fastest-mixing weights of {count} vehicles: cvxpy says {problem.status}")
+    return np.asarray(np.eye(count) - incidence @ np.diag(weight.value) @ incidence.T)
+
+
+# Printing.
+
+
+def analysis_table(analysis: dict[str, Any]) -> Group:
+    """An analysis for the terminal."""
+    graph = Table(title="network", title_justify="left")
+    graph.add_column("figure")
+    graph.add_column("value", overflow="fold")
+    for name, value in _graph_rows(analysis):
+        graph.add_row(name, value)
+    parts: list[Any] = [graph, _rules_table(analysis), *map(Text, analysis["left_out"])]
+    if "measured" in analysis:
+        parts.append(f"measured: deviation {analysis['measured']['deviation_m']:.4g} m")
+    return Group(*parts)
+
+
+def _graph_rows(analysis: dict[str, Any]) -> list[tuple[str, str]]:
+    degree, connectivity = analysis["degree"], analysis["algebraic_connectivity"]
+    histogram = "  ".join(f"{value}:{count}" for value, count in analysis["degree_histogram"].items())
+    return [
+        ("vehicles", str(analysis["vehicles"])),
+        ("components (vehicles)", ", ".join(map(str, analysis["components"]))),
+        ("links, both ways / one way", f"{analysis['links']} / {analysis['one_way_links']}"),
+        ("degree: min / median / max", f"{degree['min']} / {degree['median']:g} / {degree['max']}"),
+        ("degree:vehicles", histogram),
+        ("diameter (hops)", str(analysis["diameter"])),
+        ("algebraic connectivity", "–" if connectivity is None else f"{connectivity:.4g}"),
+    ]
+
+
+def _rules_table(analysis: dict[str, Any]) -> Table:
+    noise = analysis.get("measured", {}).get("noise_m")
+    table = Table(
+        title="linear model, by weight rule (noise of unit variance a round)",
+        title_justify="left",
+        caption="of components: each by itself, in the order above" if len(analysis["components"]) > 1 else None,
+    )
+    headings = ["rule", "r_asym", "spectral gap", "variance of deviations", "r_asym of components"]
+    for heading in [*headings, *(["noise that explains the run, m"] if noise is not None else [])]:
+        table.add_column(heading)
+    for name, figures in analysis["rules"].items():
+        variance = figures["deviation_variance"]
+        row = [
+            name,
+            f"{figures['convergence_factor']:.4f}",
+            f"{figures['spectral_gap']:.4f}",
+            "unbounded" if variance is None else f"{variance:.4g}",
+            " ".join(f"{factor:.4f}" for factor in figures["component_convergence_factor"]),
+        ]
+        if noise is not None:
+            row.append(f"{noise[name]:.3g}" if name in noise else "–")
+        table.add_row(*row)
+    return table
