@@ -87,6 +87,7 @@ class Estimator:
         In real time a vehicle that is late with its work finds frames of the next period: they wait for it.
         """
         waiting, self._early = self._early, []
+        heard = []
         for sender, frame in [*waiting, *self._decoded(packets)]:
             if abs(now_ns - frame.fix_time_ns) > STALE_PERIODS * self._period_ns:
                 self.rejected["stale"] += 1
@@ -100,7 +101,8 @@ class Estimator:
                 self._newest_ns[sender] = frame.fix_time_ns
                 self._frames[sender] = frame
                 if self._is_neighbour(sender):
-                    self._sightings.learn(int(sender, 16), frame)
+                    heard.append((int(sender, 16), frame))
+        self._sightings.learn(heard)
 
     def _decoded(self, packets: Iterable[Packet]) -> Iterator[tuple[str, CooperativeFrame]]:
         for packet in packets:
@@ -151,7 +153,7 @@ class Estimator:
         self.weights = dict(zip([self._node_id, *(self._ids[s] for s in frames)], weights.tolist(), strict=True))
         if self._options.exchange == "particles":
             known = [
-                frozenset(frame.heard) | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
+                frame.names_heard | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
                 for sender, frame in frames.items()
             ]
             clouds = [Cloud(f.cloud_m, names) for f, names in zip(frames.values(), known, strict=True)]
@@ -225,8 +227,7 @@ def _consensus(rule: str, name: str) -> Consensus:
 
 
 def _share(frame: CooperativeFrame) -> Share:
-    takers = frozenset(name for name, takes in frame.heard.items() if takes)
-    return Share(frame.epoch, frame.running_sum, takers, frozenset(frame.heard))
+    return Share(frame.epoch, frame.running_sum, frame.takers, frame.names_heard)
 
 
 async def main(node: Node) -> None:

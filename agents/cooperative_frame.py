@@ -11,7 +11,7 @@ import hashlib
 import math
 import struct
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,16 @@ class CooperativeFrame:
     cloud_m: Array
     relayed: NDArray[np.void] = field(default_factory=_nothing_relayed)
     largest_degree: int = 0
+
+    @cached_property
+    def takers(self) -> frozenset[str]:
+        """Those of `heard` that are given a share."""
+        return frozenset(name for name, takes in self.heard.items() if takes)
+
+    @cached_property
+    def names_heard(self) -> frozenset[str]:
+        """The names in `heard`."""
+        return frozenset(self.heard)
 
     def own_fix(self, code: int) -> NDArray[np.void]:
         """The sender's own fix, (1,) of `RELAYED`, under its code."""

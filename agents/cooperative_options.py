@@ -28,6 +28,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "one_sided": True,
         "roads_apart": True,
         "two_frames": True,
+        "fusion_interval_s": 0.1,
         "ridge_m2": 0.01,
         "start_sigma_m": 0.1,
     },
@@ -57,7 +58,7 @@ class Options:
     alpha: float = 0.5
     self_floor: float = 0.0
     ridge_m2: float = 0.0
-    fusion_interval_s: float = 0.1
+    fusion_interval_s: float = 0.2
     particles: int = 200
     common_sigma_m: float = 3.0
     common_tau_s: float = 600.0
