@@ -59,7 +59,7 @@ class Estimator:
         self.name = short_name(node_id)
         self.rejected: Counter[str] = Counter()
         self.rbpf = Rbpf(options.filter_config(), lanes, rng)
-        self.consensus = _consensus(options.consensus, self.name)
+        self.consensus = _consensus(options, self.name)
         self.stacked_m = self.rbpf.estimate_m
         self.weights: dict[str, float] = {}
         """The latest fusion weights by node id, its own included."""
@@ -75,7 +75,7 @@ class Estimator:
         self._early: list[tuple[str, CooperativeFrame]] = []
         self._ids: dict[str, str] = {}
         self._sightings = Sightings(int(self.name, 16), period_ns)
-        self._optimized = OptimizedWeights(options.self_floor)
+        self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._largest_degree = 0
         self._said = self._estimate()
@@ -183,8 +183,6 @@ class Estimator:
     def _optimize(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         estimates = np.array([self._said[0], *(frame.estimate_m for frame in frames.values())])
         covariances = np.array([self._said[1], *(frame.covariance_m2 for frame in frames.values())])
-        if self._options.ridge_m2:
-            covariances = np.tile(self._options.ridge_m2 / 2 * np.eye(2), (len(estimates), 1, 1))
         mean = self.consensus.mean_m
         return self._optimized.solve(estimates, covariances, estimates.mean(axis=0) if mean is None else mean)
 
@@ -216,13 +214,13 @@ class Estimator:
         return encode(frame)
 
 
-def _consensus(rule: str, name: str) -> Consensus:
-    match rule:
+def _consensus(options: Options, name: str) -> Consensus:
+    match options.consensus:
         case "ratio":
             return RatioConsensus(name)
         case "exact":
-            return DirectMean()
-        case _:
+            return DirectMean(current=options.two_frames)
+        case rule:
             return AveragingConsensus(name, rule)
 
 

@@ -17,19 +17,19 @@ EXCHANGES = ("estimates", "particles")
 CONSENSUSES = ("ratio", *AVERAGING_RULES, "exact")
 PROFILES: dict[str, dict[str, Any]] = {
     "default": {},
-    # The paper's, from its published runs (MODEL 7): a very loose random walk of 0.5 m a step of 0.1 s, lanes
-    # bounded on one side and counted anew each step, after the particles of this very step have been stacked.
+    # The paper's, from its published runs (MODEL 7): a loose random walk, its 0.5 m a step of 0.1 s read as uniform
+    # in ±0.5 m (docs/paper.md says why), lanes bounded on one side and counted anew each step, after the particles of this very step have been stacked.
     "paper": {
         "particles": 50,
         "exchange": "particles",
         "relay": False,
         "consensus": "exact",
-        "common_walk_m": 0.5 / math.sqrt(0.1),
+        "common_walk_m": 0.5 / math.sqrt(3) / math.sqrt(0.1),
         "one_sided": True,
         "roads_apart": True,
         "two_frames": True,
         "fusion_interval_s": 0.1,
-        "ridge_m2": 0.01,
+        "ridge_m2": 1e-4,
         "start_sigma_m": 0.1,
     },
 }

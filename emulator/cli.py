@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record.
+"""`vnet`: run, simulate, emulator, access, check, record, analyze, experiment.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -8,8 +8,7 @@ from __future__ import annotations
 import asyncio
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from emulator.experiments.cli import app as experiment_app
 from emulator.observe.checks import check_run
 from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
@@ -28,6 +28,7 @@ from emulator.run.join import split_into_processes
 from emulator.run.live import LiveOptions, run_live
 from emulator.run.progress import ProgressLine
 from emulator.run.simulate import simulate as run_simulation
+from emulator.terminal import one_line_errors
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, VnetError
 from vnet.link.access import Access, Credentials
@@ -41,6 +42,7 @@ app = typer.Typer(
     no_args_is_help=True,
     help="An asyncio message-passing emulator for connected vehicles over Zenoh.",
 )
+app.add_typer(experiment_app, name="experiment")
 
 
 class Pacing(StrEnum):
@@ -83,7 +85,7 @@ def run(
     rerun: RerunOption = Rerun.OFF,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    with _one_line_errors():
+    with one_line_errors():
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         world = build_world(loaded)
         options = LiveOptions(_create_access(loaded, world))
@@ -102,7 +104,7 @@ def simulate(
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
-    with _one_line_errors():
+    with one_line_errors():
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         sys.path.append(str(Path.cwd()))
         emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
@@ -143,7 +145,7 @@ def emulator(
     rerun: RerunOption = Rerun.OFF,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
-    with _one_line_errors():
+    with one_line_errors():
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
@@ -168,7 +170,7 @@ def write_access(
     overrides: SetOption = None,
 ) -> None:
     """Write a separate zenohd's configuration (zenohd -c OUT/zenohd.json5) and everybody's credentials."""
-    with _one_line_errors():
+    with one_line_errors():
         loaded = _load(scenario, overrides)
         users = _create_access(loaded, build_world(loaded))
         users.save(out, listen, router_folder or out.resolve())
@@ -179,10 +181,24 @@ def write_access(
 @app.command()
 def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]) -> None:
     """Judge a run again, from its files alone."""
-    with _one_line_errors():
+    with one_line_errors():
         judgement = check_run(folder)
         print_checks(judgement, Console())
         raise typer.Exit(judgement.exit_status)
+
+
+@app.command()
+def analyze(
+    scenario: ScenarioArgument,
+    run: Annotated[Path | None, typer.Option(help="A run's folder: what its filters did is set beside.")] = None,
+    overrides: SetOption = None,
+) -> None:
+    """What the network's graph says without a run: components, degrees, how well each rule of weights mixes."""
+    from emulator.experiments.analyze import analysis_table
+    from emulator.experiments.analyze import analyze as analyze_scenario
+
+    with one_line_errors():
+        Console().print(analysis_table(analyze_scenario(_load(scenario, overrides), run)))
 
 
 @app.command()
@@ -195,7 +211,7 @@ def record(
     """Watch a run from outside and write a Rerun recording of it."""
     from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it
 
-    with _one_line_errors():
+    with one_line_errors():
         record_run(connect, run, None if credentials is None else Credentials.load(credentials), out)
 
 
@@ -252,16 +268,6 @@ def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str
     judgement, verdict = conclude(emulation, wall_s, command)
     print_summary(judgement, verdict, emulation.folder.path, Console())
     raise typer.Exit(130 if interrupted else judgement.exit_status)
-
-
-@contextmanager
-def _one_line_errors() -> Iterator[None]:
-    """Say what went wrong in one line, and end with status 2."""
-    try:
-        yield
-    except VnetError as error:
-        print(f"vnet: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
 
 
 def main() -> None:

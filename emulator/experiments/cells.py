@@ -131,7 +131,7 @@ def run_cell(cell: Cell, store: Path, live: bool = False) -> None:
             _, interrupted = simulate(emulation)
         if interrupted:
             raise KeyboardInterrupt
-        broken = [e for e in folder.events if e.kind in ("died", "raised", "exited")]
+        broken = [e for e in folder.events if e.kind in ("died", "crashed", "spun", "stalled")]
         if broken:
             event = broken[0]
             raise VnetError(f"cell {cell.labels}: {event.node} {event.kind}: {event.details.get('error', '')}")

@@ -19,6 +19,7 @@ from emulator.world.world import build_world, components
 from vnet.errors import VnetError
 from vnet.scenario import Scenario
 
+Labels = dict[str, str | int | float]
 NETWORKS = {"n1": 50, "n2": 38, "n3": 24}
 RANGE_M = 3000.0
 PAPER_S = 10.0
@@ -51,15 +52,17 @@ def network_sections(folder: Path | None) -> dict[str, dict[str, Any]]:
     return sections
 
 
-def table2_cells(networks: dict[str, dict[str, Any]], seeds: Sequence[int]) -> list[Cell]:
+def table2_cells(
+    networks: dict[str, dict[str, Any]], seeds: Sequence[int], sides: Sequence[int] = (1, 2)
+) -> list[Cell]:
     """The paper's profile: centralized, optimized, random and none; lanes bounded on one side, and on two."""
     cells = []
     for network, section in networks.items():
-        for sides in (1, 2):
+        for side_count in sides:
             for mechanism in ("centralized", "optimized", "random", "none"):
                 for seed in seeds:
-                    labels = {"network": network, "sides": sides, "mechanism": mechanism, "seed": seed}
-                    scenario = paper_scenario(section, seed, mechanism, sides)
+                    labels: Labels = {"network": network, "sides": side_count, "mechanism": mechanism, "seed": seed}
+                    scenario = paper_scenario(section, seed, mechanism, side_count)
                     cells.append(Cell(labels, scenario))
     return cells
 
@@ -72,7 +75,7 @@ def default_cells(
     for network, section in networks.items():
         for seed in seeds:
             for mechanism in ("centralized", "limit"):
-                labels = {"network": network, "mechanism": mechanism, "seed": seed}
+                labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
                 cells.append(Cell(labels, bound_scenario(section, seed, mechanism == "limit"), SETTLED_S))
             for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
                 labels = {"network": network, "mechanism": mechanism, "seed": seed}

@@ -175,9 +175,13 @@ class RatioConsensus:
 
 
 class DirectMean:
-    """The mean of everybody's x, heard from everybody: for comparisons, where all hear all."""
+    """The mean of everybody's x, heard from everybody: for comparisons, where all hear all.
 
-    def __init__(self) -> None:
+    `current`: what has been heard is of the same instant as the input, and not of the round before.
+    """
+
+    def __init__(self, current: bool = False) -> None:
+        self._current = current
         self._said: Array | None = None
         self._mean: Array | None = None
 
@@ -189,7 +193,7 @@ class DirectMean:
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """Take what everybody said last, and say the input x (2,)."""
         said = [np.array(shares[peer].running_sum[:2]) for peer in sorted(shares) if shares[peer].running_sum[2]]
-        own = value if self._said is None else self._said
+        own = value if self._said is None or self._current else self._said
         self._mean = np.mean([own, *said], axis=0)
         self._said = np.array(value, dtype=float)
         x, y = self._said.tolist()

@@ -22,14 +22,16 @@ RIDGE_FLOOR_M2 = 0.01
 class OptimizedWeights:
     """min ‖Σ_j a_j x_j − x̄‖² + Σ_j λ_j a_j²  subject to  Σ_j a_j = 1, 0 ≤ a_j ≤ 1, a_0 ≥ `self_floor`.
 
-    λ_j = tr Cov(x_j), at least 0.01 m²: without the ridge two rows of data do not determine up to 31 weights.
+    λ_j = tr Cov(x_j), at least 0.01 m²: without the ridge two rows of data do not determine up to 31 weights. With
+    `ridge_m2` λ is the same for all; the paper has none, and a small one stands for that.
     OSQP (Stellato et al. 2020) is set up once for each number of neighbours and updated afterwards. Its step size
     is carried over from problem to problem, so the last digits depend on the history, but never on the wall clock:
     the same problems in the same order give the same bits.
     """
 
-    def __init__(self, self_floor: float = 0.0) -> None:
+    def __init__(self, self_floor: float = 0.0, ridge_m2: float | None = None) -> None:
         self._self_floor = self_floor
+        self._ridge_m2 = ridge_m2
         self._solvers: dict[int, osqp.OSQP] = {}
 
     def solve(self, estimates_m: Array, covariances_m2: Array, mean_m: Array) -> Array:
@@ -42,7 +44,10 @@ class OptimizedWeights:
         if count == 1:
             return np.ones(1)
         offset = estimates_m - mean_m
-        ridge = np.maximum(np.trace(covariances_m2, axis1=1, axis2=2), RIDGE_FLOOR_M2)
+        if self._ridge_m2 is None:
+            ridge = np.maximum(np.trace(covariances_m2, axis1=1, axis2=2), RIDGE_FLOOR_M2)
+        else:
+            ridge = np.full(count, self._ridge_m2)
         hessian = 2 * (offset @ offset.T + np.diag(ridge))
         scale = float(np.mean(np.diag(hessian)))  # OSQP's tolerances are absolute
         rows, columns = _upper_triangle(count)

@@ -1,0 +1,201 @@
+"""What the experiments found, in Markdown: means over seeds ± standard errors, beside the paper's figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from emulator.experiments.paper import ALPHAS
+from emulator.experiments.tables import markdown_table, mean_and_error, paired_difference, paired_ratio
+
+Result = Mapping[str, Any]
+
+PAPER_TABLE1: dict[float | str, tuple[float, float]] = {
+    "optimized": (0.13, 0.58),
+    0.05: (0.38, 0.81),
+    0.1: (0.33, 0.63),
+    0.2: (0.28, 0.60),
+    0.4: (0.21, 0.56),
+    0.5: (0.20, 0.57),
+    0.6: (0.21, 0.58),
+    0.8: (0.33, 0.59),
+    0.9: (0.46, 0.62),
+    0.95: (0.68, 0.80),
+}
+"""√variance and √MSE in metres: Table I of Shen, Sun and Zhao, "Semi-Interpenetrating Cooperative Localization in
+Connected Vehicle Networks"."""
+PAPER_TABLE2 = {
+    "centralized": {"n1": 0.67, "n2": 0.64, "n3": 0.64},
+    "optimized": {"n1": 0.76, "n2": 0.72, "n3": 1.04},
+    "random": {"n1": 0.72, "n2": 1.60, "n3": 4.30},
+}
+"""RMSE in metres: Table II of the same."""
+
+
+def select(results: Sequence[Result], **labels: object) -> list[Result]:
+    """The results with these labels, by seed."""
+    found = [row for row in results if all(row[key] == value for key, value in labels.items())]
+    return sorted(found, key=lambda row: int(row["seed"]))
+
+
+def column(rows: Sequence[Result], name: str) -> list[float]:
+    """One figure of each row."""
+    return [row[name] for row in rows]
+
+
+def unique(results: Sequence[Result], label: str) -> list[Any]:
+    """The values of a label in the order in which they come."""
+    return list(dict.fromkeys(row[label] for row in results))
+
+
+def table1(results: Sequence[Result]) -> str:
+    """Table I: the network's √variance and √MSE for each constant α, and for optimized weights."""
+    rows = []
+    for name in ("optimized", *(f"{alpha:g}" for alpha in ALPHAS)):
+        found = select(results, weights=name)
+        paper = PAPER_TABLE1["optimized" if name == "optimized" else float(name)]
+        variance, error = column(found, "stacked_deviation_m"), column(found, "stacked_rmse_m")
+        rows.append([name, mean_and_error(variance), mean_and_error(error), f"{paper[0]:.2f}", f"{paper[1]:.2f}"])
+    header = ["α", "√variance [m]", "√MSE [m]", "the paper's √variance", "the paper's √MSE"]
+    title = "# Table I: four vehicles on a directed ring"
+    return f"{title}\n\n{markdown_table(header, rows)}\n\n{_table1_summary(results)}\n"
+
+
+def _table1_summary(results: Sequence[Result]) -> str:
+    means = {
+        alpha: float(np.mean(column(select(results, weights=f"{alpha:g}"), "stacked_deviation_m")))
+        for alpha in ALPHAS
+    }
+    best = min(means, key=lambda alpha: means[alpha])
+    worst = max(means, key=lambda alpha: means[alpha])
+    ratio, error = paired_ratio(
+        column(select(results, weights="optimized"), "stacked_deviation_m"),
+        column(select(results, weights=f"{best:g}"), "stacked_deviation_m"),
+    )
+    return (
+        f"√variance is smallest at α = {best:g} and largest at α = {worst:g}; optimized weights have "
+        f"{ratio:.2f} ± {error:.2f} times that of the best constant. {len(unique(results, 'seed'))} seeds, "
+        "± standard error; estimates right after stacking, before the road weighs them."
+    )
+
+
+def table2(results: Sequence[Result]) -> str:
+    """Table II: RMSE of each mechanism on each network, lanes bounded on one side (the paper's) and on two."""
+    parts = ["# Table II: RMSE of the common error [m], the paper's profile"]
+    networks = unique(results, "network")
+    for sides, title in ((1, "Lanes bounded on one side, as the paper's"), (2, "Lanes bounded on both sides")):
+        rows = []
+        for mechanism in unique(results, "mechanism"):
+            row = [mechanism]
+            for network in networks:
+                found = select(results, network=network, mechanism=mechanism, sides=sides)
+                row.append(mean_and_error(column(found, "stacked_rmse_m")))
+                row.append(f"{PAPER_TABLE2[mechanism][network]:.2f}" if mechanism in PAPER_TABLE2 else "–")
+            rows.append(row)
+        rows.append(_ratio_row(results, networks, sides))
+        header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
+        parts += [f"## {title}", markdown_table(header, rows)]
+    parts.append(
+        f"{len(unique(results, 'seed'))} seeds, ± standard error; 10 s, estimates right after stacking. "
+        "The paper's figures contain a floor of about 0.6 m from constant lateral offsets, which is left out here."
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def _ratio_row(results: Sequence[Result], networks: Sequence[str], sides: int) -> list[str]:
+    row = ["random / optimized"]
+    for network in networks:
+        random, optimized = (
+            column(select(results, network=network, mechanism=m, sides=sides), "stacked_rmse_m")
+            for m in ("random", "optimized")
+        )
+        ratio, error = paired_ratio(random, optimized)
+        paper = PAPER_TABLE2["random"][network] / PAPER_TABLE2["optimized"][network]
+        row += [f"{ratio:.2f} ± {error:.2f}", f"{paper:.2f}"]
+    return row
+
+
+def default_profile(results: Sequence[Result]) -> str:
+    """vnet's own profile: RMSE, the ratio to the limit, consistency and cost of each mechanism."""
+    networks = unique(results, "network")
+    mechanisms = unique(results, "mechanism")
+
+    def table(title: str, cell: Callable[[list[Result], list[Result]], str]) -> str:
+        rows = []
+        for mechanism in mechanisms:
+            row = [mechanism]
+            for network in networks:
+                found = select(results, network=network, mechanism=mechanism)
+                limit = select(results, network=network, mechanism="limit")
+                row.append(cell(*_same_seeds(found, limit)) if found else "–")
+            rows.append(row)
+        return f"## {title}\n\n" + markdown_table(["mechanism", *(n.upper() for n in networks)], rows)
+
+    parts = [
+        "# The default profile",
+        table("RMSE of the common error [m]", lambda a, _: mean_and_error(column(a, "rmse_m"))),
+        table("Relative to the limit, the same seeds", _ratio_to_limit),
+        table("Relative to the limit, by component", _component_ratios),
+        table("Network deviation [m]", lambda a, _: mean_and_error(column(a, "deviation_m"))),
+        table("RMSE of the position [m]", lambda a, _: mean_and_error(column(a, "position_rmse_m"))),
+        table("ANEES of the common error", lambda a, _: mean_and_error(column(a, "common_error_anees"), 2)),
+        table("ANEES of the position", lambda a, _: mean_and_error(column(a, "position_anees"), 2)),
+        table("Bytes a frame; vehicles that diverged", _cost),
+        _paired(results, networks),
+        _notes(results),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _same_seeds(rows: list[Result], limit: list[Result]) -> tuple[list[Result], list[Result]]:
+    seeds = {row["seed"] for row in rows}
+    return rows, [row for row in limit if row["seed"] in seeds]
+
+
+def _ratio_to_limit(rows: list[Result], limit: list[Result]) -> str:
+    ratio, error = paired_ratio(column(rows, "rmse_m"), column(limit, "rmse_m"))
+    return f"{ratio:.2f} ± {error:.2f}"
+
+
+def _component_ratios(rows: list[Result], limit: list[Result]) -> str:
+    ours, bound = (np.array([row["component_rmse_m"] for row in some]) for some in (rows, limit))
+    if ours.shape != bound.shape:
+        return "–"
+    return " / ".join(
+        f"{paired_ratio(a.tolist(), b.tolist())[0]:.2f}" for a, b in zip(ours.T, bound.T, strict=True)
+    )
+
+
+def _cost(rows: list[Result], _: list[Result]) -> str:
+    size = [row["bytes"] for row in rows if row["bytes"] is not None]
+    text = f"{np.mean(size):.0f} B" if size else "–"
+    return f"{text}; {sum(row['divergent'] for row in rows)} of {len(rows)} runs"
+
+
+def _paired(results: Sequence[Result], networks: Sequence[str]) -> str:
+    lines = ["## Paired differences [m]", ""]
+    rows = []
+    for a, b in (("optimized", "random"), ("random", "none")):
+        row = [f"{a} − {b}"]
+        for network in networks:
+            one, other = (select(results, network=network, mechanism=m) for m in (a, b))
+            common = {r["seed"] for r in one} & {r["seed"] for r in other}
+            one, other = ([r for r in some if r["seed"] in common] for some in (one, other))
+            difference, error = paired_difference(column(one, "rmse_m"), column(other, "rmse_m"))
+            row.append(f"{difference:+.3f} ± {error:.3f} ({len(common)} seeds)")
+        rows.append(row)
+    return "\n".join(lines) + "\n" + markdown_table(["", *(n.upper() for n in networks)], rows)
+
+
+def _notes(results: Sequence[Result]) -> str:
+    runs = len(unique(results, "seed"))
+    low, high = chi2.ppf([0.025, 0.975], 2 * runs) / (2 * runs)
+    return (
+        f"100 s, counted from 20 s on; up to {runs} seeds, ± standard error. `limit` is one centralized filter "
+        "a connected component, `centralized` one over all. `one hop` mixes particles as the paper does and passes "
+        f"no fixes on. ANEES is 1 for a consistent filter; the 95 % band of {runs} independent samples of two "
+        f"degrees of freedom is {low:.2f} to {high:.2f} (the samples within a run are not independent)."
+    )

@@ -1,0 +1,15 @@
+"""A cell of the paper's tables, live: four processes over Zenoh give the numbers of the simulation."""
+
+from pathlib import Path
+
+from emulator.experiments import paper
+from emulator.experiments.cells import run_cells
+
+
+def test_a_cell_run_over_zenoh_has_the_numbers_of_its_simulation(tmp_path: Path) -> None:
+    paper.write_crossing(tmp_path / "crossing.csv")
+    cell = paper.table1_cells([1], tmp_path / "crossing.csv")[0]
+    simulated = run_cells([cell], tmp_path)[0]
+    live = run_cells([cell], tmp_path, live=True)[0]
+    assert live == simulated
+    assert live["metrics_sha256"]
