@@ -18,7 +18,8 @@ CONSENSUSES = ("ratio", *AVERAGING_RULES, "exact")
 PROFILES: dict[str, dict[str, Any]] = {
     "default": {},
     # The paper's, from its published runs (MODEL 7): a loose random walk, its 0.5 m a step of 0.1 s read as uniform
-    # in ±0.5 m (docs/paper.md says why), lanes bounded on one side and counted anew each step, after the particles of this very step have been stacked.
+    # in ±0.5 m (docs/paper.md says why), lanes bounded on one side and counted anew each step, after the particles
+    # of this very step have been stacked.
     "paper": {
         "particles": 50,
         "exchange": "particles",
