@@ -22,12 +22,12 @@ from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from emulator.channel.stages import Topology
-from emulator.world.world import build_world, components
+from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
 from vnet.errors import VnetError
 from vnet.roads.lanes import Array
-from vnet.scenario import Scenario
+from vnet.scenario import Radio, Scenario
 
 Links = NDArray[np.bool_]
 FASTEST = "fastest-mixing"
@@ -44,8 +44,8 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     and both for each component by itself, where x̄ is the component's mean. `run`, a run's folder, adds `measured`.
     Raises VnetError where the network or the run cannot be used.
     """
-    hears = hears_matrix(scenario)
     world = build_world(scenario)
+    hears = hears_matrix(scenario.radio, world)
     weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
     result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
     if run is not None:
@@ -111,10 +111,8 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 # Graphs.
 
 
-def hears_matrix(scenario: Scenario) -> Links:
+def hears_matrix(radio: Radio, world: World) -> Links:
     """Who (row) hears whom (column) at the start, (N, N): range or links, and the peer cap."""
-    world = build_world(scenario)
-    radio = scenario.radio
     topology = Topology(world.at(0).position_m, radio.range_m, radio.max_peers, world.links)
     return np.asarray(topology.admitted.T)
 

@@ -79,7 +79,7 @@ def run_consensus(networks_folder: Path | None, seeds: Sequence[int], out: Path)
 
 def study_network(network: dict[str, Any], seeds: Sequence[int], out: Path, rounds: int = ROUNDS) -> Path:
     """The same on any `[network]`, and for so many rounds. Raises VnetError if the network is not connected."""
-    linked = mutual(hears_matrix(_scenario(network, "ratio", seeds[0], rounds)))
+    _, linked = graph(network)
     if not is_connected(linked):
         raise VnetError("the consensus study needs a network that is connected: its error is that of one mean")
     cells = consensus_cells(network, seeds, rounds)
@@ -102,6 +102,7 @@ def study_network(network: dict[str, Any], seeds: Sequence[int], out: Path, roun
 
 def consensus_cells(network: dict[str, Any], seeds: Sequence[int], rounds: int = ROUNDS) -> list[Cell]:
     """All runs of the study: each varies one thing, for each rule and seed."""
+    node_ids, linked = graph(network)
     cells = []
     for rule in RULES:
         for seed in seeds:
@@ -109,11 +110,18 @@ def consensus_cells(network: dict[str, Any], seeds: Sequence[int], rounds: int =
                 cells.append(_cell("loss", network, rule, seed, rounds, {"loss": loss}))
             for latency_ms in LATENCIES_MS:
                 cells.append(_cell("delay", network, rule, seed, rounds, {"latency_ms": latency_ms}))
-            links = one_way_links(mutual(hears_matrix(_scenario(network, rule, seed, rounds))), seed)
-            radio = {"links": links.astype(int).tolist()}
+            radio = {"links": one_way_links(linked, seed).astype(int).tolist()}
             cells.append(_cell("one-way links", network, rule, seed, rounds, radio))
-            cells.append(_cell("churn", network, rule, seed, rounds, {}, silent_vehicles(network, seed)))
+            silent = silent_vehicles(node_ids, linked, seed)
+            cells.append(_cell("churn", network, rule, seed, rounds, {}, silent))
     return cells
+
+
+def graph(network: dict[str, Any]) -> tuple[tuple[str, ...], Links]:
+    """The vehicles of a `[network]`, and who of them are linked, (N, N)."""
+    scenario = _scenario(network, "ratio", 1, 0)
+    world = build_world(scenario)
+    return world.node_ids, mutual(hears_matrix(scenario.radio, world))
 
 
 def _cell(
@@ -172,11 +180,8 @@ def one_way_links(linked: Links, seed: int) -> Links:
     return hears
 
 
-def silent_vehicles(network: dict[str, Any], seed: int) -> dict[str, list[float]]:
+def silent_vehicles(node_ids: Sequence[str], linked: Links, seed: int) -> dict[str, list[float]]:
     """A tenth of the vehicles, away for a while (`AWAY_S`); those who stay are still connected."""
-    scenario = _scenario(network, "ratio", seed, ROUNDS)
-    node_ids = build_world(scenario).node_ids
-    linked = mutual(hears_matrix(scenario))
     away: list[int] = []
     for number in np.random.default_rng([seed, 2]).permutation(len(node_ids)).tolist():
         stay = np.setdiff1d(np.arange(len(node_ids)), [*away, number])

@@ -85,37 +85,37 @@ def _table1_summary(results: Sequence[Result]) -> str:
 def table2(results: Sequence[Result]) -> str:
     """Table II: RMSE of each mechanism on each network, lanes bounded on one side (the paper's) and on two."""
     parts = ["# Table II: RMSE of the common error [m], the paper's profile"]
-    networks = unique(results, "network")
-    for sides, title in ((1, "Lanes bounded on one side, as the paper's"), (2, "Lanes bounded on both sides")):
-        rows = []
-        for mechanism in unique(results, "mechanism"):
-            row = [mechanism]
-            for network in networks:
-                found = select(results, network=network, mechanism=mechanism, sides=sides)
-                row.append(mean_and_error(column(found, "stacked_rmse_m")))
-                row.append(f"{PAPER_TABLE2[mechanism][network]:.2f}" if mechanism in PAPER_TABLE2 else "–")
-            rows.append(row)
-        rows.append(_ratio_row(results, networks, sides))
-        header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
-        parts += [f"## {title}", markdown_table(header, rows)]
-    parts.append(
-        f"{len(unique(results, 'seed'))} seeds, ± standard error; 10 s, estimates right after stacking. "
-        "The paper's figures contain a floor of about 0.6 m from constant lateral offsets, which is left out here."
-    )
+    for sides, name, title in (
+        (1, "stacked_rmse_m", "Lanes bounded on one side, as the paper's; right after stacking"),
+        (1, "rmse_m", "The same at the end of the period, once the roads have weighed the stack"),
+        (2, "stacked_rmse_m", "Lanes bounded on both sides; right after stacking"),
+    ):
+        found = [row for row in results if row["sides"] == sides]
+        if found:
+            parts += [f"## {title}", _table2_section(found, name)]
+    parts.append(f"{len(unique(results, 'seed'))} seeds, ± standard error; 10 s.")
     return "\n\n".join(parts) + "\n"
 
 
-def _ratio_row(results: Sequence[Result], networks: Sequence[str], sides: int) -> list[str]:
+def _table2_section(results: Sequence[Result], name: str) -> str:
+    networks = unique(results, "network")
+    rows = []
+    for mechanism in unique(results, "mechanism"):
+        row = [mechanism]
+        for network in networks:
+            row.append(mean_and_error(column(select(results, network=network, mechanism=mechanism), name)))
+            row.append(f"{PAPER_TABLE2[mechanism][network]:.2f}" if mechanism in PAPER_TABLE2 else "–")
+        rows.append(row)
     row = ["random / optimized"]
     for network in networks:
         random, optimized = (
-            column(select(results, network=network, mechanism=m, sides=sides), "stacked_rmse_m")
-            for m in ("random", "optimized")
+            column(select(results, network=network, mechanism=m), name) for m in ("random", "optimized")
         )
         ratio, error = paired_ratio(random, optimized)
         paper = PAPER_TABLE2["random"][network] / PAPER_TABLE2["optimized"][network]
         row += [f"{ratio:.2f} ± {error:.2f}", f"{paper:.2f}"]
-    return row
+    header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
+    return markdown_table(header, [*rows, row])
 
 
 def default_profile(results: Sequence[Result]) -> str:
@@ -185,7 +185,7 @@ def _paired(results: Sequence[Result], networks: Sequence[str]) -> str:
             common = {r["seed"] for r in one} & {r["seed"] for r in other}
             one, other = ([r for r in some if r["seed"] in common] for some in (one, other))
             difference, error = paired_difference(column(one, "rmse_m"), column(other, "rmse_m"))
-            row.append(f"{difference:+.3f} ± {error:.3f} ({len(common)} seeds)")
+            row.append(f"{difference:+.3f} ± {error:.3f} ({len(common)} seeds)" if common else "–")
         rows.append(row)
     return "\n".join(lines) + "\n" + markdown_table(["", *(n.upper() for n in networks)], rows)
 
