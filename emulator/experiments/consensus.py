@@ -275,7 +275,7 @@ def draw(study: Study, models: dict[str, Array], path: Path) -> None:
     from matplotlib.figure import Figure
 
     with rc_context({"svg.hashsalt": "vnet", "svg.fonttype": "none", "font.size": 10}):
-        figure = Figure(figsize=(11, 4.6), layout="constrained")
+        figure = Figure(figsize=(11, 5.4), layout="constrained")
         left, right = figure.subplots(1, 2)
         _draw_rounds(left, study, models)
         _draw_loss(right, study)
@@ -288,13 +288,15 @@ def _draw_rounds(axes: Any, study: Study, models: dict[str, Array]) -> None:
     for rule in RULES:
         errors = study.select(study="loss", rule=rule, loss=0.0)
         axes.plot(_geometric_mean(errors), color=COLOURS[rule], linewidth=2, label=f"{rule}, measured")
-        axes.plot(model_error(models[rule], rounds), "--", color=COLOURS[rule], linewidth=1, label="linear model")
+        axes.plot(
+            model_error(models[rule], rounds), "--", color=COLOURS[rule], linewidth=1, label=f"{rule}, linear model"
+        )
     if FASTEST in models:
         error = model_error(models[FASTEST], rounds)
         axes.plot(error, ":", color=COLOURS[FASTEST], linewidth=1.5, label=f"{FASTEST} weights, linear model")
     _finish(axes, "rounds, one every 0.1 s", f"{len(study.linked)} vehicles, no loss")
     axes.set_xlim(0, rounds)
-    axes.set_ylim(1e-10, 2)
+    axes.set_ylim(1e-10, 20)
 
 
 def _draw_loss(axes: Any, study: Study) -> None:
@@ -316,7 +318,7 @@ def _finish(axes: Any, label: str, title: str) -> None:
     axes.set_ylabel("consensus error / spread of the inputs (no unit)")
     axes.set_title(title)
     axes.grid(True, which="major", alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
 
 
 def _geometric_mean(errors: Array) -> Any:

@@ -144,13 +144,16 @@ def test_a_study_leaves_a_table_its_numbers_and_a_picture(tmp_path: Path, monkey
     monkeypatch.setattr(subject, "has_cvxpy", lambda: False)
     monkeypatch.setattr(subject, "LOSSES", (0.0, 0.3))
     monkeypatch.setattr(subject, "LATENCIES_MS", (150.0,))
-    network = {"kind": "generated", "vehicles": 5}
+    places = [(0, 0), (2000, 0), (4000, 0), (2000, 2000), (0, 2000)]
+    rows = [f"v{number},{x},{y},0" for number, (x, y) in enumerate(places)]
+    (tmp_path / "five.csv").write_text("\n".join(["id,x_m,y_m,heading_rad", *rows]))
+    network = {"kind": "file", "path": str(tmp_path / "five.csv")}
     path = study_network(network, [1, 2], tmp_path, rounds=55)
     text = path.read_text()
-    rows = pq.read_table(tmp_path / "consensus.parquet").to_pylist()
-    assert len(rows) == 3 * 2 * (2 + 1 + 2)
-    assert {"study", "rule", "loss", "latency_ms", "seed", "convergence_factor"} <= set(rows[0])
-    assert {"error_50", "error_55"} <= set(rows[0])
+    results = pq.read_table(tmp_path / "consensus.parquet").to_pylist()
+    assert len(results) == 3 * 2 * (2 + 1 + 2)
+    assert {"study", "rule", "loss", "latency_ms", "seed", "convergence_factor"} <= set(results[0])
+    assert {"error_50", "error_55"} <= set(results[0])
     assert "| loss 30% | ratio | " in text and "| delay 150 ms | metropolis | " in text
     assert "| one-way links | max-degree | " in text and "| churn | ratio | " in text
     assert text.count("cvxpy is not installed") == 1
