@@ -1,14 +1,15 @@
 """The cells of an experiment: one run each, many at once, never the same one twice.
 
 A cell is a scenario and the labels of its place in a table. What is kept of a run is its metrics, period by period,
-and a few figures; the file of a finished cell bears the digest of its scenario, so that an experiment that was
-interrupted goes on where it stopped, and one whose scenario has changed runs anew.
+and a few figures; the file of a finished cell bears the digest of its scenario and of the code, so that an
+experiment that was interrupted goes on where it stopped, and one whose scenario or program has changed runs anew.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
+import importlib.util
 import json
 import os
 import tempfile
@@ -16,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from importlib.metadata import version
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,22 @@ class Cell:
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        text = json.dumps([FORMAT, version("vnet-emulator"), self.from_s, dump_scenario(self.scenario)])
+        code = code_digest(self.scenario.program.entry)
+        text = json.dumps([FORMAT, code, self.from_s, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@cache
+def code_digest(entry: str) -> str:
+    """SHA-256 of the code that a result depends on: vnet, the emulator, and the package of the program `entry`."""
+    digest = hashlib.sha256()
+    for package in ("vnet", "emulator", entry.partition(":")[0].partition(".")[0]):
+        spec = importlib.util.find_spec(package)
+        for folder in (spec.submodule_search_locations or []) if spec else []:
+            for path in sorted(Path(folder).rglob("*.py")):
+                if "experiments" not in path.parts:
+                    digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def run_cells(

@@ -206,9 +206,9 @@ AVERAGING_RULES = ("metropolis", "max-degree")
 class AveragingConsensus:
     """x_i += Σ_j (x_j − x_i) / max(D_i, D_j) over the peers that hear each other (Xiao and Boyd 2004).
 
-    Under `metropolis` D_i is the degree of the node, under `max-degree` the largest of the network as far as word
-    of it has come; both count the node itself, as the paper does. Both ends of a link weigh it by what they last
-    broadcast, so that without loss the mean stays what it is even while word spreads. Loss moves it. Raises
+    Under `metropolis` D_i is the number of nodes that it hears, under `max-degree` the largest of the network as far
+    as word of it has come; both count the node itself, as the paper does. Both ends of a link weigh it by what they
+    last broadcast, so that without loss the mean stays what it is even while word spreads. Loss moves it. Raises
     VnetError for another rule.
     """
 
@@ -235,7 +235,9 @@ class AveragingConsensus:
         if self._state is not None and self._input is not None:
             pull = sum((_towards(self._state, self._degree, other) for other in said.values()), np.zeros(2))
             state = self._state + pull + (value - self._input)
-        own_degree = 1.0 + len(mutual)
+        # All who are heard count, not only those known to hear this node: of whom that is known late, and a first
+        # step with too small a degree is a leap that loss makes lopsided.
+        own_degree = 1.0 + len(self._peers.heard)
         if self._rule == "max-degree":
             self._degree = max([self._degree, own_degree, *(degree for _, _, degree in said.values())])
         else:
