@@ -206,10 +206,10 @@ AVERAGING_RULES = ("metropolis", "max-degree")
 class AveragingConsensus:
     """x_i += Σ_j (x_j − x_i) / max(D_i, D_j) over the peers that hear each other (Xiao and Boyd 2004).
 
-    Under `metropolis` D_i is the number of nodes that it hears, under `max-degree` the largest of the network as far
-    as word of it has come; both count the node itself, as the paper does. Both ends of a link weigh it by what they
-    last broadcast, so that without loss the mean stays what it is even while word spreads. Loss moves it. Raises
-    VnetError for another rule.
+    Under `metropolis` D_i is the number of nodes that it hears, under `max-degree` the largest of the network as
+    far as word of it has come; both count the node itself, as the paper does. Both ends of a link weigh it by what
+    they last broadcast, so that without loss the mean stays what it is even while word spreads. Loss moves it.
+    Raises VnetError for another rule.
     """
 
     def __init__(self, node: str, rule: str, config: ConsensusConfig | None = None) -> None:
