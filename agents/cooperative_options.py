@@ -71,7 +71,7 @@ class Options:
     roads_apart: bool = False
     two_frames: bool = False
     hears: dict[str, list[str]] = field(default_factory=dict)
-    slots: int = 8
+    slots: int = 2
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
