@@ -24,7 +24,7 @@ import zenoh
 from vnet.errors import LinkError, ProgramError, VnetError
 from vnet.link import keys, wire
 from vnet.link.access import Credentials
-from vnet.link.hosting import Host, Program, load_program
+from vnet.link.hosting import Host, Programs, load_programs
 from vnet.link.session import open_client
 from vnet.link.virtual_time import SpinError, VirtualTimeLoop
 
@@ -54,7 +54,7 @@ Item = tuple[bytes, int] | type[_Lost] | type[_Found]
 def run_agent(
     endpoint: str, run: str, nodes: Sequence[str], credentials: Credentials | None, join_timeout_s: float
 ) -> None:
-    """Join `run` at `endpoint` as `nodes` and run their program to the end of the run.
+    """Join `run` at `endpoint` as `nodes` and run their programs to the end of the run.
 
     Raises LinkError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
@@ -63,16 +63,16 @@ def run_agent(
         attachment = _Attachment(session, run, nodes, stack)
         welcomes = attachment.join(join_timeout_s)
         try:
-            program = load_program(welcomes[0].entry)
+            programs = load_programs(welcomes)
         except ProgramError as error:
             attachment.say_hello(failure=str(error))
             raise
         gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
-            _run_lockstep(attachment, welcomes, program)
+            _run_lockstep(attachment, welcomes, programs)
         else:
-            _run_realtime(attachment, welcomes, program)
+            _run_realtime(attachment, welcomes, programs)
 
 
 class _Attachment:
@@ -219,7 +219,7 @@ def _no_wake(payload: bytes) -> None:
     """In lockstep the program's thread waits on the queue itself."""
 
 
-def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
     """Run the programs on a virtual-time loop until the emulator ends the run."""
     seq = 0
 
@@ -243,7 +243,7 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
     asyncio.set_event_loop(loop)
     try:
         next_grant()
-        host.start(loop, program)
+        host.start(loop, programs)
         while True:
             try:
                 loop.run_forever()
@@ -255,18 +255,18 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
         loop.close()
 
 
-def _run_realtime(attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+def _run_realtime(attachment: _Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
     """Run the programs on an ordinary loop, on the wall clock."""
     with asyncio.Runner() as runner:
-        runner.run(_RealTimeAgent(attachment, welcomes, program).main())
+        runner.run(_RealTimeAgent(attachment, welcomes, programs).main())
 
 
 class _RealTimeAgent:
     """Real time: frames go out as they are sent, batches come in when they are due."""
 
-    def __init__(self, attachment: _Attachment, welcomes: Sequence[wire.Welcome], program: Program) -> None:
+    def __init__(self, attachment: _Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
         self._attachment = attachment
-        self._program = program
+        self._programs = programs
         self._boot_id = welcomes[0].boot_id
         self._origin_ns = time.monotonic_ns()
         self._host = Host(welcomes, self._now_ns, self._schedule_flush)
@@ -350,7 +350,7 @@ class _RealTimeAgent:
             self._origin_ns = batch.origin_ns if same_machine else time.monotonic_ns() + wire.HEAD_START_NS
             self._started = True
             head_start_s = max(0.0, (self._origin_ns - time.monotonic_ns()) / 1e9)
-            self._loop.call_later(head_start_s, self._host.start, self._loop, self._program)
+            self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)
         now_ns = arrived_ns - self._origin_ns
         for packet in batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1

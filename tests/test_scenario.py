@@ -290,3 +290,12 @@ def test_an_empty_file_is_a_valid_scenario(tmp_path: Path) -> None:
 @pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
 def test_every_scenario_that_is_shipped_loads(path: Path) -> None:
     assert load_scenario(path).run.name == path.stem
+
+
+def test_some_vehicles_may_run_another_program(tmp_path: Path) -> None:
+    text = '[program]\nentry = "a:b"\n[[program.exceptions]]\nnodes = ["v1"]\nentry = "c:d"\noptions = {x = 1}\n'
+    program = load_scenario(write(tmp_path, text)).program
+    assert (program.of("v1").entry, program.of("v1").options) == ("c:d", {"x": 1})
+    assert (program.of("v2").entry, program.of("v2").options) == ("a:b", {})
+    with pytest.raises(ScenarioError, match="'v1' is in two exceptions"):
+        load_scenario(write(tmp_path, text + '[[program.exceptions]]\nnodes = ["v1"]\nentry = "c:d"\n'))

@@ -133,8 +133,8 @@ class Radio(Section):
         return links
 
 
-class Program(Section):
-    """`[program]`: what every vehicle runs, as `package.module:function`, and the options it is given."""
+class OneProgram(Section):
+    """A program as `package.module:function`, and the options it is given."""
 
     entry: str = "agents.beacon:main"
     options: dict[str, Any] = {}
@@ -145,6 +145,29 @@ class Program(Section):
         if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", entry):
             raise ValueError("write it as package.module:function")
         return entry
+
+
+class ProgramException(OneProgram):
+    """`[[program.exceptions]]`: `nodes` (ids) that run another program than all others, with options of its own."""
+
+    nodes: tuple[str, ...] = Field(min_length=1)
+
+
+class Program(OneProgram):
+    """`[program]`: what every vehicle runs, but for the `exceptions`."""
+
+    exceptions: tuple[ProgramException, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_program_a_node(self) -> Program:
+        named = [node for exception in self.exceptions for node in exception.nodes]
+        if twice := sorted({node for node in named if named.count(node) > 1}):
+            raise ValueError(f"node {twice[0]!r} is in two exceptions")
+        return self
+
+    def of(self, node: str) -> OneProgram:
+        """What `node` runs."""
+        return next((exception for exception in self.exceptions if node in exception.nodes), self)
 
 
 class Scenario(Section):

@@ -77,13 +77,14 @@ class Emulation:
     def welcome(self, node: str, nonce: bytes, incarnation: int = 0) -> wire.Welcome:
         """All that `node` is told; nothing in it says anything about the truth."""
         scenario = self.scenario
+        program = scenario.program.of(node)
         return wire.Welcome(
             node,
             nonce,
             incarnation,
             scenario.run.pacing,
-            scenario.program.entry,
-            scenario.program.options,
+            program.entry,
+            program.options,
             self.world.lane_map.to_wire(),
             node_seed(scenario.run.seed, node, incarnation),
             self.world.period_ns,

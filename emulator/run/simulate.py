@@ -12,7 +12,7 @@ import time
 from emulator.run.emulation import Emulation
 from emulator.run.pacing import Lockstep
 from vnet.link import wire
-from vnet.link.hosting import Host, Program, load_program
+from vnet.link.hosting import Host, load_programs
 from vnet.link.virtual_time import SpinError, VirtualTimeLoop
 
 _NONCE = b""
@@ -27,13 +27,12 @@ def simulate(emulation: Emulation) -> tuple[float, bool]:
 
     Ctrl-C ends the run early, with the event `interrupted`. Raises ProgramError if the program cannot be loaded.
     """
-    program = load_program(emulation.scenario.program.entry)
     simulation = _Simulation(emulation)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
     try:
-        simulation.run(program)
+        simulation.run()
     except KeyboardInterrupt:
         interrupted = True
         emulation.folder.event(simulation.loop.now_ns, "interrupted")
@@ -51,14 +50,15 @@ class _Simulation:
         self._seq = 0
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
+        self._programs = load_programs(welcomes)
         self._host = Host(welcomes, lambda: self.loop.now_ns)
 
-    def run(self, program: Program) -> None:
+    def run(self) -> None:
         """From the first grant to the last."""
         asyncio.set_event_loop(self.loop)
         try:
             self._take(self._lockstep.start())
-            self._host.start(self.loop, program)
+            self._host.start(self.loop, self._programs)
             while True:
                 try:
                     self.loop.run_forever()

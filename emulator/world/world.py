@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from emulator.world.links import load_links
 from emulator.world.networks import Network, generate_network, load_network
+from vnet.errors import ScenarioError
 from vnet.link.node import Fix
 from vnet.roads.lanes import Array, LaneMap
 from vnet.scenario import NS_PER_S, Gnss, Scenario
@@ -43,7 +44,7 @@ class World:
     """All that is true during a run. `lane_map` is what vehicles may know; `lane_of` (N,) is their secret.
 
     `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. Raises ScenarioError
-    if the scenario's links do not fit the network.
+    if the scenario's links or exceptions do not fit the network.
     """
 
     def __init__(self, scenario: Scenario, network: Network) -> None:
@@ -51,6 +52,7 @@ class World:
         count = len(network.node_ids)
         self.node_ids = network.node_ids
         self.links = load_links(scenario.radio, count)
+        _check_exceptions(scenario, network)
         self.period_ns = scenario.period_ns
         self.periods = math.ceil(scenario.duration_ns / scenario.period_ns) + 1
         order = _stream(seed, "map order", 0).permutation(count)
@@ -125,6 +127,14 @@ class World:
             noisy = self._network.heading_rad[node] + self._heading_noise[period, node]
             heading = float(np.mod(noisy, 2 * np.pi))
         return Fix(period * self.period_ns, fix_m, np.eye(2) * self._gnss.sigma_m**2, heading)
+
+
+def _check_exceptions(scenario: Scenario, network: Network) -> None:
+    for exception in scenario.program.exceptions:
+        for node in exception.nodes:
+            if node not in network.node_ids:
+                some = ", ".join(network.node_ids[:8]) + (", …" if len(network.node_ids) > 8 else "")
+                raise ScenarioError(f"program.exceptions: {node!r} is no vehicle of the network; they are {some}")
 
 
 def build_world(scenario: Scenario) -> World:

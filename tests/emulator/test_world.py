@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.world.world import World, build_world, components
+from vnet.errors import ScenarioError
 from vnet.scenario import Scenario, load_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -270,3 +271,9 @@ def test_the_dense_scenario_exercises_the_cap() -> None:
     distance_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
     degrees = (distance_m <= dense.radio.range_m).sum(axis=0) - 1
     assert (degrees > dense.radio.max_peers).mean() > 0.5
+
+
+def test_an_exception_for_a_vehicle_that_is_not_there_is_refused() -> None:
+    program = {"exceptions": [{"nodes": ["nobody"], "entry": "agents.beacon:main"}]}
+    with pytest.raises(ScenarioError, match="'nobody' is no vehicle of the network; they are "):
+        build_world(Scenario.model_validate({"network": {"vehicles": 3}, "program": program}))

@@ -58,7 +58,7 @@ class World:
         return now_ns
 
     def run(self, program: Program) -> None:
-        self.host.start(self.loop, program)
+        self.host.start(self.loop, dict.fromkeys(self.host.nodes, program))
         try:
             while True:
                 try:

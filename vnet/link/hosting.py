@@ -15,7 +15,7 @@ import sys
 import traceback
 import weakref
 from collections import deque
-from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from vnet.errors import ProgramError
@@ -25,6 +25,8 @@ from vnet.link.virtual_time import LoopAbandonedError, SpinError, VirtualTimeLoo
 from vnet.roads.lanes import LaneMap
 
 Program = Callable[[Node], Awaitable[None]]
+Programs = Mapping[str, Program]
+"""What each node runs, by id."""
 
 _current_node: contextvars.ContextVar[str | None] = contextvars.ContextVar("vnet_node", default=None)
 
@@ -42,6 +44,11 @@ def load_program(entry: str) -> Program:
     if not asyncio.iscoroutinefunction(program):
         raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
     return program  # type: ignore[no-any-return]
+
+
+def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
+    """The program of each node that is welcome. Raises ProgramError."""
+    return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
 
 
 def fix_hash_seed(module: str) -> None:
@@ -109,14 +116,14 @@ class Host:
 
     # What the transport asks of the host.
 
-    def start(self, loop: asyncio.AbstractEventLoop, program: Program) -> None:
+    def start(self, loop: asyncio.AbstractEventLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""
         self._loop = loop
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
             context = contextvars.copy_context()
             context.run(_current_node.set, node.id)
-            loop.create_task(self._run(node, program), name=f"{node.id} main", context=context)
+            loop.create_task(self._run(node, programs[node.id]), name=f"{node.id} main", context=context)
 
     def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
         """Put packets, then fixes, into the mailboxes."""
