@@ -15,27 +15,25 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from vnet.errors import ScenarioError
+from vnet.faults import Fault
+from vnet.sections import Section, first_problem
 
 NS_PER_S = 1_000_000_000
-LONGEST_SHOWN = 100
-"""How many characters of a wrong value a message shows."""
-
-
-class Section(BaseModel):
-    """Common behaviour of all sections: immutable, and no key is ignored in silence."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Run(Section):
-    """`[run]`: what the run is called, how long it takes and how patient it is."""
+    """`[run]`: what the run is called, how long it takes and how patient it is.
+
+    Where there are faults, all have healed `settle_s` before the end, so that the network is judged at rest.
+    """
 
     name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
     seed: int = Field(1, ge=0, lt=2**63)
     duration_s: float = Field(30.0, gt=0, le=86_400)
+    settle_s: float = Field(5.0, ge=0)
     pacing: Literal["lockstep", "realtime"] = "lockstep"
     nodes_per_process: int = Field(1, ge=1, le=1000)
     join_timeout_s: float = Field(60.0, gt=0)
@@ -137,7 +135,7 @@ class OneProgram(Section):
     """A program as `package.module:function`, and the options it is given."""
 
     entry: str = "agents.beacon:main"
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("entry")
     @classmethod
@@ -178,6 +176,22 @@ class Scenario(Section):
     world: WorldSection = WorldSection()
     radio: Radio = Radio()
     program: Program = Program()
+    fault: tuple[Fault, ...] = ()
+
+    @model_validator(mode="after")
+    def _faults_start_in_time(self) -> Scenario:
+        for number, fault in enumerate(self.fault):
+            if fault.at_s >= self.healed_s:
+                raise ValueError(
+                    f"fault.{number}.at_s = {fault.at_s:g}: must be less than {self.healed_s:g}, which is "
+                    "run.duration_s - run.settle_s"
+                )
+        return self
+
+    @property
+    def healed_s(self) -> float:
+        """When all faults have healed, in emulated seconds."""
+        return self.run.duration_s - self.run.settle_s
 
     @property
     def duration_ns(self) -> int:
@@ -208,7 +222,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     try:
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
-        raise ScenarioError(f"{path}: {_first_problem(error)}") from None
+        raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
     scenario = _with_absolute_paths(scenario, path)
     for name, digest in input_digests(scenario).items():
         if recorded_digests.get(name, digest) != digest:
@@ -264,28 +278,3 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
         if not isinstance(table, dict):
             raise ScenarioError(f"--set {override}: {part} is not a section")
     table[parts[-1]] = value
-
-
-def _first_problem(error: ValidationError) -> str:
-    """The first of pydantic's complaints as `key = value: what is allowed`."""
-    problem = error.errors()[0]
-    key = ".".join(str(part) for part in problem["loc"])
-    if problem["type"] == "extra_forbidden":
-        return f"{key}: unknown key; allowed here: {', '.join(_allowed_keys(problem['loc'][:-1]))}"
-    message = problem["msg"].removeprefix("Value error, ")
-    message = message[0].lower() + message[1:]
-    if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
-        return f"{key}: {message}"
-    value = repr(problem["input"])
-    if len(value) > LONGEST_SHOWN:  # a whole matrix
-        value = f"{value[:LONGEST_SHOWN]}…"
-    return f"{key} = {value}: {message}"
-
-
-def _allowed_keys(section: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] = Scenario
-    for name in section:
-        annotation = model.model_fields[str(name)].annotation
-        assert isinstance(annotation, type)
-        model = annotation
-    return sorted(model.model_fields)

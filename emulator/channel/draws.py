@@ -22,11 +22,11 @@ class Draws:
         self._generator = np.random.Generator(self._bits)
         self._state = self._bits.state
 
-    def uniform(self, sender: int, seq: int, count: int) -> NDArray[np.float64]:
-        """`count` draws in [0, 1) for one frame, to be indexed by receiver number."""
+    def uniform(self, sender: int, seq: int, count: int, copy: int = 0) -> NDArray[np.float64]:
+        """`count` draws in [0, 1) for one frame, or a copy of it, to be indexed by receiver number."""
         # Setting the counter of one generator is four times as fast as making one for each frame.
         state = self._state
-        state["state"]["counter"][:] = (0, seq, sender, 0)
+        state["state"]["counter"][:] = (0, seq, sender, copy)
         state["buffer_pos"] = 4
         state["has_uint32"] = 0
         self._bits.state = state

@@ -8,8 +8,8 @@ state of two receivers, so that the engine can be split by receiver; the transmi
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,43 +19,57 @@ from emulator.channel.outcomes import Outcome
 from vnet.scenario import Radio
 
 NS_PER_MS = 1_000_000
+NO_CAUSE = -1
 MIN_LATENCY_NS = 1_000
 """No exchange without time passing: every pair's latency is at least a microsecond."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One broadcast as the channel sees it; `sender` is a receiver number, `seq` counts the sender's frames."""
+    """One broadcast as the channel sees it; `sender` is a receiver number, `seq` counts the sender's frames.
+
+    `copy` counts the times that a frame is sent again (by a fault); such a copy has a row, and luck, of its own.
+    """
 
     sender: int
     seq: int
     sent_ns: int
     size_bytes: int
+    copy: int = 0
 
 
 @dataclass(slots=True)
 class Pairs:
     """The pairs of one frame with every receiver: arrays indexed by receiver number.
 
-    `outcome` (N,) of `Outcome`; `arrival_ns` (N,) is when the frame arrives where it does; `cause` names the
-    fault behind an outcome `fault`.
+    `outcome` (N,) of `Outcome`; `arrival_ns` (N,) is when the frame arrives where it does; `cause` (N,) is the
+    number of the fault behind an outcome `fault`, or behind changed bytes, else NO_CAUSE. `copies` are pairs that
+    arrive once more: which (N,), how much later in ns, and by which fault. `flips` are bytes that change on the
+    way, by receiver: places, and what they are xored with.
     """
 
     outcome: NDArray[np.uint8]
     arrival_ns: NDArray[np.int64]
-    cause: str = ""
+    cause: NDArray[np.int16]
+    copies: list[tuple[NDArray[np.bool_], int, int]] = field(default_factory=list)
+    flips: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
 
-    def decide(self, which: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
-        """Give `outcome` to those of `which` that are still pending."""
-        self.outcome[(self.outcome == Outcome.pending) & which] = outcome
+    @classmethod
+    def of(cls, frame: Frame, count: int) -> Pairs:
+        """The pairs of a frame with `count` nodes, nothing decided."""
+        sent_ns = np.full(count, frame.sent_ns, np.int64)
+        return cls(np.zeros(count, np.uint8), sent_ns, np.full(count, NO_CAUSE, np.int16))
+
+    def decide(self, which: NDArray[np.bool_] | bool, outcome: Outcome, cause: int = NO_CAUSE) -> None:
+        """Give `outcome`, by fault number `cause`, to those of `which` that are still pending."""
+        decided = (self.outcome == Outcome.pending) & which
+        self.outcome[decided] = outcome
+        if cause != NO_CAUSE:
+            self.cause[decided] = cause
 
 
-class Stage(Protocol):
-    """One step of the channel."""
-
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
-        """Decide pairs, or change when they arrive."""
-        ...
+Stage = Callable[[Frame, Pairs], None]
+"""One step of the channel: decides pairs, or changes when they arrive."""
 
 
 class Topology:
@@ -81,8 +95,8 @@ class Topology:
     def move(self, position_m: NDArray[np.float64]) -> None:
         """Take new positions."""
         offset_m = position_m[:, None, :] - position_m[None, :, :]
-        self._distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
-        self.in_range = self._distance_m <= self._range_m if self._links is None else self._links.T.copy()
+        self.distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
+        self.in_range = self.distance_m <= self._range_m if self._links is None else self._links.T.copy()
         np.fill_diagonal(self.in_range, False)
         self._rank()
 
@@ -98,7 +112,7 @@ class Topology:
     def _rank(self) -> None:
         """`admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
         candidate = self.in_range & self._up[:, None]
-        distance_m = np.where(candidate, self._distance_m, np.inf)
+        distance_m = np.where(candidate, self.distance_m, np.inf)
         order = np.argsort(distance_m, axis=0, kind="stable")  # ties go to the lower number
         rank = np.empty_like(order)
         np.put_along_axis(rank, order, np.arange(len(order))[:, None], axis=0)
@@ -111,7 +125,7 @@ class InRange:
     def __init__(self, topology: Topology) -> None:
         self._topology = topology
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `out_of_range`."""
         pairs.decide(~self._topology.in_range[frame.sender], Outcome.out_of_range)
 
@@ -122,7 +136,7 @@ class PayloadLimit:
     def __init__(self, max_payload_bytes: int) -> None:
         self._max_payload_bytes = max_payload_bytes
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `oversize`."""
         if frame.size_bytes > self._max_payload_bytes:
             pairs.decide(True, Outcome.oversize)
@@ -131,19 +145,20 @@ class PayloadLimit:
 class TransmitQueue:
     """The sender's own queue: random access delay, airtime at `radio.bitrate_mbps`, at most `queue_frames` waiting.
 
-    Sets the arrival to the end of the transmission.
+    Sets the arrival to the end of the transmission. `throttled_mbps` is the bitrate of senders that a fault slows.
     """
 
     def __init__(self, seed: int, radio: Radio) -> None:
         self._draws = Draws(seed, "access")
         self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
-        self._ns_per_byte = 8_000 / radio.bitrate_mbps
+        self._bitrate_mbps = radio.bitrate_mbps
+        self.throttled_mbps: dict[int, float] = {}
         self._max_payload_bytes = radio.max_payload_bytes
         self._limit = radio.queue_frames
         self._starts_ns: dict[int, deque[int]] = {}
         self._busy_until_ns: dict[int, int] = {}
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `queue_full`, or when the frame has left the sender."""
         if frame.size_bytes > self._max_payload_bytes:  # never got as far as the queue
             return
@@ -153,9 +168,10 @@ class TransmitQueue:
         if len(waiting) >= self._limit:
             pairs.decide(True, Outcome.queue_full)
             return
-        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1)[0])
+        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.copy)[0])
         start_ns = max(frame.sent_ns + jitter_ns, self._busy_until_ns.get(frame.sender, 0))
-        end_ns = start_ns + round(frame.size_bytes * self._ns_per_byte)
+        bitrate_mbps = min(self._bitrate_mbps, self.throttled_mbps.get(frame.sender, self._bitrate_mbps))
+        end_ns = start_ns + round(frame.size_bytes * 8_000 / bitrate_mbps)
         waiting.append(start_ns)
         self._busy_until_ns[frame.sender] = end_ns
         pairs.arrival_ns[:] = end_ns
@@ -167,7 +183,7 @@ class PeerCap:
     def __init__(self, topology: Topology) -> None:
         self._topology = topology
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `peer_cap`."""
         pairs.decide(~self._topology.admitted[frame.sender], Outcome.peer_cap)
 
@@ -179,10 +195,10 @@ class Loss:
         self._draws = Draws(seed, "loss")
         self._loss = loss
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `lost`."""
         if self._loss > 0:
-            draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome))
+            draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.copy)
             pairs.decide(draws < self._loss, Outcome.lost)
 
 
@@ -195,23 +211,11 @@ class Latency:
         self._jitter_ns = radio.jitter_ms * NS_PER_MS
         self._tick_ns = radio.delivery_tick_us * 1_000
 
-    def apply(self, frame: Frame, pairs: Pairs) -> None:
+    def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Set when each pair arrives."""
-        draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome))
+        draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.copy)
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = pairs.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
         pairs.arrival_ns = arrival_ns
-
-
-def default_chain(radio: Radio, seed: int, topology: Topology) -> list[Stage]:
-    """The paper's radio, as DESIGN 5 has it."""
-    return [
-        InRange(topology),
-        PayloadLimit(radio.max_payload_bytes),
-        TransmitQueue(seed, radio),
-        PeerCap(topology),
-        Loss(seed, radio.loss),
-        Latency(seed, radio),
-    ]

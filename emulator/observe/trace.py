@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from emulator.channel.outcomes import Outcome
+from emulator.channel.stages import NO_CAUSE, Frame
 
 NOT_ARRIVING = -1
 FIRST_ROWS = 1 << 22
@@ -55,41 +56,41 @@ class Trace:
 
     def append(
         self,
-        sent_ns: int,
-        sender: int,
-        seq: int,
+        frame: Frame,
         receivers: NDArray[np.intp],
-        size_bytes: int,
-        payload_digest: int,
+        payload_digest: int | NDArray[np.uint64],
         outcome: NDArray[np.uint8],
         arrival_ns: NDArray[np.int64],
-        cause: str = "",
-        copy: int = 0,
+        cause: NDArray[np.int16],
     ) -> int:
-        """Add the rows of one frame, one a receiver; returns the number of the first."""
+        """Add the rows of one frame, one a receiver; returns the number of the first.
+
+        `payload_digest` is of what arrives; `cause` are numbers of faults, whose names `name_cause` has told.
+        """
         first, end = self._count, self._count + len(receivers)
         if end > len(self._rows):
             grown = np.zeros(max(2 * len(self._rows), end), dtype=_ROW)
             grown[:first] = self._rows[:first]
             self._rows = grown
         rows = self._rows[first:end]
-        rows["sent_ns"] = sent_ns
-        rows["sender"] = sender
-        rows["seq"] = seq
+        rows["sent_ns"] = frame.sent_ns
+        rows["sender"] = frame.sender
+        rows["seq"] = frame.seq
         rows["receiver"] = receivers
-        rows["size_bytes"] = size_bytes
+        rows["size_bytes"] = frame.size_bytes
         rows["payload_digest"] = payload_digest
         rows["outcome"] = outcome
-        rows["cause"] = self._cause_number(cause)
+        rows["cause"] = cause - NO_CAUSE
         rows["arrival_ns"] = np.where(outcome == Outcome.pending, arrival_ns, NOT_ARRIVING)
-        rows["copy"] = copy
+        rows["copy"] = frame.copy
         self._count = end
         return first
 
-    def _cause_number(self, cause: str) -> int:
-        if cause not in self._causes:
-            self._causes.append(cause)
-        return self._causes.index(cause)
+    def name_cause(self, number: int, name: str) -> None:
+        """Say what fault `number` is called."""
+        missing = number + 2 - len(self._causes)
+        self._causes += [""] * missing
+        self._causes[number - NO_CAUSE] = name
 
     def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
         """Give rows their outcome."""

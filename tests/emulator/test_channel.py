@@ -11,6 +11,7 @@ from scipy.stats import binom
 from emulator.channel.draws import Draws
 from emulator.channel.outcomes import Outcome
 from emulator.channel.stages import (
+    NO_CAUSE,
     Frame,
     InRange,
     Latency,
@@ -21,8 +22,8 @@ from emulator.channel.stages import (
     Stage,
     Topology,
     TransmitQueue,
-    default_chain,
 )
+from emulator.engine import Engine
 from vnet.scenario import Radio
 
 MS = 1_000_000
@@ -37,13 +38,13 @@ def radio(**changes: float) -> Radio:
 
 def pairs(count: int, sent_ns: int = 0, outcome: Sequence[Outcome] | None = None) -> Pairs:
     decided = np.zeros(count, np.uint8) if outcome is None else np.array(outcome, np.uint8)
-    return Pairs(decided, np.full(count, sent_ns, np.int64))
+    return Pairs(decided, np.full(count, sent_ns, np.int64), np.full(count, NO_CAUSE, np.int16))
 
 
 def sent(stage: Stage, count: int, seq: int = 0, sender: int = 0, sent_ns: int = 0, size: int = 100) -> Pairs:
     """One frame through one stage."""
     result = pairs(count, sent_ns)
-    stage.apply(Frame(sender, seq, sent_ns, size), result)
+    stage(Frame(sender, seq, sent_ns, size), result)
     return result
 
 
@@ -74,11 +75,12 @@ def test_seed_stage_sender_and_sequence_each_give_other_draws() -> None:
 
 
 def test_a_pair_that_is_decided_stays_decided() -> None:
-    chain = default_chain(radio(loss=1.0, max_payload_bytes=10), 1, Topology(np.zeros((3, 2)), 3000.0, 1))
+    strict = radio(loss=1.0, max_payload_bytes=10, max_peers=1)
+    chain = Engine(["a", "b", "c"], strict, 1, np.zeros((3, 2)), None).chain
     for decided in set(Outcome) - {Outcome.pending}:
         for stage in chain:
             subject = pairs(3, outcome=[decided] * 3)
-            stage.apply(Frame(0, 0, 0, 11), subject)
+            stage(Frame(0, 0, 0, 11), subject)
             assert subject.outcome.tolist() == [decided] * 3
 
 

@@ -1,0 +1,166 @@
+"""The plan of a run's faults: which act at an instant, and when that changes next.
+
+What acts is always worked out from the plan and the time, never by doing and undoing: so faults overlap, and end in
+any order, without leaving anything behind.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from emulator.faults.selectors import Mask, Nodes, links_of, select, severed_by
+from vnet.errors import ScenarioError
+from vnet.faults import Fault, Infrastructure, LinkFault, NodeFault, Partition, Swizzle
+from vnet.scenario import NS_PER_S, Scenario
+
+
+@dataclass(frozen=True)
+class PlannedFault:
+    """A fault with its place in the plan, the instants [start, end) between which it acts, and where.
+
+    `nodes` (N,) are those selected; `links` (N, N), rows are senders, those it acts on; None for faults of nodes.
+    """
+
+    number: int
+    fault: Fault
+    start_ns: int
+    end_ns: int
+    nodes: Mask
+    links: Mask | None
+
+    @property
+    def label(self) -> str:
+        """Its name in trace, events and commands, for example `partition-0`."""
+        return f"{self.fault.kind}-{self.number}"
+
+    def acts_at(self, time_ns: int) -> bool:
+        """Whether it acts at this instant."""
+        return self.start_ns <= time_ns < self.end_ns
+
+
+class FaultPlan:
+    """All faults of a run, those that have been and those to come. Raises ScenarioError if one does not fit."""
+
+    def __init__(self, scenario: Scenario, nodes: Nodes) -> None:
+        self._seed = scenario.run.seed
+        self._healed_ns = round(scenario.healed_s * NS_PER_S)
+        self._nodes = nodes
+        self._groups = scenario.run.nodes_per_process
+        self.faults: list[PlannedFault] = []
+        for fault in scenario.fault:
+            self.add(fault)
+
+    def add(self, fault: Fault) -> PlannedFault:
+        """Plan one more fault; it is cut short where the network must be at rest. Raises ScenarioError."""
+        number = len(self.faults)
+        start_ns = round(fault.at_s * NS_PER_S)
+        if start_ns >= self._healed_ns:
+            limit_s = self._healed_ns / NS_PER_S
+            raise ScenarioError(f"{fault.kind}: at_s = {fault.at_s:g}: must be less than {limit_s:g}")
+        end_ns = min(start_ns + max(1, round(fault.duration_s * NS_PER_S)), self._healed_ns)
+        rng = stream(self._seed, number, "select")
+        try:
+            nodes, links = _places(fault, self._nodes, rng)
+        except ScenarioError as error:
+            raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
+        planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links)
+        self._refuse_parts_of_processes(planned)
+        self.faults.append(planned)
+        return planned
+
+    def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
+        """Nodes of one process live, pause and die together."""
+        if planned.fault.kind not in ("kill", "restart", "pause"):
+            return
+        for start in range(0, len(planned.nodes), self._groups):
+            part = planned.nodes[start : start + self._groups]
+            if part.any() and not part.all():
+                ids = self._nodes.ids[start : start + self._groups]
+                named = [node for node, chosen in zip(ids, part, strict=True) if chosen]
+                others = [node for node, chosen in zip(ids, part, strict=True) if not chosen]
+                raise ScenarioError(
+                    f"{planned.label}: {', '.join(named)} shares a process with {', '.join(others)}: "
+                    "name them all, or set run.nodes_per_process = 1"
+                )
+
+    def heal(self, label: str, time_ns: int) -> PlannedFault:
+        """End a fault at `time_ns` at the latest; healing twice is harmless. Raises ScenarioError for no such."""
+        for number, planned in enumerate(self.faults):
+            if planned.label == label:
+                healed = replace(planned, end_ns=max(planned.start_ns, min(planned.end_ns, time_ns)))
+                self.faults[number] = healed
+                return healed
+        known = ", ".join(planned.label for planned in self.faults) or "none"
+        raise ScenarioError(f"no fault {label!r}; there are: {known}")
+
+    def next_change_ns(self, after_ns: int) -> int | None:
+        """When next, after this instant, a fault starts or ends (a swizzle: or a node of it comes or goes)."""
+        changes = (t for planned in self.faults for t in _changes(planned, self._seed))
+        return min((t for t in changes if t > after_ns), default=None)
+
+    def active(self, time_ns: int) -> list[PlannedFault]:
+        """Those that act at this instant, in the order of their numbers."""
+        return [planned for planned in self.faults if planned.acts_at(time_ns)]
+
+    def as_written(self) -> tuple[Fault, ...]:
+        """The faults as a scenario states them, with the times at which they began and ended."""
+        return tuple(map(_as_written, self.faults))
+
+
+def _as_written(planned: PlannedFault) -> Fault:
+    lasting_ns = max(planned.end_ns - planned.start_ns, 1)
+    update = {"at_s": planned.start_ns / NS_PER_S, "duration_s": lasting_ns / NS_PER_S}
+    if isinstance(planned.fault, Swizzle):
+        update["over_s"] = planned.fault.over_s or planned.fault.duration_s
+    return planned.fault.model_copy(update=update)
+
+
+def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> tuple[Mask, Mask | None]:
+    if isinstance(fault, Partition):
+        severed = severed_by(fault, nodes, rng)
+        return _ends(severed), severed
+    if isinstance(fault, LinkFault):
+        links = links_of(fault, nodes, rng)
+        return _ends(links), links
+    if isinstance(fault, Infrastructure):
+        return np.ones(len(nodes.ids), dtype=bool), None
+    assert isinstance(fault, NodeFault)
+    return select(fault.nodes, nodes, rng), None
+
+
+def _ends(links: Mask) -> Mask:
+    """The nodes (N,) at either end of a link (N, N)."""
+    return np.asarray(links.any(axis=0) | links.any(axis=1))
+
+
+def stream(seed: int, number: int, what: str) -> np.random.Generator:
+    """The random stream of one fault of the plan, by what it decides."""
+    key = int.from_bytes(hashlib.blake2b(f"fault {number} {what}".encode(), digest_size=8).digest(), "little")
+    return np.random.Generator(np.random.Philox(key=np.array([seed, key], dtype=np.uint64)))
+
+
+def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, int]]:
+    """(node, cut off at, back at) of each node of a swizzle: off in the first half, back in the second."""
+    assert isinstance(planned.fault, Swizzle)
+    chosen = np.flatnonzero(planned.nodes)
+    rng = stream(seed, planned.number, "swizzle")
+    half_ns = round((planned.fault.over_s or planned.fault.duration_s) * NS_PER_S) // 2
+    step_ns = half_ns // max(1, len(chosen))
+    back = dict(zip(rng.permutation(chosen).tolist(), range(len(chosen)), strict=True))
+    return [
+        (node, planned.start_ns + place * step_ns, planned.start_ns + half_ns + (back[node] + 1) * step_ns)
+        for place, node in enumerate(rng.permutation(chosen).tolist())
+    ]
+
+
+def _changes(planned: PlannedFault, seed: int) -> Iterator[int]:
+    yield planned.start_ns
+    yield planned.end_ns
+    if planned.fault.kind == "swizzle":
+        for _, off_ns, back_ns in swizzle_times_ns(planned, seed):
+            yield min(off_ns, planned.end_ns)
+            yield min(back_ns, planned.end_ns)

@@ -1,0 +1,97 @@
+"""Which nodes and links a fault acts on: decided once, from where the vehicles are at first and the run's seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vnet.errors import ScenarioError
+from vnet.faults import LinkFault, Partition, Selector
+from vnet.roads.lanes import Array
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """What selectors look at: ids, first positions (N, 2) in metres, and how many others each has in range (N,)."""
+
+    ids: Sequence[str]
+    position_m: Array
+    degree: NDArray[np.intp]
+
+    def numbers(self, ids: Sequence[str]) -> list[int]:
+        """The numbers of nodes. Raises ScenarioError for an id that no node has."""
+        for node in ids:
+            if node not in self.ids:
+                some = ", ".join(self.ids[:8]) + (", …" if len(self.ids) > 8 else "")
+                raise ScenarioError(f"{node!r} is no vehicle of the network; they are {some}")
+        return [self.ids.index(node) for node in ids]
+
+
+def select(selector: Selector, nodes: Nodes, rng: np.random.Generator) -> Mask:
+    """The nodes that `selector` means, as (N,); `rng` draws where it leaves a choice. Raises ScenarioError."""
+    count = len(nodes.ids)
+    chosen = np.zeros(count, dtype=bool)
+    if selector.ids is not None:
+        chosen[nodes.numbers(selector.ids)] = True
+    elif selector.fraction is not None:
+        chosen[rng.permutation(count)[: max(1, round(selector.fraction * count))]] = True
+    elif selector.random is not None:
+        chosen[rng.permutation(count)[: selector.random]] = True
+    elif selector.disc is not None:
+        x, y, radius_m = selector.disc
+        chosen = np.hypot(*(nodes.position_m - (x, y)).T) <= radius_m
+    elif selector.polygon is not None:
+        chosen = _inside(np.array(selector.polygon), nodes.position_m)
+    elif selector.degree is not None:
+        chosen = (selector.degree[0] <= nodes.degree) & (nodes.degree <= selector.degree[1])
+    else:
+        chosen[:] = True
+    return chosen
+
+
+def _inside(corner_m: Array, point_m: Array) -> Mask:
+    """Which points (N, 2) lie in a polygon (C, 2): a ray to the right crosses its sides an odd number of times."""
+    odd = np.zeros(len(point_m), dtype=bool)
+    x, y = point_m.T
+    for (x1, y1), (x2, y2) in zip(corner_m, np.roll(corner_m, -1, axis=0), strict=True):
+        spans = (y1 > y) != (y2 > y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            odd ^= spans & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+    return odd
+
+
+def links_of(fault: LinkFault, nodes: Nodes, rng: np.random.Generator) -> Mask:
+    """The links (N, N), rows are senders, that a fault of links acts on. Raises ScenarioError."""
+    end = select(fault.nodes, nodes, rng)
+    sender, receiver = select(fault.senders, nodes, rng), select(fault.receivers, nodes, rng)
+    return (end[:, None] | end[None, :]) & sender[:, None] & receiver[None, :]
+
+
+def severed_by(fault: Partition, nodes: Nodes, rng: np.random.Generator) -> Mask:
+    """The links (N, N), rows are senders, that a partition cuts. Raises ScenarioError."""
+    count = len(nodes.ids)
+    if fault.groups == "ring":
+        return _outside_majority(rng.permutation(count))
+    group = np.zeros(count, dtype=int)
+    if fault.groups == "halves":
+        group[rng.permutation(count)[: count // 2]] = 1
+    elif fault.groups == "one":
+        group[rng.integers(count)] = 1
+    else:
+        for number, ids in enumerate(fault.groups, start=1):
+            group[nodes.numbers(ids)] = number
+    return np.asarray(group[:, None] != group[None, :])
+
+
+def _outside_majority(order: NDArray[np.int64]) -> Mask:
+    """Links between nodes that are not of each other's majority: the nearest on a ring in this `order`."""
+    count = len(order)
+    place = np.empty(count, dtype=int)
+    place[order] = np.arange(count)
+    apart = np.abs(place[:, None] - place[None, :])
+    return np.asarray(np.minimum(apart, count - apart) > count // 4)
