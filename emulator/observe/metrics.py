@@ -73,7 +73,7 @@ class PeriodFigures:
     component_rmse_m: list[float | None]
     component_deviation_m: list[float | None]
     position_rmse_m: float | None
-    fix_rmse_m: float
+    fix_rmse_m: float | None
     consensus_error_m: float | None
     common_error_anees: float | None
     position_anees: float | None
@@ -136,7 +136,7 @@ class Metrics:
             [_rms(error[group]) for group in groups],
             [_rms(common[group] - _mean(common[group])) for group in groups],
             _rms(position_error),
-            float(np.sqrt(np.mean(np.sum((instant.fix_m - instant.position_m) ** 2, axis=1)))),
+            _rms(instant.fix_m - instant.position_m),
             _rms(named["mean_m"] - component_mean),
             _anees(error, named["common_error_covariance_m2"]),
             _anees(position_error, covariance),

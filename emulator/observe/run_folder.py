@@ -74,7 +74,7 @@ class RunFolder:
 
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
-        self.put(name, lambda path: _write_text(path, json.dumps(data, indent=2) + "\n"))
+        self.put(name, lambda path: write_text(path, json.dumps(data, indent=2) + "\n"))
 
 
 def read_events(folder: Path) -> list[Event]:
@@ -101,7 +101,8 @@ def _disk(path: Path) -> Any:
         raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
 
 
-def _write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a text file, for `RunFolder.put`."""
     path.write_text(text)
 
 

@@ -11,14 +11,19 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from emulator.channel.stages import Topology
 from emulator.engine import Delivery, Engine
+from emulator.faults.plan import FaultPlan, PlannedFault
+from emulator.faults.selectors import Nodes
+from emulator.faults.sensors import BentGnss, clock_of
 from emulator.observe.metrics import Metrics, PeriodFigures
 from emulator.observe.observation import period_message
-from emulator.observe.run_folder import RunFolder
+from emulator.observe.run_folder import RunFolder, write_text
 from emulator.world.world import Instant, World, components
+from vnet.faults import Fault, Infrastructure
 from vnet.link import wire
 from vnet.link.node import Report
-from vnet.scenario import Scenario
+from vnet.scenario import NS_PER_S, Scenario, dump_scenario
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,21 @@ class PeriodView:
         return period_message(node_ids, self.instant, self.reports, self.figures, self.counts, self.deliveries)
 
 
+@dataclass(frozen=True)
+class ProcessActions:
+    """What processes suffer from an instant on.
+
+    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start anew; `paused`: all
+    that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
+    """
+
+    stop: dict[str, bool]
+    start: list[str]
+    paused: set[str]
+    clocks: list[wire.ClockBend]
+    restarts: list[Infrastructure]
+
+
 class Emulation:
     """The state of a run; see the module's text."""
 
@@ -49,6 +69,14 @@ class Emulation:
         self.scenario = scenario
         self.world = world
         self.folder = folder
+        radio = scenario.radio
+        in_range = Topology(start.position_m, radio.range_m, radio.max_peers, world.links).in_range
+        self.faults = FaultPlan(scenario, Nodes(world.node_ids, start.position_m, in_range.sum(axis=0)))
+        self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
+        self.incarnation = dict.fromkeys(world.node_ids, 0)
+        self._down_by_fault: set[str] = set()
+        self._acting: set[str] = set()
+        self._next_fault_ns = self.faults.next_change_ns(-1)
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
         component = components(start.position_m, scenario.radio.range_m, world.links)
         self.metrics = Metrics(world.node_ids, component, world.period_ns)
@@ -74,9 +102,10 @@ class Emulation:
         """How far the run has come, in whole periods."""
         return min(self._period * self.world.period_ns, self.duration_ns)
 
-    def welcome(self, node: str, nonce: bytes, incarnation: int = 0) -> wire.Welcome:
+    def welcome(self, node: str, nonce: bytes) -> wire.Welcome:
         """All that `node` is told; nothing in it says anything about the truth."""
         scenario = self.scenario
+        incarnation = self.incarnation[node]
         program = scenario.program.of(node)
         return wire.Welcome(
             node,
@@ -128,6 +157,74 @@ class Emulation:
         self.up[node] = False
         self.engine.set_up(self.number[node], False)
 
+    # Faults.
+
+    def next_fault_ns(self) -> int | None:
+        """When next a fault starts or ends."""
+        return self._next_fault_ns
+
+    def act(self, time_ns: int) -> ProcessActions:
+        """Let the faults of `time_ns` act on links and senders; returns what processes are to suffer.
+
+        The caller has taken all that arrived before `time_ns`.
+        """
+        self._next_fault_ns = self.faults.next_change_ns(time_ns)
+        active = self.faults.active(time_ns)
+        self.engine.set_faults(active, time_ns)
+        self._log_changes(time_ns, active)
+        down = self._nodes_under(active, "kill", "restart")
+        paused = self._nodes_under(active, "pause")
+        killed = self._nodes_under(active, "kill")
+        up = [node for node in self.world.node_ids if self.up[node]]
+        stop = {node: node in killed for node in up if node in down}
+        start = [n for n in self.world.node_ids if n in self._down_by_fault and n not in down]
+        for node in stop:
+            self._take_down(node)
+        for node in start:
+            self.incarnation[node] += 1
+            self.up[node] = True
+            self.engine.set_up(self.number[node], True)
+        self._down_by_fault = (self._down_by_fault | stop.keys()) - set(start)
+        clocks = [clock_of(active, node, number, time_ns) for node, number in self.number.items()]
+        restarts = [p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns]
+        return ProcessActions(stop, start, paused, clocks, restarts)
+
+    def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
+        chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]
+        return {node for node, number in self.number.items() if any(mask[number] for mask in chosen)}
+
+    def _log_changes(self, time_ns: int, active: Sequence[PlannedFault]) -> None:
+        acting = {planned.label for planned in active}
+        for planned in active:
+            if planned.label not in self._acting:
+                nodes = [node for node, number in self.number.items() if planned.nodes[number]]
+                self.folder.event(time_ns, "fault_started", None, fault=planned.label, nodes=nodes)
+        for label in sorted(self._acting - acting):
+            self.folder.event(time_ns, "fault_ended", None, fault=label)
+        self._acting = acting
+
+    def inject(self, fault: Fault, now_ns: int) -> PlannedFault:
+        """Plan one more fault while the run is on, and write it into the run's scenario so that it replays.
+
+        It acts after `now_ns` at the earliest. Raises ScenarioError if it does not fit.
+        """
+        at_s = max(fault.at_s, (now_ns + 1) / NS_PER_S)
+        planned = self.faults.add(fault.model_copy(update={"at_s": at_s}))
+        self._change_plan(now_ns)
+        return planned
+
+    def heal(self, label: str, now_ns: int) -> PlannedFault:
+        """End a fault right after `now_ns`, and write that down. Raises ScenarioError if none is called so."""
+        planned = self.faults.heal(label, now_ns + 1)
+        self._change_plan(now_ns)
+        return planned
+
+    def _change_plan(self, now_ns: int) -> None:
+        self._next_fault_ns = self.faults.next_change_ns(now_ns)
+        self.scenario = self.scenario.model_copy(update={"fault": self.faults.as_written()})
+        text = dump_scenario(self.scenario)
+        self.folder.put("scenario.toml", lambda path: write_text(path, text))
+
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self._close_periods(time_ns)
@@ -149,7 +246,7 @@ class Emulation:
 
     def _close_periods(self, time_ns: int) -> None:
         while (self._period + 1) * self.world.period_ns <= time_ns:
-            instant = self.world.at(self._period)
+            instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
             figures = self.metrics.record(instant, reports)
             self._period += 1

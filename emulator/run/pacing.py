@@ -13,7 +13,7 @@ from itertools import accumulate
 from typing import Any
 
 from emulator.engine import Delivery
-from emulator.run.emulation import Emulation
+from emulator.run.emulation import Emulation, ProcessActions
 from vnet.errors import VnetError
 from vnet.link import wire
 from vnet.link.node import INBOX_LIMIT, Packet
@@ -35,30 +35,57 @@ class _Process:
         self.traffic: wire.Traffic | None = None
         self.packets: dict[str, deque[wire.WirePacket]] = {node: deque(maxlen=INBOX_LIMIT) for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
+        self.paused: set[str] = set()
+        self.bent: set[str] = set()
+        self.clocks: dict[str, wire.ClockBend] = {}
+
+    @property
+    def running(self) -> list[str]:
+        """The nodes that do not stand still."""
+        return [node for node in self.nodes if node not in self.paused]
 
     def take_packets(self) -> list[wire.WirePacket]:
-        due = [packet for node in self.nodes for packet in self.packets[node]]
-        for queue in self.packets.values():
-            queue.clear()
+        due = [packet for node in self.running for packet in self.packets[node]]
+        for node in self.running:
+            self.packets[node].clear()
         return due
+
+    def take_clocks(self) -> list[wire.ClockBend]:
+        changed, self.clocks = list(self.clocks.values()), {}
+        return changed
 
 
 class Lockstep:
     """The barrier of a run. `processes` are the node ids of each event loop, the lead first.
 
-    Use: grants = start(); then, until `step` returns none: give each grant to its process and `receive` its
-    yield (or say that it `died`); when nothing is `owed`, call `step`.
+    Use: grants = start(); then, until `step` returns none: do what `take_actions` says, give each grant to its
+    process and `receive` its yield (or say that it `died`); when nothing is `owed`, call `step`.
+
+    Processes come and go with faults: `hosts_all` says that one process outlives them (a simulation), and that its
+    driver stops and starts programs within it.
     """
 
-    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
+    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], hosts_all: bool = False) -> None:
         self._emulation = emulation
+        self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
+        self._lead = {node: nodes[0] for nodes in processes for node in nodes}
         self._processes = {nodes[0]: _Process(nodes) for nodes in processes}
+        self._hosts_all = hosts_all
+        self._actions: list[ProcessActions] = []
+        self._woken: set[str] = set()
         self.owed: dict[str, int] = {}
         self.now_ns = 0
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
-        return self._grant(list(self._processes))
+        if self._emulation.next_fault_ns() == 0:
+            self._act(0)
+        return self._grant([lead for lead, p in self._processes.items() if p.running])
+
+    def take_actions(self) -> list[ProcessActions]:
+        """What processes suffer at this instant, before the grants are given."""
+        actions, self._actions = self._actions, []
+        return actions
 
     def receive(self, lead: str, message: wire.Yield) -> None:
         """A process has yielded. Raises ProtocolError if it was not owed or speaks for others' nodes."""
@@ -75,7 +102,9 @@ class Lockstep:
 
     def died(self, lead: str, **details: Any) -> None:
         """A process has ended: its nodes are down from this instant on, and nothing is owed by it."""
-        process = self._processes.pop(lead)
+        process = self._processes.pop(lead, None)
+        if process is None:  # a fault was faster
+            return
         self.owed.pop(lead, None)
         for node in process.nodes:
             self._emulation.died(self.now_ns, node, **details)
@@ -83,32 +112,86 @@ class Lockstep:
     def step(self) -> dict[str, wire.Grant]:
         """Do what was yielded, go to the next instant, and say who is granted it; none at the end."""
         assert not self.owed, self.owed
-        self._emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
+        emulation = self._emulation
+        emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
         for process in self._processes.values():
             process.traffic = None
-        wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
-        due = [wake for wake in wakes.values() if wake is not None]
-        if not due or min(due) >= self._emulation.duration_ns:
-            self._emulation.finish(self._emulation.duration_ns)
+        while True:
+            wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
+            next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
+            fault_ns = emulation.next_fault_ns()
+            if fault_ns is None or fault_ns > next_ns or fault_ns >= emulation.duration_ns:
+                break
+            self._act(fault_ns)
+        if next_ns >= emulation.duration_ns:
+            emulation.finish(emulation.duration_ns)
             return {}
-        self.now_ns = min(due)
-        self._collect_packets()
-        return self._grant([lead for lead, wake in wakes.items() if wake == self.now_ns])
+        self.now_ns = next_ns
+        self._collect_packets(next_ns)
+        return self._grant([lead for lead, wake in wakes.items() if wake == next_ns])
+
+    def _act(self, time_ns: int) -> None:
+        """Let faults act: after all that came before this instant, and before anything that happens at it."""
+        self._collect_packets(time_ns - 1)
+        self.now_ns = time_ns
+        actions = self._emulation.act(time_ns)
+        self._actions.append(actions)
+        for node in actions.stop:
+            self._stop(node)
+        for node in actions.start:
+            self._start(node)
+        for process in self._processes.values():
+            paused = actions.paused & set(process.nodes)
+            if process.paused - paused:
+                self._woken.add(process.nodes[0])
+            process.paused = paused
+            for clock in actions.clocks:
+                if clock.node in process.next_fix:
+                    self._bend(process, clock)
+
+    def _bend(self, process: _Process, clock: wire.ClockBend) -> None:
+        if clock.bends or clock.node in process.bent:
+            process.clocks[clock.node] = clock
+            process.bent.add(clock.node)
+
+    def _stop(self, node: str) -> None:
+        lead = self._lead[node]
+        if self._hosts_all:
+            self._processes[lead].packets[node].clear()
+        else:
+            self._processes.pop(lead, None)
+
+    def _start(self, node: str) -> None:
+        lead = self._lead[node]
+        if lead not in self._processes:
+            # In the order of the first processes, so that nothing depends on who was gone when.
+            self._processes[lead] = _Process(self._groups[lead])
+            self._processes = {lead: self._processes[lead] for lead in self._groups if lead in self._processes}
+        process = self._processes[lead]
+        process.next_fix[node] = -(-self.now_ns // self._emulation.world.period_ns)
+        self._woken.add(lead)
 
     def _wake_ns(self, process: _Process) -> int | None:
         """When a process must run next: its next timer, or what its nodes' tasks wait for."""
+        if process.nodes[0] in self._woken:
+            return self.now_ns
+        if not process.running:
+            return None
         emulation = self._emulation
         candidates = [process.next_timer_ns]
-        candidates += [emulation.engine.next_arrival_ns(emulation.number[n]) for n in process.waiting_radio]
-        candidates += [emulation.fix_time_ns(process.next_fix[n]) for n in process.waiting_gnss]
+        awaited = set(process.running)
+        candidates += [
+            emulation.engine.next_arrival_ns(emulation.number[n]) for n in process.waiting_radio if n in awaited
+        ]
+        candidates += [emulation.fix_time_ns(process.next_fix[n]) for n in process.waiting_gnss if n in awaited]
         due = [time_ns for time_ns in candidates if time_ns is not None]
-        return min(due) if due else None
+        return max(min(due), self.now_ns) if due else None
 
-    def _collect_packets(self) -> None:
-        """Put what has arrived where its receiver will find it at its next wake-up."""
+    def _collect_packets(self, time_ns: int) -> None:
+        """Put what has arrived by then where its receiver will find it at its next wake-up."""
         node_ids = self._emulation.world.node_ids
         queues = {node: queue for p in self._processes.values() for node, queue in p.packets.items()}
-        for delivery in self._emulation.advance(self.now_ns):
+        for delivery in self._emulation.advance(time_ns):
             node = node_ids[delivery.receiver]
             queues[node].append(_wire_packet(node, delivery.packet))
 
@@ -116,8 +199,10 @@ class Lockstep:
         grants = {}
         for lead in leads:
             process = self._processes[lead]
-            fixes = [fix for node in process.nodes for fix in self._take_fixes(process, node)]
-            grants[lead] = wire.Grant(process.seq, self.now_ns, process.take_packets(), fixes)
+            self._woken.discard(lead)
+            fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
+            packets, clocks = process.take_packets(), process.take_clocks()
+            grants[lead] = wire.Grant(process.seq, self.now_ns, packets, fixes, clocks)
             self.owed[lead] = process.seq
             process.seq += 1
         return grants
@@ -130,7 +215,8 @@ class Lockstep:
         if not self._emulation.up[node]:
             return []
         number = self._emulation.number[node]
-        return [wire.WireFix.of(node, world.fix(period, number)) for period in range(first, last + 1)]
+        fixes = [self._emulation.gnss.fix(period, number) for period in range(first, last + 1)]
+        return [wire.WireFix.of(node, fix) for fix in fixes if fix is not None]
 
 
 class RealTime:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Sequence
 
-from emulator.run.emulation import Emulation
+from emulator.run.emulation import Emulation, ProcessActions
 from emulator.run.pacing import Lockstep
 from vnet.link import wire
 from vnet.link.hosting import Host, load_programs
@@ -46,7 +47,8 @@ class _Simulation:
     def __init__(self, emulation: Emulation) -> None:
         node_ids = emulation.world.node_ids
         self._lead = node_ids[0]
-        self._lockstep = Lockstep(emulation, [node_ids])
+        self._emulation = emulation
+        self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
         self._seq = 0
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
@@ -57,8 +59,8 @@ class _Simulation:
         """From the first grant to the last."""
         asyncio.set_event_loop(self.loop)
         try:
-            self._take(self._lockstep.start())
             self._host.start(self.loop, self._programs)
+            self._take(self._lockstep.start())
             while True:
                 try:
                     self.loop.run_forever()
@@ -79,5 +81,16 @@ class _Simulation:
             raise _RunOverError
         grant = grants[self._lead]
         self._seq = grant.seq
+        self._host.bend(grant.clocks, self.loop)
+        self._suffer(self._lockstep.take_actions())
         self._host.deliver(grant.packets, grant.fixes)
         return grant.time_ns
+
+    def _suffer(self, actions: Sequence[ProcessActions]) -> None:
+        """Do to the programs what faults do to processes."""
+        for action in actions:
+            for node in action.stop:
+                self._host.stop(node)
+            for node in action.start:
+                self._host.restart(self._emulation.welcome(node, _NONCE))
+            self._host.pause(action.paused)

@@ -13,6 +13,9 @@ times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)
 reals = st.floats(allow_nan=False)
 packets = st.builds(wire.WirePacket, names, names, times, times, st.binary(max_size=64))
+clocks = st.lists(
+    st.builds(wire.ClockBend, names, times, st.integers(-(2**50), 2**50), st.floats(-0.5, 0.5)), max_size=2
+)
 fixes = st.builds(
     wire.WireFix,
     names,
@@ -53,8 +56,18 @@ agent_messages = st.one_of(
     st.builds(wire.Standing, st.binary(), names),
 )
 emulator_messages = st.one_of(
-    st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3)),
-    st.builds(wire.Batch, st.lists(fixes, max_size=3), times, st.lists(packets, max_size=3), st.none() | times),
+    st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
+    st.builds(
+        wire.Batch,
+        st.lists(fixes, max_size=3),
+        times,
+        st.lists(packets, max_size=3),
+        st.none() | times,
+        times,
+        st.booleans(),
+        clocks,
+    ),
+    st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.Where()),
     st.builds(wire.End, st.none() | st.binary(), names, st.booleans()),
 )

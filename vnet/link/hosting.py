@@ -14,14 +14,14 @@ import os
 import sys
 import traceback
 import weakref
-from collections import deque
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from vnet.errors import ProgramError
 from vnet.link import wire
 from vnet.link.node import Node, Report
-from vnet.link.virtual_time import LoopAbandonedError, SpinError, VirtualTimeLoop
+from vnet.link.virtual_time import BendableLoop, LoopAbandonedError, SpinError, VirtualTimeLoop
 from vnet.roads.lanes import LaneMap
 
 Program = Callable[[Node], Awaitable[None]]
@@ -82,6 +82,8 @@ class Host:
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], str | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = dict.fromkeys(self.nodes, True)
+        self._clocks: dict[str, wire.ClockBend] = {}
+        self._paused: set[str] = set()
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -97,10 +99,10 @@ class Host:
 
     # What nodes ask of their link.
 
-    @property
-    def now_ns(self) -> int:
-        """Emulated time in nanoseconds."""
-        return self._clock()
+    def now_ns(self, node: str) -> int:
+        """Emulated time in nanoseconds, by the clock of `node`."""
+        bend = self._clocks.get(node)
+        return self._clock() if bend is None else max(bend.shown_ns(self._clock()), 0)
 
     def send_frame(self, node: str, payload: bytes) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
@@ -119,16 +121,55 @@ class Host:
     def start(self, loop: asyncio.AbstractEventLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""
         self._loop = loop
+        self._programs = programs
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
-            context = contextvars.copy_context()
-            context.run(_current_node.set, node.id)
-            loop.create_task(self._run(node, programs[node.id]), name=f"{node.id} main", context=context)
+            self._start(node)
+
+    def _start(self, node: Node) -> None:
+        context = contextvars.copy_context()
+        context.run(_current_node.set, node.id)
+        program = self._run(node, self._programs[node.id])
+        self._loop.create_task(program, name=f"{node.id} main", context=context)
+
+    def stop(self, node: str) -> None:
+        """A node's process is gone: what is left of its program is cancelled, unheard (simulated)."""
+        self.nodes[node].sever()
+        self._active[node] = False
+        for task in self._tasks_of(node):
+            task.cancel()
+
+    def restart(self, welcome: wire.Welcome) -> None:
+        """Run a node's program anew, as another incarnation (simulated)."""
+        node = self.nodes[welcome.node] = self._node(welcome)
+        self._active[node.id] = True
+        self._start(node)
+
+    def pause(self, nodes: Iterable[str]) -> None:
+        """From now on these nodes stand still, and no others: their callbacks wait (simulated)."""
+        assert isinstance(self._loop, VirtualTimeLoop)
+        self._paused = set(nodes)
+        self._loop.hold(lambda handle: _owner(handle) in self._paused)
+
+    def bend(self, clocks: Iterable[wire.ClockBend], loop: BendableLoop) -> None:
+        """Take new clocks of nodes."""
+        for clock in clocks:
+            self._clocks.pop(clock.node, None)
+            if clock.bends:
+                self._clocks[clock.node] = clock
+        loop.bend_of = self._bend_of_task if self._clocks else _no_bend
+
+    def _bend_of_task(self) -> wire.ClockBend | None:
+        node = _current_node.get()
+        return None if node is None else self._clocks.get(node)
 
     def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
         """Put packets, then fixes, into the mailboxes."""
         for packet in packets:
-            self.nodes[packet.node].radio.inbox.deliver((packet.packet(),))
+            received = packet.packet()
+            if (bend := self._clocks.get(packet.node)) is not None:
+                received = replace(received, received_ns=bend.shown_ns(received.received_ns))
+            self.nodes[packet.node].radio.inbox.deliver((received,))
         for fix in fixes:
             self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
 
@@ -157,17 +198,20 @@ class Host:
         self._active[node] = False
         self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
         running = asyncio.current_task(self._loop)
-        for task, owner in list(self._tasks.items()):
-            if owner == node and task is not running:
+        for task in self._tasks_of(node):
+            if task is not running:
                 task.cancel()
         self._on_traffic()
+
+    def _tasks_of(self, node: str) -> list[asyncio.Task[Any]]:
+        return [task for task, owner in list(self._tasks.items()) if owner == node and not task.done()]
 
     def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
         """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
 
         What spins on although it was cancelled loses its callbacks.
         """
-        ready: deque[asyncio.Handle] = loop._ready  # type: ignore[attr-defined]
+        ready = loop._ready
         owners = dict.fromkeys(_owner(handle) for handle in ready)
         spinning = [owner for owner in owners if owner is not None] or list(self.nodes)
         if not any(self._active[node] for node in spinning):
@@ -180,10 +224,9 @@ class Host:
     def stacks(self, node: str) -> str:
         """Where the tasks of a node stand, as text."""
         lines = []
-        for task, owner in list(self._tasks.items()):
-            if owner == node and not task.done():
-                lines.append(f"task {task.get_name()}:")
-                lines += [f"  {place}" for place in _standing(task)]
+        for task in self._tasks_of(node):
+            lines.append(f"task {task.get_name()}:")
+            lines += [f"  {place}" for place in _standing(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
@@ -209,11 +252,15 @@ class Host:
             raise
         except (Exception, SystemExit) as error:
             if isinstance(error, SystemExit) and not error.code:
-                self.end(node.id, "finished")
+                self._over(node, "finished")
                 return
-            self.end(node.id, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
+            self._over(node, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
         else:
-            self.end(node.id, "finished")
+            self._over(node, "finished")
+
+    def _over(self, node: Node, kind: str, error: str = "", details: str = "") -> None:
+        if self.nodes[node.id] is node:  # and not what is left of an earlier incarnation
+            self.end(node.id, kind, error, details)
 
     def _new_task(
         self,
@@ -233,6 +280,11 @@ def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
         coroutine = coroutine.cr_await
+
+
+def _no_bend() -> wire.ClockBend | None:
+    """All clocks are right."""
+    return None
 
 
 def _owner(handle: asyncio.Handle) -> str | None:

@@ -62,9 +62,8 @@ class Report:
 class NodeLink(Protocol):
     """What a node needs of the process that hosts it."""
 
-    @property
-    def now_ns(self) -> int:
-        """Emulated time in nanoseconds."""
+    def now_ns(self, node: str) -> int:
+        """Emulated time in nanoseconds, by the clock of `node`."""
         ...
 
     def send_frame(self, node: str, payload: bytes) -> None:
@@ -213,8 +212,12 @@ class Node:
 
     @property
     def now_ns(self) -> int:
-        """Emulated nanoseconds since the start of the run."""
-        return self._link.now_ns
+        """Emulated nanoseconds since the start of the run, by the vehicle's own clock."""
+        return self._link.now_ns(self.id)
+
+    def sever(self) -> None:
+        """Cut what is left of the program off from the world: the vehicle's process is gone."""
+        self._link = self.radio._link = _Severed(self.now_ns)
 
     def report(
         self,
@@ -241,6 +244,22 @@ class Node:
                 named,
             )
         )
+
+
+class _Severed:
+    """The link of a node whose process is gone: nothing that it still does reaches anybody."""
+
+    def __init__(self, now_ns: int) -> None:
+        self._now_ns = now_ns
+
+    def now_ns(self, node: str) -> int:
+        return self._now_ns
+
+    def send_frame(self, node: str, payload: bytes) -> None:
+        pass
+
+    def send_report(self, report: Report) -> None:
+        pass
 
 
 def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]:

@@ -14,11 +14,14 @@ from __future__ import annotations
 
 import asyncio
 import selectors
-from collections.abc import Callable, Coroutine
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import Context
 from typing import Any, NoReturn
 
 from vnet.errors import VirtualTimeError
+from vnet.link.wire import ClockBend
 
 NS_PER_S = 1_000_000_000
 
@@ -34,7 +37,42 @@ class LoopAbandonedError(VirtualTimeError):
     """A loop that was told to end, but whose tasks still wait for something."""
 
 
-class VirtualTimeLoop(asyncio.SelectorEventLoop):
+class BendableLoop(asyncio.SelectorEventLoop):
+    """A loop that shows some tasks another time: `bend_of` gives the clock of the task that asks, or None.
+
+    Timers are kept in the loop's own time.
+    """
+
+    bend_of: Callable[[], ClockBend | None] = staticmethod(lambda: None)
+
+    @property
+    def now_ns(self) -> int:
+        """The loop's own time in nanoseconds of the run."""
+        raise NotImplementedError
+
+    def time(self) -> float:
+        """Seconds, as asyncio counts, on the clock of the task that asks."""
+        bend = self.bend_of()
+        if bend is None:
+            return self.own_time()
+        now_ns = self.now_ns
+        return self.own_time() + (bend.shown_ns(now_ns) - now_ns) / NS_PER_S
+
+    def own_time(self) -> float:
+        """Seconds on the loop's own clock."""
+        return super().time()
+
+    def call_at(  # type: ignore[override]
+        self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """Call at `when` on the clock of the task that asks."""
+        bend = self.bend_of()
+        if bend is not None:
+            when = self.own_time() + (when - self.time()) / (1 + bend.rate)
+        return super().call_at(when, callback, *args, context=context)
+
+
+class VirtualTimeLoop(BendableLoop):
     """An event loop in virtual time; see the module's text.
 
     `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.
@@ -47,6 +85,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         self._now_ns = 0
         self._ending = False
         self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
+        self._ready: deque[asyncio.Handle]  # asyncio's
         super().__init__(_YieldingSelector(self._wait))
 
     @property
@@ -54,7 +93,17 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
         """The granted time in nanoseconds."""
         return self._now_ns
 
-    def time(self) -> float:
+    def start_at(self, time_ns: int) -> None:
+        """Set the clock before anything runs: a process that is started anew joins late."""
+        self._now_ns = time_ns
+
+    def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
+        """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that."""
+        if not isinstance(self._ready, _HoldingQueue):
+            self._ready = _HoldingQueue(self._ready)
+        self._ready.release(held)
+
+    def own_time(self) -> float:
         """The granted time in seconds, as asyncio counts."""
         return self._now_ns / NS_PER_S
 
@@ -141,6 +190,29 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     getaddrinfo = getnameinfo = _refuse
     sock_recv = sock_recv_into = sock_recvfrom = sock_recvfrom_into = _refuse
     sock_sendall = sock_sendto = sock_connect = sock_accept = sock_sendfile = _refuse
+
+
+class _HoldingQueue(deque[asyncio.Handle]):
+    """The loop's queue of callbacks that are ready, but for those of programs that stand still."""
+
+    def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
+        super().__init__(ready)
+        self._holds: Callable[[asyncio.Handle], bool] = lambda handle: False
+        self._held: list[asyncio.Handle] = []
+
+    def append(self, handle: asyncio.Handle) -> None:
+        if self._holds(handle):
+            self._held.append(handle)
+        else:
+            super().append(handle)
+
+    def release(self, holds: Callable[[asyncio.Handle], bool]) -> None:
+        """Hold what `holds` says, and let go of what it no longer does, in the order in which it came."""
+        waiting = [*self, *self._held]
+        self.clear()
+        self._holds, self._held = holds, []
+        for handle in waiting:
+            self.append(handle)
 
 
 class _YieldingSelector(selectors.DefaultSelector):

@@ -156,28 +156,62 @@ class Welcome(Message, frozen=True):
     boot_id: str
 
 
+class ClockBend(msgspec.Struct, frozen=True, array_like=True):
+    """How the clock of `node` goes wrong: at time t it shows t + offset_ns + rate · (t − since_ns)."""
+
+    node: str
+    since_ns: TimeNs
+    offset_ns: Annotated[int, msgspec.Meta(ge=-(2**53), le=2**53)] = 0
+    rate: Annotated[float, msgspec.Meta(gt=-1, lt=1)] = 0.0
+
+    @property
+    def bends(self) -> bool:
+        """Whether the clock is wrong at all."""
+        return bool(self.offset_ns or self.rate)
+
+    def shown_ns(self, time_ns: int) -> int:
+        """What the clock shows at `time_ns`."""
+        return time_ns + self.offset_ns + round(self.rate * (time_ns - self.since_ns))
+
+    def time_ns(self, shown_ns: int) -> int:
+        """When the clock shows this."""
+        return self.since_ns + round((shown_ns - self.since_ns - self.offset_ns) / (1 + self.rate))
+
+
 class Grant(Message, frozen=True):
-    """Lockstep: it is now `time_ns`; here is what is due. Grant 0 starts the run."""
+    """Lockstep: it is now `time_ns`; here is what is due. Grant 0 starts a process. `clocks` that have changed."""
 
     seq: Count
     time_ns: TimeNs
     packets: Sequence[WirePacket] = ()
     fixes: Sequence[WireFix] = ()
+    clocks: Sequence[ClockBend] = ()
 
 
 class Batch(Message, frozen=True):
-    """Real time: what is due by now. Batch 0 starts the run: time 0 is `origin_ns` on the monotonic clock of
-    the machine whose boot the welcome names; on other machines, its arrival.
+    """Real time: what is due by now. Batch 0 starts the process: it is `start_ns` at `origin_ns` + `start_ns` on
+    the monotonic clock of the machine whose boot the welcome names; on other machines, when it arrives.
+
+    `held`: packets waited for a process that stood still, so that nobody is to blame that they are late.
     """
 
     fixes: Sequence[WireFix]
     seq: Count
     packets: Sequence[WirePacket] = ()
     origin_ns: int | None = None
+    start_ns: TimeNs = 0
+    held: bool = False
+    clocks: Sequence[ClockBend] = ()
 
 
 class Where(Message, frozen=True):
     """The emulator waits too long for this process: where does it stand?"""
+
+
+class Await(Message, frozen=True):
+    """The emulator, or its router, is about to go away, and expects to be back within `within_s`."""
+
+    within_s: float
 
 
 class End(Message, frozen=True):
@@ -189,7 +223,7 @@ class End(Message, frozen=True):
 
 
 AgentMessage = Hello | Yield | Frames | Standing
-EmulatorMessage = Welcome | Grant | Batch | Where | End
+EmulatorMessage = Welcome | Grant | Batch | Where | Await | End
 
 _M = TypeVar("_M")
 _encoder = msgspec.msgpack.Encoder()

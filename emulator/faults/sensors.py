@@ -1,0 +1,98 @@
+"""What the faults do to a vehicle's GNSS receiver and clock: functions of the plan and the time alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from emulator.faults.plan import PlannedFault, stream
+from emulator.world.world import Instant, World
+from vnet.faults import (
+    ConstPosOffset,
+    Drift,
+    GnssFault,
+    GnssFreeze,
+    GnssJump,
+    GnssOutage,
+    GnssRamp,
+    RandomPos,
+    Skew,
+)
+from vnet.link.node import Fix
+from vnet.link.wire import ClockBend
+from vnet.roads.lanes import Array
+from vnet.scenario import NS_PER_S
+
+
+class BentGnss:
+    """The fixes of a run as the receivers give them: the world's, and what faults make of them."""
+
+    def __init__(self, world: World, faults: Sequence[PlannedFault], seed: int) -> None:
+        self._world = world
+        self._faults = faults
+        self._seed = seed
+
+    def fix(self, period: int, number: int) -> Fix | None:
+        """The fix of vehicle `number` at the start of `period`; None in an outage."""
+        time_ns = period * self._world.period_ns
+        acting = [
+            planned
+            for planned in self._faults
+            if planned.acts_at(time_ns) and isinstance(planned.fault, GnssFault) and planned.nodes[number]
+        ]
+        fix = self._world.fix(period, number)
+        if not acting:
+            return fix
+        if any(isinstance(planned.fault, GnssOutage) for planned in acting):
+            return None
+        position_m = self._start(acting, fix, number)
+        for planned in acting:
+            position_m = self._moved(planned, position_m, time_ns, period, number)
+        return replace(fix, position_m=position_m)
+
+    def at(self, period: int) -> Instant:
+        """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""
+        instant = self._world.at(period)
+        if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
+            return instant
+        fixes = [self.fix(period, number) for number in range(len(self._world.node_ids))]
+        nothing = np.full(2, np.nan)
+        return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
+
+    def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
+        """The position that frozen receivers repeat: their last before the earliest freeze."""
+        frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
+        if not frozen:
+            return fix.position_m
+        last = max(0, math.ceil(min(frozen) / self._world.period_ns) - 1)
+        return self._world.fix(last, number).position_m
+
+    def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:
+        match planned.fault:
+            case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
+                return np.asarray(position_m + np.array(offset_m))
+            case GnssRamp(rate_m_s=rate_m_s):
+                return np.asarray(position_m + np.array(rate_m_s) * (time_ns - planned.start_ns) / NS_PER_S)
+            case RandomPos(radius_m=radius_m):
+                # A place of its own for each vehicle and period, whatever was drawn before.
+                draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
+                angle, away_m = 2 * math.pi * draws[0], radius_m * math.sqrt(draws[1])
+                return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
+            case _:
+                return position_m
+
+
+def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockBend:
+    """How the clock of a vehicle goes at `time_ns`: skews and drifts add up."""
+    offset_ns, rate = 0.0, 0.0
+    for planned in faults:
+        if planned.acts_at(time_ns) and planned.nodes[number]:
+            if isinstance(planned.fault, Skew):
+                offset_ns += planned.fault.offset_ms * 1e6
+            elif isinstance(planned.fault, Drift):
+                offset_ns += planned.fault.rate_ppm / 1e6 * (time_ns - planned.start_ns)
+                rate += planned.fault.rate_ppm / 1e6
+    return ClockBend(node, time_ns, round(offset_ns), rate)
