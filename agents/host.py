@@ -26,7 +26,7 @@ from vnet.link import keys, wire
 from vnet.link.access import Credentials
 from vnet.link.hosting import Host, Programs, load_programs
 from vnet.link.session import open_client
-from vnet.link.virtual_time import SpinError, VirtualTimeLoop
+from vnet.link.virtual_time import BendableLoop, SpinError, VirtualTimeLoop
 
 HELLO_PERIOD_S = 0.5
 LEASE_MS = 60_000
@@ -84,6 +84,7 @@ class _Attachment:
         self.inbox: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self.on_message: Callable[[bytes], None] = _no_wake
         self.orphan_timeout_s = 5.0
+        self._patience_until = 0.0
         self._host = socket.gethostname()
         self._main_thread = threading.main_thread().ident
         self._publishers = {
@@ -194,14 +195,22 @@ class _Attachment:
         if not isinstance(item, tuple):
             return None
         message = wire.decode_rx(item[0])
+        if isinstance(message, wire.Await):
+            self._patience_until = time.monotonic() + message.within_s
+            return None
         if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
             if message.refused:
                 raise LinkError(f"refused: {message.reason}")
             raise _RunOverError(message.reason)
         return message
 
+    @property
+    def patience_s(self) -> float:
+        """How long to wait for an emulator that is gone: longer if it has said so before it went."""
+        return max(self.orphan_timeout_s, self._patience_until - time.monotonic())
+
     def _wait_as_orphan(self) -> None:
-        deadline = time.monotonic() + self.orphan_timeout_s
+        deadline = time.monotonic() + self.patience_s
         while (wait_s := deadline - time.monotonic()) > 0:
             try:
                 if self.inbox.get(timeout=wait_s) is _Found:
@@ -235,6 +244,7 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
         while not isinstance(message, wire.Grant):
             message = attachment.next_message()
         seq = message.seq
+        host.bend(message.clocks, loop)
         host.deliver(message.packets, message.fixes)
         return message.time_ns
 
@@ -242,7 +252,7 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
     host = Host(welcomes, lambda: loop.now_ns)
     asyncio.set_event_loop(loop)
     try:
-        next_grant()
+        loop.start_at(next_grant())
         host.start(loop, programs)
         while True:
             try:
@@ -257,8 +267,19 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
 
 def _run_realtime(attachment: _Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
     """Run the programs on an ordinary loop, on the wall clock."""
-    with asyncio.Runner() as runner:
+    with asyncio.Runner(loop_factory=_WallClockLoop) as runner:
         runner.run(_RealTimeAgent(attachment, welcomes, programs).main())
+
+
+class _WallClockLoop(BendableLoop):
+    """An ordinary loop that knows when the run began, so that clocks can go wrong."""
+
+    origin_ns = 0
+
+    @property
+    def now_ns(self) -> int:
+        """Nanoseconds since the start of the run."""
+        return max(time.monotonic_ns() - self.origin_ns, 0)
 
 
 class _RealTimeAgent:
@@ -284,7 +305,9 @@ class _RealTimeAgent:
 
     async def main(self) -> None:
         """From the start of the run to its end."""
-        self._loop = asyncio.get_running_loop()
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, _WallClockLoop)
+        self._loop = loop
         self._over: asyncio.Future[None] = self._loop.create_future()
         self._attachment.on_message = self._wake
         for node in self._host.nodes.values():
@@ -335,7 +358,7 @@ class _RealTimeAgent:
             self._orphan_timer.cancel()
             self._orphan_timer = None
         if not present:
-            self._orphan_timer = self._loop.call_later(self._attachment.orphan_timeout_s, self._orphaned)
+            self._orphan_timer = self._loop.call_later(self._attachment.patience_s, self._orphaned)
 
     def _orphaned(self) -> None:
         if not self._over.done():
@@ -347,12 +370,15 @@ class _RealTimeAgent:
         self._expected = batch.seq + 1
         if batch.origin_ns is not None and not self._started:
             same_machine = self._boot_id != "" and self._boot_id == wire.boot_id()
-            self._origin_ns = batch.origin_ns if same_machine else time.monotonic_ns() + wire.HEAD_START_NS
+            head_start_ns = 0 if batch.start_ns else wire.HEAD_START_NS
+            here_ns = time.monotonic_ns() + head_start_ns - batch.start_ns
+            self._origin_ns = self._loop.origin_ns = batch.origin_ns if same_machine else here_ns
             self._started = True
-            head_start_s = max(0.0, (self._origin_ns - time.monotonic_ns()) / 1e9)
+            head_start_s = max(0.0, (self._origin_ns + batch.start_ns - time.monotonic_ns()) / 1e9)
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)
         now_ns = arrived_ns - self._origin_ns
-        for packet in batch.packets:
+        self._host.bend(batch.clocks, self._loop)
+        for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.deliver(batch.packets, batch.fixes)
 

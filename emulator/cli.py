@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -22,15 +23,17 @@ from emulator.observe.checks import check_run
 from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
 from emulator.observe.summary import print_checks, print_summary
+from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
-from emulator.run.live import LiveOptions, run_live
+from emulator.run.live import run_live
 from emulator.run.progress import ProgressLine
+from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
 from emulator.terminal import one_line_errors
 from emulator.world.world import World, build_world
-from vnet.errors import LinkError, VnetError
+from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.link.access import Access, Credentials
 from vnet.link.hosting import fix_hash_seed
 from vnet.link.session import quiet_zenoh
@@ -50,6 +53,13 @@ class Pacing(StrEnum):
 
     LOCKSTEP = "lockstep"
     REALTIME = "realtime"
+
+
+class RouterKind(StrEnum):
+    """Who routes a run that `vnet run` starts."""
+
+    EMBEDDED = "embedded"
+    SEPARATE = "separate"
 
 
 class Rerun(StrEnum):
@@ -83,13 +93,22 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     rerun: RerunOption = Rerun.OFF,
+    router: Annotated[
+        RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
+    ] = RouterKind.EMBEDDED,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
     with one_line_errors():
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
+        _check_restarts(loaded, router is RouterKind.SEPARATE)
         world = build_world(loaded)
-        options = LiveOptions(_create_access(loaded, world))
-        _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options)
+        access = _create_access(loaded, world)
+        with ExitStack() as stack:
+            separate = None
+            if router is RouterKind.SEPARATE:
+                private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
+                separate = SeparateRouter(access, Path(private))
+            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, LiveOptions(access, router=separate))
 
 
 @app.command()
@@ -149,6 +168,7 @@ def emulator(
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
+        _check_restarts(loaded, own_router=False)
         world = build_world(loaded)
         folder = RunFolder.create(out, loaded)
         listen = listen or DEFAULT_LISTEN
@@ -262,6 +282,13 @@ def _run_live(scenario: Scenario, world: World, folder: RunFolder, rerun: Rerun,
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
     _finish(emulation, wall_s, interrupted, "run")
+
+
+def _check_restarts(scenario: Scenario, own_router: bool) -> None:
+    """Only a router that the run itself has started can be restarted."""
+    kinds = {fault.kind for fault in scenario.fault}
+    if "router_restart" in kinds and not own_router:
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
 def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str) -> None:

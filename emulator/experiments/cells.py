@@ -28,9 +28,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from emulator.observe.run_folder import RunFolder
+from emulator.run.attachment import LiveOptions
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
-from emulator.run.live import LiveOptions, run_live
+from emulator.run.live import run_live
 from emulator.run.simulate import simulate
 from emulator.world.world import build_world
 from vnet.errors import VnetError

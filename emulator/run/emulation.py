@@ -163,10 +163,11 @@ class Emulation:
         """When next a fault starts or ends."""
         return self._next_fault_ns
 
-    def act(self, time_ns: int) -> ProcessActions:
+    def act(self, time_ns: int, starts_at_once: bool = True) -> ProcessActions:
         """Let the faults of `time_ns` act on links and senders; returns what processes are to suffer.
 
-        The caller has taken all that arrived before `time_ns`.
+        The caller has taken all that arrived before `time_ns`. Without `starts_at_once` nodes that start anew are
+        up only when it says that they `come_back`.
         """
         self._next_fault_ns = self.faults.next_change_ns(time_ns)
         active = self.faults.active(time_ns)
@@ -182,12 +183,19 @@ class Emulation:
             self._take_down(node)
         for node in start:
             self.incarnation[node] += 1
-            self.up[node] = True
-            self.engine.set_up(self.number[node], True)
+        if starts_at_once:
+            self.come_back(start, time_ns)
         self._down_by_fault = (self._down_by_fault | stop.keys()) - set(start)
         clocks = [clock_of(active, node, number, time_ns) for node, number in self.number.items()]
         restarts = [p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns]
         return ProcessActions(stop, start, paused, clocks, restarts)
+
+    def come_back(self, nodes: Sequence[str], time_ns: int) -> None:
+        """Nodes that were down are up again."""
+        for node in nodes:
+            self.up[node] = True
+            self.engine.set_up(self.number[node], True)
+            self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
 
     def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
         chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]

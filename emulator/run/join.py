@@ -15,7 +15,7 @@ from vnet.link import wire
 @dataclass
 class _Member:
     lead: str
-    nonce: bytes
+    nonce: bytes | None  # None: it is to join again
     pid: int
     host: str
     ready: bool = False
@@ -34,13 +34,13 @@ class Membership:
         if hello.node != key_node or key_node not in self._node_ids or hello.lead not in self._node_ids:
             return f"{hello.node!r} is not a node of this run"
         member = self._members.get(hello.node)
-        if member is not None and member.nonce != hello.nonce:
+        if member is not None and member.nonce not in (None, hello.nonce):
             return f"{hello.node} is already present"
-        if member is None:
-            if self.closed:
+        if member is None or member.nonce is None:
+            if self.closed and (member is None or member.lead != hello.lead):
                 return "the run has started"
             lead = self._members.get(hello.lead)
-            if lead is not None and lead.nonce != hello.nonce:
+            if lead is not None and lead.nonce not in (None, hello.nonce):
                 return f"{hello.lead} belongs to another process"
             member = self._members[hello.node] = _Member(hello.lead, hello.nonce, hello.pid, hello.host)
         member.ready = member.ready or hello.ready
@@ -49,6 +49,12 @@ class Membership:
     def leave(self, node: str) -> None:
         """Forget a node that went away before the start."""
         self._members.pop(node, None)
+
+    def expect(self, nodes: Sequence[str]) -> None:
+        """These nodes are to join again, from new processes."""
+        for node in nodes:
+            self._members[node].nonce = None
+            self._members[node].ready = False
 
     @property
     def missing(self) -> list[str]:
@@ -71,6 +77,11 @@ class Membership:
         """Whether a message on the `tx` of `lead` with this nonce is its process's own."""
         member = self._members.get(lead)
         return member is not None and member.nonce == nonce and member.lead == lead
+
+    def nodes_with(self, lead: str) -> list[str]:
+        """The nodes of the process of `lead`, the lead first."""
+        others = [node for node in self._node_ids if node != lead and self._members[node].lead == lead]
+        return [lead, *others]
 
     def lead_of(self, node: str) -> str:
         """The lead of a node's process."""

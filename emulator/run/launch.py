@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +53,7 @@ class Launcher:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._services: set[str] = set()
 
     def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
         """Start the process of `nodes`; its name here is that of its lead, the first node.
@@ -67,15 +68,17 @@ class Launcher:
             os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
 
     def start(
-        self, name: str, arguments: Sequence[str], credentials: Credentials, environment: Mapping[str, str]
+        self, name: str, arguments: Sequence[str], credentials: Credentials | None, environment: Mapping[str, str]
     ) -> None:
-        """Start `python ARGUMENTS --credentials …` with its output in `logs/{name}.log`."""
+        """Start `python ARGUMENTS`, with `--credentials` if there are any; its output goes to `logs/{name}.log`."""
         read_end, write_end = os.pipe()
-        os.write(write_end, credentials.dumps().encode())
+        command = [sys.executable, *arguments]
+        if credentials is not None:
+            os.write(write_end, credentials.dumps().encode())
+            command += ["--credentials", f"/dev/fd/{read_end}"]
         os.close(write_end)
-        command = [sys.executable, *arguments, "--credentials", f"/dev/fd/{read_end}"]
         try:
-            with (self._logs / f"{name}.log").open("wb") as log:
+            with (self._logs / f"{name}.log").open("ab") as log:
                 self._processes[name] = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -118,6 +121,33 @@ class Launcher:
         if name in self._processes:
             self._processes[name].send_signal(signal.SIGUSR1)
 
+    def start_service(self, name: str, arguments: Sequence[str]) -> None:
+        """Start `python ARGUMENTS`, which goes on until it is told to end."""
+        self._services.add(name)
+        self.start(name, arguments, None, {})
+
+    def kill(self, name: str) -> None:
+        """End a process at once; it is not among those that `ended` reports."""
+        process = self._processes.pop(name, None)
+        if process is not None:
+            process.kill()
+            process.wait()
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a process, if it is there."""
+        if name in self._processes:
+            self._processes[name].send_signal(number)
+
+    def see_off(self, name: str, patience_s: float) -> None:
+        """Wait for a process that has been told to go, and kill it if it does not; `ended` does not report it."""
+        process = self._processes.pop(name, None)
+        if process is not None:
+            try:
+                process.wait(patience_s)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
     def wait_for(self, name: str, timeout_s: float) -> None:
         """Wait for one process to end by itself."""
         with contextlib.suppress(KeyError, subprocess.TimeoutExpired):
@@ -125,7 +155,7 @@ class Launcher:
 
     def stop(self, patience_s: float = 1.0) -> None:
         """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL."""
-        self._wait(patience_s)
+        self._wait(patience_s, self._services)
         for process in self._processes.values():
             process.terminate()
         self._wait(0.5)
@@ -135,11 +165,13 @@ class Launcher:
             process.wait()
         self._processes.clear()
 
-    def _wait(self, timeout_s: float) -> None:
+    def _wait(self, timeout_s: float, but: Set[str] = frozenset()) -> None:
+        """Wait until all but these have ended."""
         deadline = time.monotonic() + timeout_s
-        while self._processes and time.monotonic() < deadline:
+        while time.monotonic() < deadline:
             for name, process in list(self._processes.items()):
                 if process.poll() is not None:
                     del self._processes[name]
-            if self._processes:
-                time.sleep(0.01)
+            if self._processes.keys() <= but:
+                return
+            time.sleep(0.01)

@@ -11,23 +11,23 @@ import gc
 import signal
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import ExitStack, asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import zenoh
-
 from emulator.observe.observation import scene_message
-from emulator.run.emulation import Emulation, PeriodView
+from emulator.run.attachment import Attachment, LiveOptions
+from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
 from emulator.run.pacing import Lockstep, ProtocolError, RealTime
+from emulator.run.router import ROUTER
 from vnet.errors import LinkError, ProgramError, VnetError, WireError
+from vnet.faults import EmulatorRestart, Infrastructure
 from vnet.link import keys, wire
-from vnet.link.access import EMULATOR, OBSERVER, Access
-from vnet.link.session import open_client, open_router, router_endpoint
+from vnet.link.access import OBSERVER
+from vnet.scenario import Scenario
 
 LEASE_MS = 60_000
 """Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
@@ -35,26 +35,14 @@ REALTIME_LEASE_MS = 2_000
 DEATH_GRACE_S = 0.3
 """How long the last words of a process that has ended may still be on their way."""
 STANDING_WAIT_S = 1.0
+AWAIT_WARNING_S = 0.2
+"""How long before it goes the emulator tells agents that it will."""
+REJOIN_POLL_S = 0.1
 FAREWELL_S = 1.0
 RECORDER_WAIT_S = 20.0
 RECORDER = "recorder"
 REALTIME_AGENT_NICE = 5
 SCENE_EVERY_PERIODS = 50
-
-
-@dataclass(frozen=True)
-class LiveOptions:
-    """How a live run is attached.
-
-    `listen` (embedded router) or `connect` (client of a separate one); `launch` starts the agents; `record`
-    is where a recorder process writes its recording, or None.
-    """
-
-    access: Access
-    listen: str = "tcp/127.0.0.1:0"
-    connect: str | None = None
-    launch: bool = True
-    record: Path | None = None
 
 
 class Stalled(Exception):
@@ -86,39 +74,35 @@ async def run_live(
 
     Ctrl-C and SIGTERM end the run early, with the event `interrupted`. Raises VnetError if it cannot start.
     """
-    realtime = emulation.scenario.run.pacing == "realtime"
-    lease_ms = REALTIME_LEASE_MS if realtime else LEASE_MS
-    access = options.access
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
         stack.callback(launcher.stop)
         async with _interruptible():
-            if options.connect is None:
-                session = stack.enter_context(open_router(options.listen, access, lease_ms))
-                endpoint = router_endpoint(session)
-            else:
-                endpoint = options.connect
-                session = stack.enter_context(open_client(endpoint, access.credentials(EMULATOR), lease_ms))
-            run = LiveRun(emulation, options, session, launcher, stack)
-            return await run.run(endpoint, on_state)
+            if options.router is not None:
+                options.router.start(launcher)
+            run = LiveRun(emulation, options, launcher)
+            stack.callback(run.close)
+            return await run.run(on_state)
+
+
+def _lease_ms(scenario: Scenario) -> int:
+    """How long nothing may be heard of a process; in real time a planned pause is not to end its connection."""
+    if scenario.run.pacing == "lockstep":
+        return LEASE_MS
+    pauses_s = [fault.duration_s for fault in scenario.fault if fault.kind == "pause"]
+    return REALTIME_LEASE_MS + round(1000 * max(pauses_s, default=0.0))
 
 
 class LiveRun:
-    """One live run: its session, its processes and its pacing."""
+    """One live run: its attachment, its processes and its pacing."""
 
-    def __init__(
-        self,
-        emulation: Emulation,
-        options: LiveOptions,
-        session: zenoh.Session,
-        launcher: Launcher,
-        stack: ExitStack,
-    ) -> None:
+    def __init__(self, emulation: Emulation, options: LiveOptions, launcher: Launcher) -> None:
         self._emulation = emulation
         self._options = options
         self._launcher = launcher
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
+        self._realtime = emulation.scenario.run.pacing == "realtime"
         self._members = Membership(emulation.world.node_ids)
         self._pacing: Lockstep | RealTime | None = None
         self._origin_ns = 0
@@ -127,43 +111,24 @@ class LiveRun:
         self._over = False
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
+        self._returning: set[str] = set()  # nodes whose processes faults have ended
+        self._expected: set[str] = set()  # leads of processes that were started anew (real time)
+        self._paused: set[str] = set()
+        self._restarting = False
         self._join_failure: VnetError | None = None
         self._standing: dict[str, str] = {}
         self._refused: dict[str, int] = {}
-        self._open(session, stack)
+        lease_ms = _lease_ms(emulation.scenario)
+        self._link = Attachment(
+            options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake
+        )
+        self._link.open()
 
-    def _open(self, session: zenoh.Session, stack: ExitStack) -> None:
-        name = self._name
-        realtime = self._emulation.scenario.run.pacing == "realtime"
-        # Lockstep has one message outstanding per agent, so BLOCK is safe; in real time one frozen agent
-        # must not stall all others.
-        control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
-        self._rx = {
-            node: stack.enter_context(
-                session.declare_publisher(keys.node_rx(name, node), congestion_control=control, express=True)
-            )
-            for node in self._emulation.world.node_ids
-        }
-        self._observers = {
-            stream: stack.enter_context(
-                session.declare_publisher(
-                    keys.observe(name, stream), congestion_control=zenoh.CongestionControl.DROP
-                )
-            )
-            for stream in ("scene", "period", "end")
-        }
-        liveliness = session.liveliness()
-        stack.enter_context(session.declare_subscriber(keys.node_tx(name, "*"), self._on_tx))
-        stack.enter_context(liveliness.declare_subscriber(keys.node_alive(name, "*"), self._on_alive, history=True))
-        stack.enter_context(liveliness.declare_token(keys.emulator_alive(name)))
+    def close(self) -> None:
+        """Close what is open to the world."""
+        self._link.close()
 
     # Zenoh's threads: append, and wake the loop once.
-
-    def _on_tx(self, sample: zenoh.Sample) -> None:
-        self._intake(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
-
-    def _on_alive(self, sample: zenoh.Sample) -> None:
-        self._intake(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
     def _intake(self, node: str, item: bytes | bool) -> None:
         self._incoming.append((node, item))
@@ -214,17 +179,14 @@ class LiveRun:
         refusal = self._members.hello(node, hello)
         if refusal is not None:
             self._refuse(node, refusal)
-            if node in self._rx:
-                self._send(node, wire.End(hello.nonce, refusal, refused=True))
+            if self._link.knows(node):
+                self._link.send(node, wire.End(hello.nonce, refusal, refused=True))
             return
         if hello.failure is not None:
             self._join_failure = ProgramError(f"{node}: {hello.failure}")
         elif not hello.ready:
-            self._send(node, self._emulation.welcome(node, hello.nonce))
+            self._link.send(node, self._emulation.welcome(node, hello.nonce))
         self._changed.set()
-
-    def _send(self, node: str, message: wire.EmulatorMessage) -> None:
-        self._rx[node].put(wire.encode(message))
 
     def _time_ns(self) -> int:
         """Emulated time for the event log."""
@@ -242,7 +204,7 @@ class LiveRun:
             self._loop.call_later(DEATH_GRACE_S, self._process_ended, name, how)
 
     def _process_ended(self, name: str, how: Exit) -> None:
-        if name not in self._rx:
+        if not self._link.knows(name):
             self._emulation.folder.event(self._time_ns(), "observer_ended", name, how=how.how)
         elif self._pacing is None:
             last = how.log_tail.splitlines()[-1:] or ["its log is empty"]
@@ -252,7 +214,8 @@ class LiveRun:
             self._process_dead(name, how=how.how, log_tail=how.log_tail)
 
     def _token_lost(self, node: str) -> None:
-        if node not in self._members.joined or node in self._launcher.pids:
+        away = self._restarting or node in self._returning
+        if away or node not in self._members.joined or node in self._launcher.pids:
             return
         if self._pacing is None:
             self._members.leave(node)
@@ -268,7 +231,7 @@ class LiveRun:
 
     # The course of a run.
 
-    async def run(self, endpoint: str, on_state: Callable[[str], None]) -> tuple[float, bool]:
+    async def run(self, on_state: Callable[[str], None]) -> tuple[float, bool]:
         """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
         self._loop.add_signal_handler(signal.SIGCHLD, self._children_ended)
         folder = self._emulation.folder
@@ -276,7 +239,7 @@ class LiveRun:
         patience_s = 0.5
         interrupted = False
         try:
-            await self._join(endpoint, on_state)
+            await self._join(on_state)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
             self._emulation.watch(self._publish_period)
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
@@ -291,6 +254,7 @@ class LiveRun:
             self._emulation.finish(self._time_ns())
         finally:
             wall_s = time.monotonic() - started
+            self._stand_still(set())
             await self._farewell(patience_s)
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
@@ -298,19 +262,19 @@ class LiveRun:
             self._over = True
         return wall_s, interrupted
 
-    async def _join(self, endpoint: str, on_state: Callable[[str], None]) -> None:
+    async def _join(self, on_state: Callable[[str], None]) -> None:
         """Start what is to be started and wait until every node is ready."""
         run = self._emulation.scenario.run
         node_ids = self._emulation.world.node_ids
         groups = split_into_processes(node_ids, run.nodes_per_process)
+        endpoint = self._link.endpoint
         deadline = time.monotonic() + run.join_timeout_s
         if self._options.record is not None:
             self._start_recorder(endpoint, self._options.record)
         if self._options.launch:
             on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
-            nice = REALTIME_AGENT_NICE if run.pacing == "realtime" else 0
             for nodes in groups:
-                self._launcher.start_agent(endpoint, self._options.access, nodes, nice)
+                self._launch(nodes)
         else:
             on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
         while self._members.missing or not self._recorder_listens():
@@ -321,13 +285,17 @@ class LiveRun:
             await self._change(0.05 if self._options.record else deadline - time.monotonic())
         self._members.closed = True
 
+    def _launch(self, nodes: Sequence[str]) -> None:
+        nice = REALTIME_AGENT_NICE if self._realtime else 0
+        self._launcher.start_agent(self._link.endpoint, self._options.access, nodes, nice)
+
     def _start_recorder(self, endpoint: str, path: Path) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
         arguments += ["--out", str(path)]
         self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
 
     def _recorder_listens(self) -> bool:
-        return self._options.record is None or self._is_watched("period")
+        return self._options.record is None or self._link.is_watched("period")
 
     def _who_is_missing(self, timeout_s: float) -> str:
         missing = self._members.missing or ["the recorder"]
@@ -347,7 +315,7 @@ class LiveRun:
 
     async def _course(self) -> None:
         processes = self._members.processes()
-        self._publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
         if self._emulation.scenario.run.pacing == "lockstep":
             self._pacing = lockstep = Lockstep(self._emulation, processes)
             await self._run_lockstep(lockstep)
@@ -358,12 +326,120 @@ class LiveRun:
     async def _run_lockstep(self, lockstep: Lockstep) -> None:
         grants = lockstep.start()
         while grants:
+            for actions in lockstep.take_actions():
+                await self._suffer(actions)
             for lead, grant in grants.items():
-                self._send(lead, grant)
+                self._link.send(lead, grant)
             await self._all_yielded(lockstep)
             grants = lockstep.step()
         for lead in sorted(self._dead):
             lockstep.died(lead, **self._dead[lead])
+
+    # Faults of processes.
+
+    async def _suffer(self, actions: ProcessActions) -> None:
+        """Do to the processes what the faults of an instant do."""
+        for node, killed in actions.stop.items():
+            await self._end_process(node, killed)
+        started = [node for node in actions.start if self._members.lead_of(node) == node]
+        for lead in started:
+            self._begin_process(lead)
+        if isinstance(self._pacing, Lockstep) and started:
+            await self._returned(started)
+        elif started:
+            self._expected.update(started)
+        self._stand_still({self._members.lead_of(node) for node in actions.paused})
+        for fault in actions.restarts:
+            await self._restart_link(fault)
+
+    def _stand_still(self, leads: set[str]) -> None:
+        """Stop the processes that are paused, and let the others go on. In lockstep it is enough not to grant."""
+        if self._realtime:
+            for lead in sorted(self._paused - leads):
+                self._launcher.signal(lead, signal.SIGCONT)
+            for lead in sorted(leads - self._paused):
+                self._launcher.signal(lead, signal.SIGSTOP)
+        self._paused = leads
+
+    def _welcome_back(self, realtime: RealTime) -> None:
+        """Real time: start what has come back."""
+        missing = set(self._members.missing)
+        for lead in sorted(self._expected):
+            if not missing & set(self._members.nodes_with(lead)):
+                self._expected.discard(lead)
+                self._returning.difference_update(self._members.nodes_with(lead))
+                self._link.send(lead, realtime.returned(self._now_ns(), lead))
+
+    async def _end_process(self, node: str, killed: bool) -> None:
+        """End the process of a node; those started by hand are told to go, and whoever started them may again."""
+        if self._members.lead_of(node) != node:
+            return
+        self._returning.update(self._members.nodes_with(node))
+        if killed and self._options.launch:
+            self._launcher.kill(node)
+            return
+        self._link.send(node, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
+        if self._options.launch:
+            await asyncio.to_thread(self._launcher.see_off, node, FAREWELL_S)
+
+    def _begin_process(self, lead: str) -> None:
+        nodes = self._members.nodes_with(lead)
+        self._members.expect(nodes)
+        if self._options.launch:
+            self._launch(nodes)
+
+    async def _returned(self, leads: Sequence[str]) -> None:
+        """Wait until processes that start anew are there again. Raises Stalled if they are not in time."""
+        timeout_s = self._emulation.scenario.run.join_timeout_s
+        deadline = time.monotonic() + timeout_s
+        nodes = [node for lead in leads for node in self._members.nodes_with(lead)]
+        while late := [
+            n for n in nodes if n in self._members.missing and self._members.lead_of(n) not in self._dead
+        ]:
+            if not await self._change(deadline - time.monotonic()):
+                error = f"has not come back within {timeout_s:g} s"
+                self._emulation.folder.event(self._time_ns(), "stalled", late[0], error=error)
+                raise Stalled
+        self._returning.difference_update(nodes)
+
+    def _late(self, nodes: Sequence[str]) -> list[str]:
+        """Those of `nodes` that are not there yet, and may still come."""
+        missing = set(self._members.missing)
+        return [node for node in nodes if node in missing and self._members.lead_of(node) not in self._dead]
+
+    async def _restart_link(self, fault: Infrastructure) -> None:
+        """Take the emulator's connection (or the separate router) down and up again; the agents are told first."""
+        patience_s = fault.down_s + self._emulation.scenario.run.join_timeout_s
+        living = [node for node in self._emulation.world.node_ids if self._emulation.up[node]]
+        for node in living:
+            self._link.send(node, wire.Await(patience_s))
+        await asyncio.sleep(AWAIT_WARNING_S)
+        self._restarting = True
+        if isinstance(fault, EmulatorRestart):
+            await asyncio.to_thread(self._link.close)
+            await asyncio.sleep(fault.down_s)
+            await asyncio.to_thread(self._link.open)
+        else:
+            self._launcher.kill(ROUTER)
+            await asyncio.sleep(fault.down_s)
+            assert self._options.router is not None
+            await asyncio.to_thread(self._options.router.start, self._launcher)
+        await self._all_answer(sorted({self._members.lead_of(node) for node in living}), patience_s)
+        self._restarting = False
+
+    async def _all_answer(self, leads: Sequence[str], patience_s: float) -> None:
+        """Wait until each process has answered: only then do messages pass in both directions again."""
+        self._standing.clear()
+        deadline = time.monotonic() + patience_s
+        while silent := [lead for lead in leads if lead not in self._standing and lead not in self._dead]:
+            if time.monotonic() > deadline:
+                error = f"has not found the emulator again within {patience_s:g} s"
+                self._emulation.folder.event(self._time_ns(), "stalled", silent[0], error=error)
+                raise Stalled
+            for lead in silent:
+                self._link.send(lead, wire.Where())
+            await asyncio.sleep(REJOIN_POLL_S)
+        self._standing.clear()
 
     async def _all_yielded(self, lockstep: Lockstep) -> None:
         stall_timeout_s = self._emulation.scenario.run.stall_timeout_s
@@ -376,7 +452,7 @@ class LiveRun:
     async def _stall(self, leads: list[str], timeout_s: float) -> None:
         """Ask those who do not yield where they stand, write it down and give up."""
         for lead in leads:
-            self._send(lead, wire.Where())
+            self._link.send(lead, wire.Where())
             self._launcher.ask_where(lead)
         await asyncio.sleep(STANDING_WAIT_S)
         for lead in leads:
@@ -394,39 +470,37 @@ class LiveRun:
         self._origin_ns = time.monotonic_ns() + wire.HEAD_START_NS
         duration_ns = self._emulation.duration_ns
         for lead, batch in realtime.start(self._origin_ns).items():
-            self._send(lead, batch)
+            self._link.send(lead, batch)
         await asyncio.sleep(wire.HEAD_START_NS / 1e9)
         while (now_ns := self._now_ns()) < duration_ns:
-            for lead, batch in realtime.due(now_ns).items():
-                self._send(lead, batch)
+            batches = realtime.due(now_ns)
+            for actions in realtime.take_actions():
+                await self._suffer(actions)
+            for lead, batch in batches.items():
+                self._link.send(lead, batch)
+            self._welcome_back(realtime)
             next_ns = min(realtime.next_time_ns() or duration_ns, duration_ns)
             await self._change((next_ns - self._now_ns()) / 1e9)
 
     async def _farewell(self, patience_s: float) -> None:
         """Tell everybody that it is over, hear last words, and see every process off."""
         for node in self._members.joined:
-            self._send(node, wire.End(None, "the run is over"))
+            self._link.send(node, wire.End(None, "the run is over"))
         if isinstance(self._pacing, RealTime):
             deadline = time.monotonic() + FAREWELL_S
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
-        self._publish("end", {})
+        self._link.publish("end", {})
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
         self._launcher.stop(patience_s)
 
     # Those who watch.
 
-    def _is_watched(self, stream: str) -> bool:
-        return bool(self._observers[stream].matching_status.matching)  # type: ignore[attr-defined]
-
-    def _publish(self, stream: str, message: dict[str, Any]) -> None:
-        self._observers[stream].put(wire.encode_observation(message))
-
     def _publish_period(self, view: PeriodView) -> None:
-        if not self._is_watched("period"):
+        if not self._link.is_watched("period"):
             return
         if view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
-            self._publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
-        self._publish("period", view.message(self._emulation.world.node_ids))
+            self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        self._link.publish("period", view.message(self._emulation.world.node_ids))

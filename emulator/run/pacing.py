@@ -222,7 +222,8 @@ class Lockstep:
 class RealTime:
     """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
 
-    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`.
+    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`. Processes
+    come and go with faults: do what `take_actions` says, and tell `returned` when one is there again.
     """
 
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
@@ -232,20 +233,30 @@ class RealTime:
         self._batch_seq = dict.fromkeys(self._nodes, 0)
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
-        self._lateness: dict[str, Sequence[int]] = {}
+        self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
+        self._present = set(self._nodes)
         self._awaited = set(self._nodes)
+        self._paused: set[str] = set()
+        self._was_paused: set[str] = set()
+        self._actions: list[ProcessActions] = []
+        self._packets: dict[str, list[Delivery]] = {}
+        self._fixes: dict[str, list[wire.WireFix]] = {}
+        self._clocks: dict[str, dict[str, wire.ClockBend]] = {lead: {} for lead in self._nodes}
         self._next_period = 0
+        self._origin_ns = 0
         self.gaps = 0
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
         """The batches that start every process; time 0 is `origin_ns` on the machine's monotonic clock."""
-        return {lead: self._batch(lead, [], [], origin_ns) for lead in self._nodes}
+        self._origin_ns = origin_ns
+        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes}
 
     def next_time_ns(self) -> int | None:
-        """When `due` must be called next: the next arrival or the next fix."""
+        """When `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
             self._emulation.fix_time_ns(self._next_period),
+            self._emulation.next_fault_ns(),
         ]
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return min(due) if due else None
@@ -258,7 +269,7 @@ class RealTime:
         self._frames_seq[lead] = message.seq + 1
         self._acknowledge(lead, message)
         if message.lateness is not None:
-            self._lateness[lead] = message.lateness.counts
+            self._lateness[lead, self._emulation.incarnation[lead]] = message.lateness.counts
         if message.final:
             self._awaited.discard(lead)
         if now_ns < self._emulation.duration_ns:
@@ -284,48 +295,79 @@ class RealTime:
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """What has become due by `now_ns`, by process."""
-        emulation = self._emulation
-        node_ids = emulation.world.node_ids
-        packets: dict[str, list[Delivery]] = {}
-        for delivery in emulation.advance(now_ns):
-            packets.setdefault(self._lead[node_ids[delivery.receiver]], []).append(delivery)
-        fixes = self._due_fixes(now_ns)
+        while (fault_ns := self._emulation.next_fault_ns()) is not None and fault_ns <= now_ns:
+            self._collect(fault_ns - 1)
+            self._act(fault_ns)
+        self._collect(now_ns)
+        ready = self._present - self._paused
         return {
-            lead: self._batch(lead, packets.get(lead, []), fixes.get(lead, []))
+            lead: self._batch(lead)
             for lead in self._nodes
-            if lead in packets or lead in fixes
+            if lead in ready and (lead in self._packets or lead in self._fixes or self._clocks[lead])
         }
 
-    def _due_fixes(self, now_ns: int) -> dict[str, list[wire.WireFix]]:
-        world = self._emulation.world
-        fixes: dict[str, list[wire.WireFix]] = {}
-        while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= now_ns:
-            for number, node in enumerate(world.node_ids):
-                if self._emulation.up[node]:
-                    fix = wire.WireFix.of(node, world.fix(self._next_period, number))
-                    fixes.setdefault(self._lead[node], []).append(fix)
-            self._next_period += 1
-        return fixes
+    def take_actions(self) -> list[ProcessActions]:
+        """What processes suffer by now."""
+        actions, self._actions = self._actions, []
+        return actions
 
-    def _batch(
-        self,
-        lead: str,
-        deliveries: list[Delivery],
-        fixes: list[wire.WireFix],
-        origin_ns: int | None = None,
-    ) -> wire.Batch:
+    def _act(self, time_ns: int) -> None:
+        actions = self._emulation.act(time_ns, starts_at_once=False)
+        self._actions.append(actions)
+        for lead in {self._lead[node] for node in actions.stop}:
+            self._present.discard(lead)
+            self._awaited.discard(lead)
+            self._unacknowledged[lead].clear()
+            self._packets.pop(lead, None)
+            self._fixes.pop(lead, None)
+        paused = {self._lead[node] for node in actions.paused}
+        self._was_paused |= self._paused - paused
+        self._paused = paused
+        for clock in actions.clocks:
+            if clock.bends or clock.node in self._clocks[self._lead[clock.node]]:
+                self._clocks[self._lead[clock.node]][clock.node] = clock
+
+    def returned(self, now_ns: int, lead: str) -> wire.Batch:
+        """A process that was started anew is ready; returns the batch that starts it."""
+        self._emulation.come_back(self._nodes[lead], now_ns)
+        self._batch_seq[lead] = self._frames_seq[lead] = 0
+        self._unacknowledged[lead].clear()
+        self._present.add(lead)
+        self._awaited.add(lead)
+        return self._batch(lead, origin_ns=self._origin_ns, start_ns=now_ns)
+
+    def _collect(self, time_ns: int) -> None:
+        """Take what arrives, and the fixes that are due, by then."""
+        node_ids = self._emulation.world.node_ids
+        for delivery in self._emulation.advance(time_ns):
+            lead = self._lead[node_ids[delivery.receiver]]
+            if lead in self._present:
+                self._packets.setdefault(lead, []).append(delivery)
+        while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= time_ns:
+            for number, node in enumerate(node_ids):
+                fix = self._emulation.gnss.fix(self._next_period, number) if self._emulation.up[node] else None
+                if fix is not None and self._lead[node] in self._present:
+                    self._fixes.setdefault(self._lead[node], []).append(wire.WireFix.of(node, fix))
+            self._next_period += 1
+
+    def _batch(self, lead: str, origin_ns: int | None = None, start_ns: int = 0) -> wire.Batch:
         seq = self._batch_seq[lead]
         self._batch_seq[lead] = seq + 1
+        deliveries, fixes = self._packets.pop(lead, []), self._fixes.pop(lead, [])
         self._unacknowledged[lead][seq] = deliveries
         node_ids = self._emulation.world.node_ids
         packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
-        return wire.Batch(fixes, seq, packets, origin_ns)
+        clocks, self._clocks[lead] = list(self._clocks[lead].values()), {}
+        held = lead in self._was_paused
+        self._was_paused.discard(lead)
+        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks)
 
     def died(self, now_ns: int, lead: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""
         for node in self._nodes[lead]:
             self._emulation.died(now_ns, node, **details)
         self._unacknowledged[lead].clear()
+        self._present.discard(lead)
         self._awaited.discard(lead)
 
     def finish(self) -> None:

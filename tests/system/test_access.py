@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from emulator.observe.run_folder import RunFolder
+from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude
 from emulator.run.emulation import Emulation
-from emulator.run.live import LiveOptions, run_live
+from emulator.run.live import run_live
 from emulator.world.world import build_world
 from tests.system.conftest import ROOT, TIMEOUT_S
 from vnet.errors import VnetError
