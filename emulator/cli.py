@@ -19,6 +19,8 @@ import typer
 from rich.console import Console
 
 from emulator.experiments.cli import app as experiment_app
+from emulator.fault_cli import app as fault_app
+from emulator.fault_cli import status
 from emulator.observe.checks import check_run
 from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
@@ -46,6 +48,8 @@ app = typer.Typer(
     help="An asyncio message-passing emulator for connected vehicles over Zenoh.",
 )
 app.add_typer(experiment_app, name="experiment")
+app.add_typer(fault_app, name="fault")
+app.command()(status)
 
 
 class Pacing(StrEnum):

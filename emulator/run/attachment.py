@@ -37,7 +37,7 @@ class LiveOptions:
 
 
 class Attachment:
-    """The emulator's end of the wire. `on_tx` and `on_alive` are called on Zenoh's threads, with the node's id."""
+    """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a node's id or a verb."""
 
     def __init__(
         self,
@@ -47,6 +47,7 @@ class Attachment:
         drops: bool,
         on_tx: Callable[[str, bytes], None],
         on_alive: Callable[[str, bool], None],
+        on_query: Callable[[str, zenoh.Query], None],
     ) -> None:
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
@@ -57,6 +58,7 @@ class Attachment:
         self._drops = drops
         self._on_tx = on_tx
         self._on_alive = on_alive
+        self._on_query = on_query
         self._stack = ExitStack()
         self._rx: dict[str, zenoh.Publisher] = {}
         self._observers: dict[str, zenoh.Publisher] = {}
@@ -91,6 +93,7 @@ class Attachment:
         stack.enter_context(session.declare_subscriber(keys.node_tx(self._run, "*"), self._take_tx))
         alive = keys.node_alive(self._run, "*")
         stack.enter_context(liveliness.declare_subscriber(alive, self._take_alive, history=True))
+        stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
         stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
 
     def close(self) -> None:
@@ -102,6 +105,9 @@ class Attachment:
 
     def _take_alive(self, sample: zenoh.Sample) -> None:
         self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
+    def _take_query(self, query: zenoh.Query) -> None:
+        self._on_query(keys.verb_of(str(query.key_expr)), query)
 
     def knows(self, node: str) -> bool:
         """Whether there is a key for this node."""

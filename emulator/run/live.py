@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import json
 import signal
 import time
 from collections import deque
@@ -16,8 +17,11 @@ from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import zenoh
+
 from emulator.observe.observation import scene_message
 from emulator.run.attachment import Attachment, LiveOptions
+from emulator.run.control import answer, way_in
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
@@ -82,6 +86,7 @@ async def run_live(
                 options.router.start(launcher)
             run = LiveRun(emulation, options, launcher)
             stack.callback(run.close)
+            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access))
             return await run.run(on_state)
 
 
@@ -106,7 +111,7 @@ class LiveRun:
         self._members = Membership(emulation.world.node_ids)
         self._pacing: Lockstep | RealTime | None = None
         self._origin_ns = 0
-        self._incoming: deque[tuple[str, bytes | bool]] = deque()
+        self._incoming: deque[tuple[str, bytes | bool | zenoh.Query]] = deque()
         self._wake_pending = False
         self._over = False
         self._changed = asyncio.Event()
@@ -120,9 +125,14 @@ class LiveRun:
         self._refused: dict[str, int] = {}
         lease_ms = _lease_ms(emulation.scenario)
         self._link = Attachment(
-            options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake
+            options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake, self._intake
         )
         self._link.open()
+
+    @property
+    def endpoint(self) -> str:
+        """Where agents and operators connect."""
+        return self._link.endpoint
 
     def close(self) -> None:
         """Close what is open to the world."""
@@ -130,8 +140,8 @@ class LiveRun:
 
     # Zenoh's threads: append, and wake the loop once.
 
-    def _intake(self, node: str, item: bytes | bool) -> None:
-        self._incoming.append((node, item))
+    def _intake(self, name: str, item: bytes | bool | zenoh.Query) -> None:
+        self._incoming.append((name, item))
         if not self._wake_pending and not self._over:
             self._wake_pending = True
             self._loop.call_soon_threadsafe(self._drain)
@@ -146,10 +156,25 @@ class LiveRun:
                 if not item:
                     self._token_lost(node)
                 continue
+            if isinstance(item, zenoh.Query):
+                self._answer(node, item)
+                continue
             try:
                 self._take(node, wire.decode_tx(item))
             except (WireError, ProtocolError) as error:
                 self._refuse(node, str(error))
+
+    def _answer(self, verb: str, query: zenoh.Query) -> None:
+        """Answer an operator, with an error in one line if need be."""
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        own_router = self._options.router is not None
+        with query:
+            try:
+                told = answer(self._emulation, verb, payload, self._time_ns(), own_router)
+                query.reply(query.key_expr, json.dumps(told))
+            except VnetError as error:
+                query.reply_err(str(error))
+        self._changed.set()
 
     def _take(self, node: str, message: wire.AgentMessage) -> None:
         if isinstance(message, wire.Hello):

@@ -1,9 +1,9 @@
 """Who may do what on the router: users, passwords and rules for one run.
 
 The router denies by default. Roles: *node* (one user an agent process, granted exactly its nodes' keys),
-*observer* (receives only) and *emulator* (all of the run's keys; needed only where the emulator is a client of a
-separate `zenohd`). Rules have no templating by user name, so that there
-is a set for each process.
+*observer* (receives only), *operator* (queries `control`) and *emulator* (all of the run's keys; needed only where
+the emulator is a client of a separate router). Rules have no templating by user name, so that there is a set for
+each process.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ Rule = dict[str, Any]
 
 EMULATOR = "emulator"
 OBSERVER = "observer"
+OPERATOR = "operator"
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Access:
     @classmethod
     def create(cls, run: str, processes: Sequence[Sequence[str]]) -> Access:
         """Draw new passwords for every process and role of a run."""
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER]
+        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
@@ -105,6 +106,13 @@ class Access:
                 [
                     _rule("observer-in", ["ingress"], [*SUBSCRIBE, *WATCH_TOKENS], observed),
                     _rule("observer-out", ["egress"], ["put", "delete", "liveliness_token"], observed),
+                ],
+            ),
+            (
+                OPERATOR,
+                [
+                    _rule("operator-ask", ["ingress"], ["query"], [keys.control(self.run, "*")]),
+                    _rule("operator-told", ["egress"], ["reply"], [keys.control(self.run, "*")]),
                 ],
             ),
             (EMULATOR, [_rule("emulator", ["ingress", "egress"], EVERYTHING, [f"vnet/{self.run}/**"])]),

@@ -43,6 +43,16 @@ def observe(run: str, stream: str) -> str:
     return f"vnet/{run}/observe/{stream}"
 
 
+def control(run: str, verb: str) -> str:
+    """Queries of operators, answered by the emulator."""
+    return f"vnet/{run}/control/{verb}"
+
+
+def verb_of(key: str) -> str:
+    """The verb of a control key."""
+    return key.split("/", 3)[3]
+
+
 def node_of(key: str) -> str:
     """The node id in one of the `node/` keys above."""
     return key.split("/")[3]

@@ -1,0 +1,99 @@
+"""`vnet fault` and `vnet status`: an operator's commands against a running emulator."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from emulator.run.control import ask
+from emulator.terminal import one_line_errors
+from vnet.errors import ScenarioError
+from vnet.faults import KINDS, parse_fault
+
+app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
+
+RunOption = Annotated[Path, typer.Option("--run", help="The folder of the run.")]
+LATEST = Path("runs/latest")
+
+
+@app.command()
+def inject(
+    kind: Annotated[str, typer.Argument(help=f"One of {', '.join(KINDS)}.")],
+    lasting: Annotated[float, typer.Option("--for", help="Emulated seconds.")] = 5.0,
+    at: Annotated[float | None, typer.Option(help="When, in emulated seconds; the default is now.")] = None,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="As in a scenario: probability=0.5, nodes.random=3"),
+    ] = None,
+    run: RunOption = LATEST,
+) -> None:
+    """Start a fault: vnet fault inject loss --for 5 --set probability=0.5 --set nodes.fraction=0.2"""
+    with one_line_errors():
+        fault: dict[str, Any] = {"kind": kind, "duration_s": lasting}
+        if at is not None:
+            fault["at_s"] = at
+        for parameter in parameters or []:
+            _set(fault, parameter)
+        parse_fault(fault)  # what is wrong is said before anybody is asked
+        _show([ask(run, "inject", fault)])
+
+
+@app.command()
+def heal(
+    name: Annotated[str, typer.Argument(help="The fault's name, as loss-0, or all.")], run: RunOption = LATEST
+) -> None:
+    """End a fault now."""
+    with one_line_errors():
+        healed = ask(run, "heal", name)["healed"]
+        print(f"healed: {', '.join(healed) or 'nothing was broken'}")
+
+
+@app.command("list")
+def list_faults(run: RunOption = LATEST) -> None:
+    """All faults of the run: those that were, are and will be."""
+    with one_line_errors():
+        _show(ask(run, "status")["faults"])
+
+
+def status(run: RunOption = LATEST) -> None:
+    """How a running emulator gets on."""
+    with one_line_errors():
+        found = ask(run, "status")
+        table = Table(title=f"run {found['run']}", show_header=False)
+        table.add_row("time", f"{found['emulated_s']:.1f} of {found['duration_s']:g} s, {found['pacing']}")
+        table.add_row("vehicles", f"{found['vehicles']}, down: {', '.join(found['down']) or 'none'}")
+        table.add_row("frames", ", ".join(f"{name} {count:,}" for name, count in found["frames"].items()))
+        acting = [fault["fault"] for fault in found["faults"] if fault["state"] == "acting"]
+        table.add_row("faults acting", ", ".join(acting) or "none")
+        Console().print(table)
+
+
+def _set(fault: dict[str, Any], parameter: str) -> None:
+    key, equals, text = parameter.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ScenarioError(f"--set {parameter}: write it as key=value, for example probability=0.3")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    table = fault
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"--set {parameter}: {part} is not a table")
+    table[parts[-1]] = value
+
+
+def _show(faults: list[dict[str, Any]]) -> None:
+    table = Table("fault", "state", "from", "to", "nodes")
+    for fault in faults:
+        nodes = fault["nodes"]
+        shown = ", ".join(nodes[:6]) + (f", … ({len(nodes)})" if len(nodes) > 6 else "")
+        table.add_row(fault["fault"], fault["state"], f"{fault['start_s']:.3f} s", f"{fault['end_s']:.3f} s", shown)
+    Console().print(table)

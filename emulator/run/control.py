@@ -1,0 +1,128 @@
+"""Control of a running emulator: queries on `control/{verb}`, answered by the run itself.
+
+`status`, `inject` (a fault as JSON) and `heal` (a fault's name, or `all`). What is wrong with a query comes back as
+one line of error. A run leaves the operator's way in, `control.json` (0600), in its folder for as long as it lasts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from emulator.faults.plan import PlannedFault
+from emulator.run.emulation import Emulation
+from vnet.errors import LinkError, ScenarioError, VnetError
+from vnet.faults import parse_fault
+from vnet.link import keys
+from vnet.link.access import OPERATOR, Access, Credentials, write_private
+from vnet.link.session import open_client
+
+CONTROL_FILE = "control.json"
+LARGEST_QUERY_BYTES = 1 << 20
+LEASE_MS = 10_000
+ANSWER_TIMEOUT_S = 10.0
+
+
+def answer(emulation: Emulation, verb: str, payload: bytes, now_ns: int, own_router: bool) -> dict[str, Any]:
+    """Do what a query asks for. Raises VnetError, in one line, if it cannot be done."""
+    match verb:
+        case "status":
+            return _status(emulation, now_ns)
+        case "inject":
+            fault = parse_fault(_json(payload))
+            if fault.kind == "router_restart" and not own_router:
+                raise ScenarioError("router_restart: needs a router of its own: vnet run --router separate")
+            return _described(emulation.inject(fault, now_ns), emulation, now_ns)
+        case "heal":
+            label = _json(payload)
+            if not isinstance(label, str):
+                raise ScenarioError(f"heal: {label!r} is no name of a fault")
+            return {"healed": _heal(emulation, label, now_ns)}
+        case _:
+            raise VnetError(f"control/{verb}: unknown; there are status, inject, heal")
+
+
+def _heal(emulation: Emulation, label: str, now_ns: int) -> list[str]:
+    if label != "all":
+        return [emulation.heal(label, now_ns).label]
+    acting = [planned for planned in emulation.faults.faults if planned.end_ns > now_ns]
+    return [emulation.heal(planned.label, now_ns).label for planned in acting]
+
+
+def _json(payload: bytes) -> Any:
+    if len(payload) > LARGEST_QUERY_BYTES:
+        raise ScenarioError(f"{len(payload)} bytes: at most {LARGEST_QUERY_BYTES} are taken")
+    try:
+        return json.loads(payload)
+    except (ValueError, RecursionError) as error:
+        raise ScenarioError(f"not valid JSON: {error}") from None
+
+
+def _status(emulation: Emulation, now_ns: int) -> dict[str, Any]:
+    scenario = emulation.scenario
+    return {
+        "run": scenario.run.name,
+        "pacing": scenario.run.pacing,
+        "emulated_s": now_ns / 1e9,
+        "duration_s": scenario.run.duration_s,
+        "vehicles": len(emulation.world.node_ids),
+        "down": [node for node, up in emulation.up.items() if not up],
+        "frames": {outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
+        "faults": [_described(planned, emulation, now_ns) for planned in emulation.faults.faults],
+    }
+
+
+def _described(planned: PlannedFault, emulation: Emulation, now_ns: int) -> dict[str, Any]:
+    state = "acting" if planned.acts_at(now_ns) else ("ended" if planned.end_ns <= now_ns else "to come")
+    return {
+        "fault": planned.label,
+        "state": state,
+        "start_s": planned.start_ns / 1e9,
+        "end_s": planned.end_ns / 1e9,
+        "nodes": [node for node, number in emulation.number.items() if planned.nodes[number]],
+    }
+
+
+@contextmanager
+def way_in(folder: Path, endpoint: str, access: Access) -> Iterator[None]:
+    """Keep `control.json` in the run's folder for as long as the block lasts."""
+    login = access.credentials(OPERATOR)
+    path = folder / CONTROL_FILE
+    data = {"endpoint": endpoint, "run": access.run, "user": login.user, "password": login.password}
+    try:
+        write_private(path, json.dumps(data) + "\n")
+    except OSError as error:
+        raise VnetError(f"{path}: cannot write: {error.strerror}") from None
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
+    """Put a query to the run whose folder this is. Raises VnetError: no such run, no answer, or what it says."""
+    path = folder / CONTROL_FILE
+    try:
+        data = json.loads(path.read_text())
+        endpoint, run, login = data["endpoint"], data["run"], Credentials(data["user"], data["password"])
+    except OSError:
+        raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)") from None
+    except (ValueError, KeyError, TypeError):
+        raise VnetError(f"{path}: not what a run writes") from None
+    with open_client(endpoint, login, LEASE_MS) as session:
+        replies = session.get(
+            keys.control(run, verb), payload=json.dumps(payload).encode(), timeout=ANSWER_TIMEOUT_S
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                answered: dict[str, Any] = json.loads(reply.ok.payload.to_bytes())
+                return answered
+            assert reply.err is not None
+            text = reply.err.payload.to_string()
+            raise LinkError("the run does not answer: is it over?" if text == "Timeout" else text)
+    raise LinkError("the run does not answer: is it over?")
