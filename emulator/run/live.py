@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
+import os
 import signal
 import time
 from collections import deque
@@ -25,6 +26,7 @@ from emulator.run.control import answer, way_in
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
+from emulator.run.memory import MemoryWatch
 from emulator.run.pacing import Lockstep, ProtocolError, RealTime
 from emulator.run.router import ROUTER
 from vnet.errors import LinkError, ProgramError, VnetError, WireError
@@ -45,6 +47,7 @@ REJOIN_POLL_S = 0.1
 FAREWELL_S = 1.0
 RECORDER_WAIT_S = 20.0
 RECORDER = "recorder"
+EMULATOR_PROCESS = "emulator"
 REALTIME_AGENT_NICE = 5
 SCENE_EVERY_PERIODS = 50
 
@@ -123,6 +126,7 @@ class LiveRun:
         self._join_failure: VnetError | None = None
         self._standing: dict[str, str] = {}
         self._refused: dict[str, int] = {}
+        self._memory = MemoryWatch(emulation.duration_ns)
         lease_ms = _lease_ms(emulation.scenario)
         self._link = Attachment(
             options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake, self._intake
@@ -267,6 +271,7 @@ class LiveRun:
             await self._join(on_state)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
             self._emulation.watch(self._publish_period)
+            self._emulation.watch(self._look_at_memory)
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started = time.monotonic()
             await self._course()
@@ -281,6 +286,7 @@ class LiveRun:
             wall_s = time.monotonic() - started
             self._stand_still(set())
             await self._farewell(patience_s)
+            self._memory.write(folder, self._time_ns())
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
             self._loop.remove_signal_handler(signal.SIGCHLD)
@@ -522,6 +528,10 @@ class LiveRun:
         self._launcher.stop(patience_s)
 
     # Those who watch.
+
+    def _look_at_memory(self, view: PeriodView) -> None:
+        processes = {**self._launcher.pids, EMULATOR_PROCESS: os.getpid()}
+        self._memory.look(view.instant.time_ns, processes)
 
     def _publish_period(self, view: PeriodView) -> None:
         if not self._link.is_watched("period"):

@@ -1,0 +1,108 @@
+"""Operators at a running emulator: faults injected live act, heal, and replay from what the run wrote down."""
+
+import json
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from emulator.run.control import CONTROL_FILE, ask
+from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet
+from tests.system.test_failures import long_run
+from vnet.errors import VnetError
+from vnet.link import keys
+from vnet.link.access import Credentials
+from vnet.link.session import open_client
+
+LOSS = {"kind": "loss", "duration_s": 3000.0, "probability": 1.0}
+
+
+def ask_until(folder: Path, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """Ask for the status until it is as wanted: emulated time passes meanwhile, at whatever pace."""
+    while not wanted(status := ask(folder, "status")):
+        pass
+    return status
+
+
+def command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*VNET, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
+def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Path, vnet: Vnet) -> None:
+    folder = tmp_path / "run"
+    with long_run(folder) as process:
+        assert (folder / CONTROL_FILE).stat().st_mode & 0o077 == 0
+        told = command("fault", "inject", "kill", "--for", "2", "--set", "nodes.random=1", "--run", str(folder))
+        assert told.returncode == 0, told.stderr
+        assert "kill-0" in told.stdout
+        assert ask(folder, "inject", LOSS)["fault"] == "loss-1"
+        ask_until(folder, lambda status: [f["state"] for f in status["faults"]] == ["ended", "acting"])
+        assert ask(folder, "heal", "loss-1") == {"healed": ["loss-1"]}
+        ask_until(folder, lambda status: status["faults"][1]["state"] == "ended")
+        assert ask(folder, "heal", "loss-1") == {"healed": ["loss-1"]}, "healing twice is harmless"
+        listed = command("fault", "list", "--run", str(folder))
+        assert [name in listed.stdout for name in ("kill-0", "loss-1")] == [True, True]
+        assert "down: none" in command("status", "--run", str(folder)).stdout
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=TIMEOUT_S)
+    assert not (folder / CONTROL_FILE).exists()
+    done = Finished(process.returncode, "", "", folder)
+    ends = {event["fault"]: event["time_ns"] / 1e9 for event in done.events_of("fault_ended")}
+    # The whole schedule is in the run's scenario: up to the last end, simulating it gives the same trace.
+    until_s = str(max(ends.values()) + 0.05)
+    again = vnet("simulate", str(folder / "scenario.toml"), "--duration", until_s, "--set", "run.settle_s=0")
+    limit_ns = float(until_s) * 1e9
+    kept = [row for row in done.trace() if row["sent_ns"] < limit_ns - 2e7]
+    assert kept == [row for row in again.trace() if row["sent_ns"] < limit_ns - 2e7]
+    assert {row["cause"] for row in kept} == {"", "loss-1"}
+
+
+@pytest.mark.parametrize(
+    ("verb", "payload", "said"),
+    [
+        ("inject", b"{", "not valid JSON"),
+        ("inject", b"[" * 100_000, "not valid JSON"),
+        ("inject", b"\xff", "not valid JSON"),
+        ("inject", b" " * 2_000_000, "at most 1048576 are taken"),
+        ("inject", b"{}", "a kind is needed"),
+        ("inject", b'{"kind": "kill", "duration_s": -1}', "kill.duration_s = -1"),
+        ("inject", b'{"kind": "kill", "duration_s": 1, "nodes": {"ids": ["x"]}}', "'x' is no vehicle"),
+        ("inject", b'{"kind": "router_restart"}', "needs a router of its own"),
+        ("heal", b'"nothing"', "no fault 'nothing'"),
+        ("heal", b"7", "7 is no name of a fault"),
+        ("explode", b"", "control/explode: unknown; there are status, inject, heal"),
+    ],
+)
+def test_a_bad_query_gets_one_line_of_error_and_changes_nothing(
+    running: tuple[Path, dict[str, str]], verb: str, payload: bytes, said: str
+) -> None:
+    folder, way_in = running
+    login = Credentials(way_in["user"], way_in["password"])
+    with open_client(way_in["endpoint"], login, 10_000) as session:
+        replies = list(session.get(keys.control(way_in["run"], verb), payload=payload, timeout=TIMEOUT_S))
+    assert len(replies) == 1
+    assert replies[0].err is not None
+    text = replies[0].err.payload.to_string()
+    assert said in text
+    assert "\n" not in text
+    assert ask(folder, "status")["faults"] == []
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("control") / "run"
+    with long_run(folder) as process:
+        yield folder, json.loads((folder / CONTROL_FILE).read_text())
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=TIMEOUT_S)
+
+
+def test_where_no_run_is_going_on_a_command_says_so(tmp_path: Path) -> None:
+    with pytest.raises(VnetError, match="no run is going on there"):
+        ask(tmp_path, "status")
+    told = command("fault", "list", "--run", str(tmp_path))
+    assert (told.returncode, told.stdout) == (2, "")
+    assert told.stderr == f"vnet: {tmp_path}: no run is going on there ({CONTROL_FILE} is missing)\n"
