@@ -127,6 +127,11 @@ def _json() -> dict[str, bytes]:
         "passwords in a list": b'{"run": "r", "processes": [], "passwords": ["a"]}',
         "a run that is no name": b'{"run": "**", "processes": [["v"]], "passwords": {}}',
         "passwords with lines": b'{"run": "r", "processes": [], "passwords": {"a": "b\\nroot:c"}}',
+        "a kind with lines": b'{"kind": "a\\nb' + b"c" * 10_000 + b'", "duration_s": 1}',
+        "a fault of 4000 digits": b'{"kind": "kill", "duration_s": 1' + b"0" * 4000 + b"}",
+        "a fault with an unknown key": b'{"kind": "kill", "duration_s": 1, "a\\nb": 1}',
+        "a kind that is a list": b'{"kind": [[1]], "duration_s": 1}',
+        "10⁵ nodes": b'{"kind": "kill", "duration_s": 1, "nodes": {"ids": [' + b'"v",' * 10**5 + b'"v"]}}',
         "certificates that are none": b'{"user": "a", "password": "b", "tls": {"ca": 3}}',
     }
 

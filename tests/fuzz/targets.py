@@ -5,6 +5,7 @@ it accepts. The tests in this folder and `make fuzz` take it from there.
 """
 
 import functools
+import json
 import os
 import tempfile
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from agents import cooperative_frame
 from emulator.world.links import load_links
 from emulator.world.networks import load_network
 from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, WireError
+from vnet.faults import KINDS, parse_fault
 from vnet.link import wire
 from vnet.link.access import Access, Credentials
 from vnet.link.node import Report
@@ -83,6 +85,15 @@ def _read_frame(data: bytes) -> None:
     frame = cooperative_frame.decode(data)
     if len(frame.heard) == data[1]:  # names that stand there twice are taken once
         assert cooperative_frame.decode(cooperative_frame.encode(frame)).heard == frame.heard
+
+
+def _read_fault(data: bytes) -> None:
+    try:
+        plain = json.loads(data)
+    except (ValueError, RecursionError):
+        return  # what is no JSON never reaches the function
+    fault = parse_fault(plain)
+    assert parse_fault(fault.model_dump(mode="json")) == fault
 
 
 # Files.
@@ -175,9 +186,10 @@ _RX = (
         100,
         "b",
     ),
-    wire.Grant(1, 100, [_PACKET], [_FIX]),
-    wire.Batch([_FIX], 1, [_PACKET], 12345),
+    wire.Grant(1, 100, [_PACKET], [_FIX], [wire.ClockBend("v01", 5, -3, 0.5)]),
+    wire.Batch([_FIX], 1, [_PACKET], 12345, 5, True),
     wire.Where(),
+    wire.Await(1.5),
     wire.End(None, "over", False),
 )
 _NETWORK = b"id,x_m,y_m,heading_rad\nv01,0,0,0\nv02,100.5,-2e3,3.14\n"
@@ -198,12 +210,39 @@ links = [[0, 1], [0, 0]]
 entry = "a.b:c"
 options = { a = 1, b = ["x", 2.5], c = { d = true } }
 """
+_FAULTS = b"""[run]
+duration_s = 60.0
+[[fault]]
+kind = "partition"
+groups = [["v01"], ["v02"]]
+duration_s = 3.0
+[[fault]]
+kind = "loss"
+probability = 0.5
+nodes = { fraction = 0.3 }
+senders = { disc = [0.0, 0.0, 100.0] }
+at_s = 5.0
+duration_s = 3
+[[program.exceptions]]
+nodes = ["v01"]
+entry = "a:b"
+"""
 _FILES = b"""[network]
 kind = "file"
 path = "network.csv"
 [inputs]
 x = "sha"
 """
+_FAULT_SEEDS = (
+    b'{"kind": "kill", "nodes": {"ids": ["v01"]}, "at_s": 1.5, "duration_s": 2}',
+    b'{"kind": "partition", "groups": [["v01"], ["v02", "v03"]], "duration_s": 2}',
+    b'{"kind": "block", "senders": {"polygon": [[0, 0], [1, 0], [0, 1]]}, "duration_s": 1}',
+    b'{"kind": "skew", "offset_ms": -3.5, "nodes": {"degree": [1, 2]}, "duration_s": 1}',
+)
+_FAULT_WORDS = tuple(
+    f'"{word}"'.encode()
+    for word in (*KINDS, "kind", "nodes", "ids", "fraction", "random", "disc", "polygon", "degree")
+)
 _ACCESS = (
     b'{"run": "r", "processes": [["v01", "v02"]], "passwords": {"node-v01": "a", "emulator": "b", "observer": "c"}}'
 )
@@ -272,10 +311,11 @@ TARGETS = (  # the slowest first
         "scenario",
         _read_scenario,
         ScenarioError,
-        (_SCENARIO, _FILES, b"" + OVERRIDE + b"radio.loss=0.3"),
+        (_SCENARIO, _FAULTS, _FILES, b"" + OVERRIDE + b"radio.loss=0.3"),
         _TOML_WORDS,
     ),
     Target("network CSV", _read_network, ScenarioError, (_NETWORK,), _CSV_WORDS),
+    Target("fault", _read_fault, ScenarioError, _FAULT_SEEDS, _FAULT_WORDS),
     Target("links CSV", _read_links, ScenarioError, (b"0,1\n1,0\n", b"0,1.0\n\n0,0\n"), _CSV_WORDS),
     Target("access.json", _read_access, LinkError, (_ACCESS,), _JSON_WORDS),
     Target("credentials", _read_credentials, LinkError, (b'{"user": "node-v01", "password": "p"}',), _JSON_WORDS),
