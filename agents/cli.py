@@ -22,7 +22,9 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 @app.command()
 def agent(
-    connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint, tcp/HOST:PORT.")],
+    connect: Annotated[
+        str, typer.Option(help="The emulator's (or its router's) endpoint, tcp/HOST:PORT or tls/HOST:PORT.")
+    ],
     run: Annotated[str, typer.Option(help="The name of the run: run.name of the scenario.")],
     node: Annotated[list[str], typer.Option(help="A node of this process; give it once a node.")],
     credentials: Annotated[

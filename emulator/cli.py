@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from enum import StrEnum
@@ -36,7 +37,7 @@ from emulator.run.simulate import simulate as run_simulation
 from emulator.terminal import one_line_errors
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
-from vnet.link.access import Access, Credentials
+from vnet.link.access import Access, Credentials, is_tls
 from vnet.link.hosting import fix_hash_seed
 from vnet.link.session import quiet_zenoh
 from vnet.scenario import Scenario, load_scenario
@@ -73,7 +74,8 @@ class Rerun(StrEnum):
     SAVE = "save"
 
 
-DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+DEFAULT_ADDRESS = "127.0.0.1:7447"
+DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 
 ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
 ProgramOption = Annotated[str | None, typer.Option(help="What every vehicle runs, as package.module:function.")]
@@ -83,6 +85,12 @@ DurationOption = Annotated[float | None, typer.Option(help="Emulated seconds.")]
 OutOption = Annotated[Path | None, typer.Option(help="Folder for the run's files; the default is runs/NAME-SEED.")]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scenario key.")
+]
+TlsNameOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tls-name", metavar="NAME", help="A further name or address of the router, for its certificate."
+    ),
 ]
 RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
 
@@ -152,7 +160,8 @@ def _record_here(emulation: Emulation, stack: ExitStack) -> None:
 def emulator(
     scenario: ScenarioArgument,
     listen: Annotated[
-        str | None, typer.Option(help="Be the router, and listen at this endpoint (tcp/HOST:PORT).")
+        str | None,
+        typer.Option(help="Be the router, and listen at this endpoint (tcp/HOST:PORT or tls/HOST:PORT)."),
     ] = None,
     connect: Annotated[str | None, typer.Option(help="Be a client of the zenohd at this endpoint.")] = None,
     access: Annotated[
@@ -175,9 +184,9 @@ def emulator(
         _check_restarts(loaded, own_router=False)
         world = build_world(loaded)
         folder = RunFolder.create(out, loaded)
-        listen = listen or DEFAULT_LISTEN
         access = access or folder.path / "access"
-        users = _load_or_create_access(loaded, world, access, listen, connect is not None)
+        users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
+        listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
         options = LiveOptions(users, listen, connect, launch=False)
         _run_live(loaded, world, folder, rerun, options)
@@ -187,7 +196,10 @@ def emulator(
 def write_access(
     scenario: ScenarioArgument,
     out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("access"),
-    listen: Annotated[str, typer.Option(help="Where the zenohd is to listen.")] = DEFAULT_LISTEN,
+    listen: Annotated[
+        str, typer.Option(help="Where the zenohd is to listen; at tls/HOST:PORT everybody gets a certificate.")
+    ] = DEFAULT_LISTEN,
+    tls_name: TlsNameOption = None,
     router_folder: Annotated[
         Path | None, typer.Option(help="Where the zenohd sees the folder, if elsewhere (a container).")
     ] = None,
@@ -196,7 +208,7 @@ def write_access(
     """Write a separate zenohd's configuration (zenohd -c OUT/zenohd.json5) and everybody's credentials."""
     with one_line_errors():
         loaded = _load(scenario, overrides)
-        users = _create_access(loaded, build_world(loaded))
+        users = _create_access(loaded, build_world(loaded), listen, tls_name or ())
         users.save(out, listen, router_folder or out.resolve())
         print(f"{len(users.processes)} agent processes, and the emulator, in {out}/credentials")
         print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
@@ -257,9 +269,12 @@ def _load(
     return load_scenario(path, [*(overrides or []), *given])
 
 
-def _create_access(scenario: Scenario, world: World) -> Access:
+def _create_access(scenario: Scenario, world: World, listen: str = "", tls_names: Sequence[str] = ()) -> Access:
+    """New users of a run; with certificates where the router listens at tls/HOST:PORT."""
     groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
-    return Access.create(scenario.run.name, groups)
+    return Access.create(
+        scenario.run.name, groups, tls_listen=listen if is_tls(listen) else None, tls_names=tls_names
+    )
 
 
 def _load_or_create_access(scenario: Scenario, world: World, folder: Path, listen: str, separate: bool) -> Access:
@@ -272,7 +287,7 @@ def _load_or_create_access(scenario: Scenario, world: World, folder: Path, liste
                 f"access folder {folder} was made for another scenario; write a new one with: vnet access"
             )
         return access
-    access = _create_access(scenario, world)
+    access = _create_access(scenario, world, listen)
     access.save(folder, listen, folder.resolve())
     return access
 

@@ -4,9 +4,36 @@ Each message is one line that names the thing, the value and what is allowed. Mi
 assertions, not members of this family.
 """
 
+LONGEST_MESSAGE = 2000
+"""Characters of a whole message."""
+LONGEST_SHOWN = 100
+"""Characters of a wrong value in a message."""
+
 
 class VnetError(Exception):
-    """Anything that vnet refuses or cannot do, said in one line."""
+    """Anything that vnet refuses or cannot do, said in one line.
+
+    A message may quote what others wrote, and it ends in terminals and logs: what is not printable is escaped, and
+    what is too long is cut.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(printable(message, LONGEST_MESSAGE))
+
+
+def printable(text: str, longest: int = LONGEST_SHOWN) -> str:
+    """`text` in one line of at most `longest` characters, with escapes for what is not printable."""
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[:longest])
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def shown(value: object) -> str:
+    """A wrong value as a message quotes it, whatever it is."""
+    try:
+        return printable(repr(value))
+    except (ValueError, RecursionError):  # an integer of thousands of digits; a value nested too deeply
+        return f"({type(value).__name__})"
 
 
 class ScenarioError(VnetError):

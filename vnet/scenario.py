@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import tomllib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +17,19 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, printable, shown
 from vnet.faults import Fault
 from vnet.sections import Section, first_problem
+from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
 
 NS_PER_S = 1_000_000_000
+DAY_S = 86_400
+"""No time in a scenario is longer, so that nanoseconds stay far within 64 bits."""
+FAR_M = 1e9
+"""No length in a scenario is larger, so that squares stay finite and millimetres mean something."""
+WILD_M = 1e5
+"""No standard deviation is larger, so that fixes stay near enough for frames to say."""
+MANY = 1_000_000_000
 
 
 class Run(Section):
@@ -32,14 +40,14 @@ class Run(Section):
 
     name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
     seed: int = Field(1, ge=0, lt=2**63)
-    duration_s: float = Field(30.0, gt=0, le=86_400)
-    settle_s: float = Field(5.0, ge=0)
+    duration_s: float = Field(30.0, gt=0, le=DAY_S)
+    settle_s: float = Field(5.0, ge=0, le=DAY_S)
     pacing: Literal["lockstep", "realtime"] = "lockstep"
     nodes_per_process: int = Field(1, ge=1, le=1000)
-    join_timeout_s: float = Field(60.0, gt=0)
-    stall_timeout_s: float = Field(30.0, gt=0)
-    orphan_timeout_s: float = Field(5.0, gt=0)
-    spin_limit: int = Field(100_000, ge=100)
+    join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
+    stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
+    orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
+    spin_limit: int = Field(100_000, ge=100, le=MANY)
 
 
 class Network(Section):
@@ -66,15 +74,15 @@ class Network(Section):
 class CommonError(Section):
     """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process (MODEL 1)."""
 
-    sigma_m: float = Field(3.0, ge=0)
+    sigma_m: float = Field(3.0, ge=0, le=WILD_M)
     tau_s: float = Field(600.0, gt=0)
 
 
 class Gnss(Section):
     """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
 
-    rate_hz: float = Field(10.0, gt=0, le=1000)
-    sigma_m: float = Field(1.0, ge=0)
+    rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
+    sigma_m: float = Field(1.0, ge=0, le=WILD_M)
     heading: bool = True
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)
 
@@ -82,8 +90,8 @@ class Gnss(Section):
 class Lateral(Section):
     """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
 
-    half_width_m: float = Field(0.85, gt=0)
-    sigma_m: float = Field(0.4, ge=0)
+    half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    sigma_m: float = Field(0.4, ge=0, le=WILD_M)
     tau_s: float = Field(20.0, gt=0)
 
 
@@ -103,17 +111,17 @@ class Radio(Section):
     the order of the network's vehicles; the diagonal means nothing.
     """
 
-    range_m: float = Field(3000.0, gt=0)
+    range_m: float = Field(3000.0, gt=0, le=FAR_M)
     links: Path | tuple[tuple[int, ...], ...] | None = None
-    max_peers: int = Field(30, ge=1)
+    max_peers: int = Field(30, ge=1, le=MANY)
     loss: float = Field(0.0, ge=0, le=1)
-    latency_ms: float = Field(2.0, ge=0.001)
-    jitter_ms: float = Field(1.0, ge=0)
-    access_jitter_ms: float = Field(1.0, ge=0)
-    delivery_tick_us: int = Field(0, ge=0)
+    latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
+    jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    delivery_tick_us: int = Field(0, ge=0, le=MANY)
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
-    bitrate_mbps: float = Field(6.0, gt=0)
-    queue_frames: int = Field(64, ge=1)
+    bitrate_mbps: float = Field(6.0, ge=1e-6)
+    queue_frames: int = Field(64, ge=1, le=MANY)
 
     @field_validator("links", mode="before")
     @classmethod
@@ -127,7 +135,7 @@ class Radio(Section):
                 raise ValueError(f"not square: row {number} of {len(links)} should be {len(links)} entries long")
             for entry in row:
                 if type(entry) is not int or entry not in (0, 1):
-                    raise ValueError(f"row {number} holds {entry!r}: each entry should be 0 or 1")
+                    raise ValueError(f"row {number} holds {shown(entry)}: each entry should be 0 or 1")
         return links
 
 
@@ -158,9 +166,9 @@ class Program(OneProgram):
 
     @model_validator(mode="after")
     def _one_program_a_node(self) -> Program:
-        named = [node for exception in self.exceptions for node in exception.nodes]
-        if twice := sorted({node for node in named if named.count(node) > 1}):
-            raise ValueError(f"node {twice[0]!r} is in two exceptions")
+        named = Counter(node for exception in self.exceptions for node in exception.nodes)
+        if twice := sorted(node for node, count in named.items() if count > 1):
+            raise ValueError(f"node {shown(twice[0])} is in two exceptions")
         return self
 
     def of(self, node: str) -> OneProgram:
@@ -211,18 +219,23 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     the scenario's own folder. Raises `ScenarioError`.
     """
     try:
-        data = tomllib.loads(path.read_bytes().decode())
+        data = read_toml(path)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
+    except ValueError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
     recorded_digests = data.pop("inputs", {})
+    if not isinstance(recorded_digests, dict):
+        raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
     for override in overrides:
         _apply_override(data, override)
     try:
+        check_plain(data)
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
+    except ValueError as error:
+        raise ScenarioError(f"{path}: {error}") from None
     scenario = _with_absolute_paths(scenario, path)
     for name, digest in input_digests(scenario).items():
         if recorded_digests.get(name, digest) != digest:
@@ -240,7 +253,12 @@ def dump_scenario(scenario: Scenario) -> str:
 def input_digests(scenario: Scenario) -> dict[str, str]:
     """SHA-256 of each file that the scenario reads, by path."""
     paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths}
+    return {str(path): _sha256(path) for path in paths}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
@@ -255,26 +273,33 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
 
 
 def _absolute(given: Path, key: str, scenario_path: Path) -> Path:
-    path = (scenario_path.parent / given).resolve()
-    if not path.is_file():
-        raise ScenarioError(f"{scenario_path}: {key} = {str(given)!r}: no such file: {path}")
+    problem = f"{scenario_path}: {key} = {shown(str(given))}"
+    try:
+        path = (scenario_path.parent / given).resolve()
+        found = path.is_file()
+    except (OSError, ValueError, RuntimeError):  # a name too long, with a NUL, or links that lead in a circle
+        raise ScenarioError(f"{problem}: cannot be the name of a file") from None
+    if not found:
+        raise ScenarioError(f"{problem}: no such file: {path}")
     if not os.access(path, os.R_OK):
-        raise ScenarioError(f"{scenario_path}: {key} = {str(given)!r}: not readable: {path}")
+        raise ScenarioError(f"{problem}: not readable: {path}")
     return path
 
 
 def _apply_override(data: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     parts = key.strip().split(".")
-    if not equals or len(parts) < 2 or not all(parts):
-        raise ScenarioError(f"--set {override}: write it as section.key=value, for example radio.loss=0.3")
+    if not equals or not 2 <= len(parts) <= DEEPEST or not all(parts):
+        raise ScenarioError(
+            f"--set {printable(override)}: write it as section.key=value, for example radio.loss=0.3"
+        )
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        value = parse_toml(f"value = {text}")["value"]
+    except ValueError:
         value = text.strip()
     table = data
     for part in parts[:-1]:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise ScenarioError(f"--set {override}: {part} is not a section")
+            raise ScenarioError(f"--set {printable(override)}: {printable(part)} is not a section")
     table[parts[-1]] = value

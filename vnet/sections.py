@@ -7,8 +7,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-LONGEST_SHOWN = 100
-"""How many characters of a wrong value a message shows."""
+from vnet.errors import printable, shown
 
 
 class Section(BaseModel):
@@ -21,22 +20,19 @@ def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]
     """The first of pydantic's complaints about a value `of` this kind, as `key = value: what is allowed`."""
     problem = error.errors()[0]
     place = problem["loc"]
-    key = ".".join(str(part) for part in place) or "it"
+    key = printable(".".join(str(part) for part in place) or "it")
     if problem["type"] == "extra_forbidden":
         return f"{key}: unknown key; allowed here: {', '.join(_allowed_keys(of, place[:-1]))}"
     if problem["type"] == "union_tag_not_found":
         return f"{key}: a kind is needed"
     if problem["type"] == "union_tag_invalid":
         kinds = sorted(problem["ctx"]["expected_tags"].replace("'", "").split(", "))
-        return f"{key}: kind = {problem['ctx']['tag']!r}: must be one of {', '.join(kinds)}"
+        return f"{key}: kind = {shown(problem['ctx']['tag'])}: must be one of {', '.join(kinds)}"
     message = problem["msg"].removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
     if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
         return f"{key}: {message}" if place else message
-    value = repr(problem["input"])
-    if len(value) > LONGEST_SHOWN:  # a whole matrix
-        value = f"{value[:LONGEST_SHOWN]}…"
-    return f"{key} = {value}: {message}"
+    return f"{key} = {shown(problem['input'])}: {message}"
 
 
 def _allowed_keys(of: type[BaseModel] | TypeAdapter[Any], place: tuple[int | str, ...]) -> list[str]:

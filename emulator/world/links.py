@@ -8,8 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.errors import ScenarioError
+from emulator.world.csv_file import MOST_ROWS, check_row_count, open_csv
+from vnet.errors import ScenarioError, shown
 from vnet.scenario import Radio
+
+_LONGEST_LINE = 10 * MOST_ROWS
+"""An entry may be written as `1.000000,`."""
 
 
 def load_links(radio: Radio, vehicles: int) -> NDArray[np.bool_] | None:
@@ -34,14 +38,13 @@ def load_links(radio: Radio, vehicles: int) -> NDArray[np.bool_] | None:
 
 
 def _read(path: Path) -> NDArray[np.bool_]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            rows = [_read_row(path, reader.line_num, row) for row in reader if row]
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(f"{path}: not a CSV file: {error}") from None
+    rows = []
+    with open_csv(path, _LONGEST_LINE) as lines:
+        reader = csv.reader(lines)
+        for entries in reader:
+            if entries:
+                rows.append(_read_row(path, reader.line_num, entries))
+                check_row_count(path, len(rows))
     if not rows:
         raise ScenarioError(f"{path}: empty; a square matrix of 0 and 1, a row for each receiver, is needed")
     for number, row in enumerate(rows, start=1):
@@ -57,7 +60,7 @@ def _read_row(path: Path, line: int, row: list[str]) -> NDArray[np.bool_]:
     entries = [_number(entry) for entry in row]
     for column, entry in enumerate(entries, start=1):
         if entry not in (0, 1):
-            raise ScenarioError(f"{path}: line {line}: entry {column} = {row[column - 1]!r}: 0 or 1 is needed")
+            raise ScenarioError(f"{path}: line {line}: entry {column} = {shown(row[column - 1])}: 0 or 1 is needed")
     return np.array(entries, dtype=bool)
 
 

@@ -15,12 +15,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.errors import ScenarioError
+from emulator.world.csv_file import check_row_count, open_csv
+from vnet.errors import ScenarioError, shown
 from vnet.link.keys import is_segment
 from vnet.roads.lanes import Array
 
 COLUMNS = ("id", "x_m", "y_m", "heading_rad")
 REFERENCE_RANGE_M = 3000.0
+FARTHEST_M = 2e7
+"""Positions are within ±20 000 km: twice what projections use, and what frames can say in 32-bit cm."""
+_LONGEST_LINE = 10_000
 
 # Sorted degrees of the published networks at 3 km, as (degree, how many vehicles have it).
 _DEGREES = {
@@ -51,39 +55,43 @@ class Network:
 
 def load_network(path: Path) -> Network:
     """Read a CSV with the columns id, x_m, y_m, heading_rad. Raises ScenarioError that names the line."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
-            if missing:
-                raise ScenarioError(f"{path}: no column {missing[0]!r}; needed are {', '.join(COLUMNS)}")
-            rows = [_read_row(path, reader.line_num, row) for row in reader]
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ScenarioError(f"{path}: not a CSV file: {error}") from None
-    if not rows:
+    vehicles: dict[str, tuple[float, float, float]] = {}
+    with open_csv(path, _LONGEST_LINE) as lines:
+        reader = csv.DictReader(lines)
+        names = list(reader.fieldnames or [])
+        for column in COLUMNS:
+            if names.count(column) != 1:
+                how = "two columns" if column in names else "no column"
+                raise ScenarioError(f"{path}: {how} {column!r}; needed are {', '.join(COLUMNS)}")
+        for row in reader:
+            name, values = _read_row(path, reader.line_num, row)
+            if name in vehicles:
+                raise ScenarioError(f"{path}: line {reader.line_num}: id = {name!r} appears twice; ids must differ")
+            vehicles[name] = values
+            check_row_count(path, len(vehicles))
+    if not vehicles:
         raise ScenarioError(f"{path}: no vehicles; at least one row is needed")
-    ids = tuple(name for name, _ in rows)
-    for line, name in enumerate(ids, start=2):
-        if name in ids[: line - 2]:
-            raise ScenarioError(f"{path}: line {line}: id = {name!r} appears twice; ids must differ")
-    numbers = np.array([values for _, values in rows])
-    return Network(ids, numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi))
+    numbers = np.array(list(vehicles.values()))
+    return Network(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi))
 
 
 def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, tuple[float, float, float]]:
+    if None in row:
+        raise ScenarioError(f"{path}: line {line}: more fields than columns; numbers are written with a point")
     name = (row["id"] or "").strip()
     if not is_segment(name):
-        raise ScenarioError(f"{path}: line {line}: id = {name!r}: letters, digits, '_', '.', '-', at most 64")
+        raise ScenarioError(f"{path}: line {line}: id = {shown(name)}: letters, digits, '_', '.', '-', at most 64")
     values = []
     for column in COLUMNS[1:]:
         try:
             value = float(row[column] or "")
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
-            raise ScenarioError(f"{path}: line {line}: {column} = {row[column]!r}: a finite number is needed")
+        if not abs(value) <= FARTHEST_M:
+            raise ScenarioError(
+                f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, "
+                f"within ±{FARTHEST_M:g}"
+            )
         values.append(value)
     return name, (values[0], values[1], values[2])
 

@@ -108,6 +108,11 @@ def test_headings_are_those_of_a_grid_town() -> None:
         (HEADER + "a,,0,0\n", "line 2: x_m = '': a finite number is needed"),
         (HEADER + "a,0,0\n", "line 2: heading_rad = None: a finite number is needed"),
         (HEADER + "a,0,0,0\n\n\nb,0,north,0\n", "line 5: y_m = 'north'"),
+        (HEADER + "a,2.1e7,0,0\n", "line 2: x_m = '2.1e7': a finite number is needed, within ±2e+07"),
+        (HEADER + "a,1,5,2,5,0\n", "line 2: more fields than columns; numbers are written with a point"),
+        ("id," + HEADER + "a,b,0,0,0\n", "two columns 'id'"),
+        (HEADER + "a," + "0" * 10_000 + ",0,0\n", "line 2: longer than 10000 characters"),
+        (HEADER + "".join(f"v{i},0,0,0\n" for i in range(10_001)), "more than 10000 rows"),
     ],
 )
 def test_a_wrong_network_file_names_its_line(tmp_path: Path, text: str, message: str) -> None:
@@ -117,6 +122,12 @@ def test_a_wrong_network_file_names_its_line(tmp_path: Path, text: str, message:
         load_network(path)
     assert str(caught.value).startswith(f"{path}: {message}")
     assert "\n" not in str(caught.value)
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "n.csv"
+    path.write_text("\ufeff" + HEADER + "a,0,0,0\n", encoding="utf-8")
+    assert load_network(path).node_ids == ("a",)
 
 
 def test_a_network_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:

@@ -114,6 +114,20 @@ def test_times_are_integers_within_bounds(time_ns: object) -> None:
         wire.decode_rx(grant)
 
 
+@pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_report])
+def test_what_is_too_large_is_not_even_decoded(decode: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "LARGEST_SAID_BYTES", 10)
+    with pytest.raises(WireError, match="11 bytes at once: at most 10 are read"):
+        decode(bytes(11))  # type: ignore[operator]
+
+
+def test_what_an_error_quotes_is_one_short_line() -> None:
+    with pytest.raises(WireError) as caught:
+        wire.decode_tx(b"\x91\xda\xff\xff" + b"a\n" * 32767 + b"a")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 300
+
+
 def test_a_fix_survives_the_wire_bit_by_bit() -> None:
     fix = Fix(5, np.array([0.1, -1e9 / 3]), np.array([[1.0, 0.1], [0.1, 2.0]]), 0.3)
     again = wire.WireFix.of("v1", fix).fix()

@@ -15,11 +15,14 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from vnet.errors import WireError
+from vnet.errors import WireError, printable
 from vnet.link.node import Fix, Packet, Report
 
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+LARGEST_SAID_BYTES = 64 * 2**20
+"""What an agent may say at once: a frame of the largest payload from each of a thousand nodes still fits."""
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, tag=True):
@@ -238,7 +241,8 @@ def encode(message: AgentMessage | EmulatorMessage | Report) -> bytes:
 
 
 def decode_tx(data: bytes) -> AgentMessage:
-    """What an agent said. Raises WireError."""
+    """What an agent said. Raises WireError, also where it is larger than `LARGEST_SAID_BYTES`."""
+    _check_size(data)
     return _decode(_agent_decoder, data)
 
 
@@ -248,7 +252,8 @@ def decode_rx(data: bytes) -> EmulatorMessage:
 
 
 def decode_report(data: bytes) -> Report:
-    """A copy of a report. Raises WireError."""
+    """A copy of a report. Raises WireError, also where it is larger than `LARGEST_SAID_BYTES`."""
+    _check_size(data)
     return _decode(_report_decoder, data)
 
 
@@ -276,7 +281,13 @@ def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
     try:
         return decoder.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise WireError(f"{len(data)} bytes that are no message: {error}") from None
+        raise WireError(f"{len(data)} bytes that are no message: {printable(str(error), 200)}") from None
+
+
+def _check_size(data: bytes) -> None:
+    # Decoded, a byte can become 30: what a stranger may have the emulator allocate is bounded here.
+    if len(data) > LARGEST_SAID_BYTES:
+        raise WireError(f"{len(data)} bytes at once: at most {LARGEST_SAID_BYTES} are read")
 
 
 HEAD_START_NS = 200_000_000
