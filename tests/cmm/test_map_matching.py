@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 
-from vnet.cmm.map_matching import candidate_lanes, log_on_lane
+from vnet.cmm.map_matching import FAR_SIGMAS, REACH, STEPS, candidate_lanes, log_on_lane, normal_cdf
 from vnet.roads.lanes import LaneMap
 
 HALF_WIDTH_M = 0.85
@@ -25,7 +25,24 @@ def reference(offset_m: float, sigma_m: float) -> float:
 def test_it_is_the_closed_form_near_and_far(offset_m: float, sigma_m: float) -> None:
     value = log_on_lane(np.array([[offset_m]]), np.array([[sigma_m]]), HALF_WIDTH_M)[0, 0]
     assert np.isfinite(value)
-    assert value == pytest.approx(reference(offset_m, sigma_m), rel=1e-9, abs=1e-12)
+    far = (HALF_WIDTH_M - abs(offset_m)) / sigma_m <= -FAR_SIGMAS
+    assert value == pytest.approx(reference(offset_m, sigma_m), rel=1e-12 if far else 0.0, abs=0.0 if far else 2e-6)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.floats(-60, 60), st.integers(-REACH * STEPS, REACH * STEPS))
+def test_the_table_is_the_normal_distribution(anywhere: float, node: int) -> None:
+    """Also at the seams of the table's steps, and right before and after them."""
+    seam = node / STEPS
+    x = np.array([anywhere, np.nextafter(seam, -100), seam, np.nextafter(seam, 100)])
+    value, exact = normal_cdf(x), ndtr(x)
+    assert np.all(np.abs(value - exact) < 2e-9)
+    assert np.all(np.abs(value - exact)[x >= -FAR_SIGMAS] < 5e-7 * exact[x >= -FAR_SIGMAS])
+
+
+def test_beyond_the_table_the_normal_distribution_is_constant() -> None:
+    assert normal_cdf(np.array([-1e9, -REACH - 1e-9])).max() < 1e-18
+    assert np.array_equal(normal_cdf(np.array([REACH, REACH + 1e-9, 1e9])), [1.0, 1.0, 1.0])
 
 
 def test_near_and_far_particles_in_one_call_agree_with_single_ones() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from vnet.cmm.map_matching import log_on_lane
 from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
 from vnet.errors import VnetError
 from vnet.roads.lanes import LaneMap
@@ -87,6 +88,31 @@ def test_an_outlier_is_left_out() -> None:
     assert with_outlier.position_m("v")[0] == pytest.approx(without.position_m("v")[0])
 
 
+@pytest.mark.parametrize(("spread_m", "taken"), [(0.0, False), (4.0, True)])
+def test_a_fix_that_is_far_off_may_be_explained_by_an_uncertain_common_error(spread_m: float, taken: bool) -> None:
+    """10 m from the mean are 7 deviations of the fix alone, and 2.4 with 4 m of uncertainty about c."""
+    rbpf = known_error((0.0, 0.0), particles=100)
+    rbpf.step(DT_S, {"v": observation([0.0, 0.0])})
+    rbpf.common_m[:] = spread_m * np.random.default_rng(2).standard_normal(rbpf.common_m.shape)
+    before = rbpf.covariance.copy()
+    rbpf.step(DT_S, {"v": observation([10.0, 0.0])})
+    assert (np.trace(rbpf.covariance[0, :2, :2]) < np.trace(before[0, :2, :2])) == taken
+
+
+def test_vehicles_on_no_lane_on_one_and_between_two_are_weighed_each_by_its_own() -> None:
+    lanes = LaneMap(np.array([[0.0, 0.0], [0.0, 3.5], [900.0, 0.0]]), np.array([0.0, 0.0, np.pi / 2]), 0.85)
+    rbpf = Rbpf(RbpfConfig(particles=50), lanes, np.random.default_rng(1))
+    places = {"a": ([0.0, 1.75], 0.0), "b": ([500.0, 500.0], 0.0), "c": ([900.0, 9.0], np.pi / 2)}
+    rbpf.step(DT_S, {name: observation(place, heading) for name, (place, heading) in places.items()})
+    across = np.sqrt(rbpf.covariance[:, 0, 0])[:, None]
+    two = [log_on_lane(rbpf.mean[:1, 1] - north, across[:1], 0.85) for north in (0.0, 3.5)]
+    one = log_on_lane(rbpf.mean[2:, 0] - 900.0, across[2:], 0.85)
+    score = rbpf.log_road(rbpf.mean, rbpf.covariance)
+    assert score == pytest.approx(np.concatenate([np.logaddexp(*two), np.zeros(one.shape), one]), abs=1e-9)
+    some = rbpf.log_road(rbpf.mean, rbpf.covariance, np.array([0, 2]))
+    assert np.array_equal(some, score[[0, 2]])
+
+
 def test_a_vehicle_not_heard_for_a_while_is_forgotten_and_may_come_back() -> None:
     rbpf = Rbpf(RbpfConfig(particles=10, forget_s=1.0), NOWHERE, np.random.default_rng(1))
     rbpf.step(DT_S, {"v": observation([0, 0]), "w": observation([5, 5])})
@@ -133,6 +159,21 @@ def test_an_old_fix_is_held_against_the_common_error_of_its_own_time() -> None:
             rbpf.common_m[:] = np.array([100.0, 0.0])[:, None]
         rbpf.step(DT_S, {"v": Observation(here + ([100.0, 0.0] if step >= 23 else 0.0), np.eye(2), 0.3, age_s=0.3)})
     assert rbpf.position_m("v")[0] == pytest.approx(here, abs=1e-6)
+
+
+@pytest.mark.parametrize("dt_s", [0.1, 0.25, 0.1 / 3])
+def test_the_common_error_is_remembered_for_its_time_and_no_longer(dt_s: float) -> None:
+    """c goes up by one a step, and a fix of so many steps ago is held against that of its time."""
+    rbpf = known_error((0.0, 0.0))
+    for step in range(1, 60):
+        rbpf.common_m[:] = step
+        steps_ago = min(step - 1, int(1.4 / dt_s))
+        fix = np.full(2, float(step - steps_ago))
+        rbpf.step(dt_s, {f"v{step}": Observation(fix, np.eye(2), 0.3, age_s=steps_ago * dt_s)})
+        row = rbpf.vehicles.index(f"v{step}")
+        assert np.abs(rbpf.mean[row, :2]).max() < 1e-6
+    rbpf.step(dt_s, {"late": Observation(np.zeros(2), np.eye(2), 0.3, age_s=1.5 + dt_s)})
+    assert "late" not in rbpf.vehicles
 
 
 def test_a_fix_that_is_not_new_or_too_old_changes_nothing() -> None:

@@ -86,7 +86,7 @@ class Rbpf:
         self.vehicles: list[str] = []
         self.mean = np.empty((0, 4, count))
         self.covariance = np.empty((0, 4, 4))
-        self._acceleration = np.empty((0, 2, 2))  # white acceleration, by vehicle
+        self._acceleration = np.empty((0, 4, 4))  # white acceleration of each vehicle, in all four blocks
         self._age_s = np.empty(0)  # how far each vehicle's filter is behind
         self._unseen_s = np.empty(0)
         self._unlooked_s = np.empty(0)  # since a road was looked at for its sake; inf for never
@@ -94,7 +94,7 @@ class Rbpf:
         self._lane = np.empty(0, dtype=np.intp)
         self._log_road = np.zeros((0, count))  # L at each vehicle's latest fix
         self._past_age_s = np.zeros(1)
-        self._past_m = self.common_m[None].copy()  # c of the last seconds, the newest first
+        self._past_m = self.common_m[None].copy()  # c of the last seconds, in any order
 
     # One period.
 
@@ -104,23 +104,21 @@ class Rbpf:
         Fixes that are not newer than the vehicle's latest, or older than `memory_s`, are left out.
         """
         self._predict(dt_s)
-        fresh = {
-            name: observations[name]
-            for row, name in enumerate(self.vehicles)
-            if name in observations
-            and observations[name].age_s < self._age_s[row] - SAME_TIME_S
-            and self._remembers(observations[name].age_s)
-        }
-        rows = self._update(fresh)
-        known = len(self.vehicles)
+        oldest_s = float(self._past_age_s.max()) + SAME_TIME_S
+        seen = {}
+        for row, (name, age_s) in enumerate(zip(self.vehicles, self._age_s.tolist(), strict=True)):
+            observation = observations.get(name)
+            if observation and observation.age_s < age_s - SAME_TIME_S and observation.age_s <= oldest_s:
+                seen[row] = observation
+        self._update(seen)
         for name in sorted(observations.keys() - set(self.vehicles)):
-            if self._remembers(observations[name].age_s):
+            if observations[name].age_s <= oldest_s:
+                seen[len(self.vehicles)] = observations[name]
                 self._add(name, observations[name])
-        rows = np.concatenate([rows, np.arange(known, len(self.vehicles))])
+        rows = np.array(list(seen), dtype=np.intp)
         if not self.config.roads_apart:
             self._match_map(rows)
         self._forget()
-        self.log_weight -= self.log_weight.max()
         self._resample_if_due(dt_s)
 
     def _resample_if_due(self, dt_s: float) -> None:
@@ -130,9 +128,6 @@ class Rbpf:
             count *= START_FACTOR if self._starting_s > 0 else 1
         if len(self.log_weight) != count or self.effective_sample_size < count / 2:
             self._resample_to(count)
-
-    def _remembers(self, age_s: float) -> bool:
-        return bool(age_s <= self._past_age_s[-1] + SAME_TIME_S)
 
     def _predict(self, dt_s: float) -> None:
         config = self.config
@@ -146,40 +141,49 @@ class Rbpf:
         self._age_s += dt_s
         self._unseen_s += dt_s
         self._unlooked_s += dt_s
-        past_age_s = self._past_age_s + dt_s
-        kept = past_age_s <= config.memory_s
-        self._past_age_s = np.concatenate([[0.0], past_age_s[kept]])
-        self._past_m = np.concatenate([self.common_m[None], self._past_m[kept]])
+        self._remember(dt_s)
 
-    def _update(self, observations: Mapping[str, Observation]) -> NDArray[np.intp]:
-        """Move the vehicles that are observed to the time of their fix and take it; returns their rows."""
-        rows = np.array([self.vehicles.index(name) for name in observations], dtype=np.intp)
-        if not len(rows):
-            return rows
-        whole = len(rows) == len(self.vehicles)
-        age_s = np.array([o.age_s for o in observations.values()])
+    def _remember(self, dt_s: float) -> None:
+        """Add the particles' c of now to those of the last seconds."""
+        self._past_age_s += dt_s
+        old = self._past_age_s > self.config.memory_s
+        if np.count_nonzero(old) == 1:  # as a rule: the new takes its place, and nothing is copied
+            row = int(old.argmax())
+            self._past_age_s[row], self._past_m[row] = 0.0, self.common_m
+            return
+        self._past_age_s = np.concatenate([[0.0], self._past_age_s[~old]])
+        self._past_m = np.concatenate([self.common_m[None], self._past_m[~old]])
+
+    def _update(self, seen: Mapping[int, Observation]) -> None:
+        """Move the vehicles that are seen, by row, to the time of their fix and take it.
+
+        With S⁻¹ = WᵀW for the innovation covariance S, everything that is asked of innovations is asked of Wν: its
+        square is the distance, and the gain is P Hᵀ Wᵀ.
+        """
+        if not seen:
+            return
+        rows, fixes = np.array(list(seen), dtype=np.intp), seen.values()
+        age_s = np.array([fix.age_s for fix in fixes])
         elapsed_s = self._age_s[rows] - age_s
-        fix = np.array([o.position_m for o in observations.values()])
-        noise = np.array([o.covariance_m2 for o in observations.values()])
+        moving = _moving(elapsed_s)
+        covariance = _moved(self.covariance[rows], moving, self._acceleration[rows], elapsed_s)
+        whitening = _whitening(covariance[:, :2, :2] + np.array([fix.covariance_m2 for fix in fixes]))
+        gain = covariance[:, :, :2] @ whitening.transpose(0, 2, 1)
+        whole = len(rows) == len(self.vehicles)
         mean = self.mean if whole else self.mean[rows]
-        covariance = _moved(self.covariance[rows], self._acceleration[rows], elapsed_s)
-        moving = np.tile(np.eye(4), (len(rows), 1, 1))
-        moving[:, 0, 2] = moving[:, 1, 3] = elapsed_s
-        innovation = moving[:, :2] @ mean  # products of small matrices are numpy's fastest way over particles
-        np.subtract(fix[:, :, None], innovation, out=innovation)
-        innovation -= self._common_at(age_s)
-        expected = covariance[:, :2, :2] + noise
-        inverse = _inverse_2x2(expected)
-        gain = covariance[:, :, :2] @ inverse
-        kept = self._inside_gate(innovation, expected)
-        gain[~kept] = 0
-        inverse[~kept] = 0
+        # −Wν = W (H m + c − z), as products of small matrices: numpy's fastest way over particles.
+        off = (whitening @ moving[:, :2]) @ mean
+        off += whitening @ self._common_at(age_s)
+        off -= whitening @ np.array([fix.position_m for fix in fixes])[:, :, None]
+        kept = self._inside_gate(off)
+        if not kept.all():
+            gain[~kept] = 0
+            off[~kept] = 0
         mean = moving @ mean
-        mean += gain @ innovation
-        weighted = inverse @ innovation
-        weighted *= innovation
-        self.log_weight -= 0.5 * weighted.reshape(-1, weighted.shape[2]).sum(axis=0)
-        covariance = covariance - gain @ covariance[:, :2, :]
+        mean -= gain @ off
+        covariance -= gain @ gain.transpose(0, 2, 1)
+        off = off.reshape(-1, off.shape[2])
+        self.log_weight -= 0.5 * np.einsum("ik,ik->k", off, off)
         if whole:
             self.mean = mean
         else:
@@ -187,7 +191,6 @@ class Rbpf:
         self.covariance[rows] = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         self._age_s[rows] = age_s
         self._unseen_s[rows[kept]] = age_s[kept]
-        return rows
 
     def _common_at(self, age_s: Array) -> Array:
         """The particles' c of so long ago: (2, K) if that is now for all, else (m, 2, K)."""
@@ -195,14 +198,20 @@ class Rbpf:
             return self.common_m
         return np.asarray(self._past_m[np.abs(self._past_age_s - age_s[:, None]).argmin(axis=1)])
 
-    def _inside_gate(self, innovation: Array, covariance: Array) -> NDArray[np.bool_]:
-        """Per vehicle, not per particle: the gain must stay the same for all particles."""
-        weight = self.weight
-        middle = innovation @ weight
-        square = (innovation * weight) @ innovation.transpose(0, 2, 1)
-        total = covariance + square - middle[:, :, None] * middle[:, None, :]
-        distance = np.einsum("mi,mij,mj->m", middle, _inverse_2x2(total), middle)
-        return np.asarray(distance <= self.config.gate_sigmas**2)
+    def _inside_gate(self, off: Array) -> NDArray[np.bool_]:
+        """Per vehicle, not per particle: the gain must stay the same for all particles. `off` is −Wν, (m, 2, K)."""
+        weight, gate = self.weight, self.config.gate_sigmas**2
+        middle = off @ weight
+        inside = np.asarray((middle * middle).sum(axis=1) <= gate)
+        if inside.all():
+            return inside
+        # The particles' spread adds to the unit covariance of −Wν: that can only bring in a fix that is outside.
+        far = np.flatnonzero(~inside)
+        off, middle = off[far], middle[far, :, None]
+        total = np.eye(2) + (off * weight) @ off.transpose(0, 2, 1) - middle @ middle.transpose(0, 2, 1)
+        distance = middle.transpose(0, 2, 1) @ np.linalg.solve(total, middle)
+        inside[far] = distance[:, 0, 0] <= gate
+        return inside
 
     def _add(self, name: str, observation: Observation) -> None:
         """Track a vehicle from its first fix: m = z − c, at rest, with the fix's covariance."""
@@ -223,7 +232,7 @@ class Rbpf:
         self.mean = np.concatenate([self.mean, mean])
         self.covariance = np.concatenate([self.covariance, covariance])
         acceleration = _acceleration(heading, self.config.acceleration_m2_s4)
-        self._acceleration = np.concatenate([self._acceleration, acceleration[None]])
+        self._acceleration = np.concatenate([self._acceleration, np.tile(acceleration, (1, 2, 2))])
         self._age_s = np.append(self._age_s, observation.age_s)
         self._unseen_s = np.append(self._unseen_s, observation.age_s)
         self._unlooked_s = np.append(self._unlooked_s, np.inf)
@@ -248,12 +257,14 @@ class Rbpf:
 
     def _match_map(self, rows: NDArray[np.intp]) -> None:
         """Weigh the particles by what the roads say of those vehicles in `rows` whose turn it is."""
-        rows = rows[self._unlooked_s[rows] > LOOK_S - SAME_TIME_S]
+        unlooked_s = self._unlooked_s[rows]
+        due = unlooked_s > LOOK_S - SAME_TIME_S
+        rows, unlooked_s = rows[due], unlooked_s[due]
         if not len(rows) or not len(self._lane):
             return
         log_road = self.log_road(self.mean, self.covariance, rows)
-        stays = np.maximum(0.0, 1 - self._unlooked_s[rows] / self.config.lateral_tau_s)
-        self._unlooked_s[rows] = np.where(np.isinf(self._unlooked_s[rows]) & (rows % 2 == 1), LOOK_S / 2, 0.0)
+        stays = np.maximum(0.0, 1 - unlooked_s / self.config.lateral_tau_s)
+        self._unlooked_s[rows] = LOOK_S / 2 * (np.isinf(unlooked_s) & (rows % 2 == 1))
         self.log_weight += log_road.sum(axis=0) - stays @ self._log_road[rows]
         self._log_road[rows] = log_road
 
@@ -266,38 +277,34 @@ class Rbpf:
     def log_road(self, mean: Array, covariance: Array, rows: NDArray[np.intp] | None = None) -> Array:
         """log P(vehicle on a road) as (M, K) for means (M, 4, K): the candidate lanes as a mixture.
 
-        With `rows` only of those vehicles, (len(rows), K). A vehicle without a lane scores 0.
+        With `rows`, in ascending order, only of those vehicles, (len(rows), K). A vehicle without a lane scores 0.
         """
         if rows is None:
             rows = np.arange(len(self.vehicles))
-        entry, index = self._lanes_of(rows)
+        entry = self._lanes_of(rows)
         row, lane = self._lane_vehicle[entry], self._lane[entry]
-        normal = self._normal[lane]
-        whole = len(row) == len(mean) and np.array_equal(row, np.arange(len(mean)))
-        position = mean if whole else mean[row, :2]
-        offset = normal[:, 0, None] * position[:, 0]
-        offset += normal[:, 1, None] * position[:, 1]
+        normal = self._normal[lane][:, None, :]
+        offset = (normal @ mean[row, :2])[:, 0]
         offset -= self._offset_m[lane][:, None]
-        across = np.einsum("pi,pij,pj->p", normal, covariance[row, :2, :2], normal)
+        across = (normal @ covariance[row, :2, :2] @ normal.transpose(0, 2, 1))[:, 0, 0]
         sigma_m = np.sqrt(across)[:, None]
         if self.config.one_sided:
             score = log_left_of_edge(offset, sigma_m, self._lanes.half_width_m)
         else:
             score = log_on_lane(offset, sigma_m, self._lanes.half_width_m)
-        if len(index) == len(rows) and np.array_equal(index, np.arange(len(rows))):
+        if np.array_equal(row, rows):
             return score
         result = np.zeros((len(rows), score.shape[1]))
-        if len(index):  # entries of a vehicle stand together
-            first = np.flatnonzero(np.diff(index, prepend=-1))
-            result[index[first]] = np.logaddexp.reduceat(score, first, axis=0)
+        first, end = np.searchsorted(row, rows), np.searchsorted(row, rows, side="right")
+        some = end > first  # entries of a vehicle stand together
+        result[some] = np.logaddexp.reduceat(score, first[some], axis=0)
         return result
 
-    def _lanes_of(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Entries of `_lane` for the vehicles `rows`, and which of `rows` each is of."""
-        position = np.full(len(self.vehicles), -1, dtype=np.intp)
-        position[rows] = np.arange(len(rows))
-        entry = np.flatnonzero(position[self._lane_vehicle] >= 0)
-        return entry, position[self._lane_vehicle[entry]]
+    def _lanes_of(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Entries of `_lane` for the vehicles `rows`."""
+        wanted = np.zeros(len(self.vehicles), dtype=np.bool_)
+        wanted[rows] = True
+        return np.flatnonzero(wanted[self._lane_vehicle])
 
     # What the filter believes.
 
@@ -315,14 +322,15 @@ class Rbpf:
     def weight(self) -> Array:
         """Normalized weights (K,)."""
         if self._weight is None:
-            weight = np.exp(self._log_weight - self._log_weight.max())
+            self._log_weight = self._log_weight - self._log_weight.max()
+            weight = np.exp(self._log_weight)
             self._weight = weight / weight.sum()
         return self._weight
 
     @property
     def effective_sample_size(self) -> float:
         """1 / Σ w²."""
-        return float(1.0 / np.sum(self.weight**2))
+        return float(1.0 / (self.weight @ self.weight))
 
     @property
     def estimate_m(self) -> Array:
@@ -342,7 +350,9 @@ class Rbpf:
         position = self.mean[row, :2] + self._age_s[row] * self.mean[row, 2:]
         mean = position @ weight
         spread = position - mean[:, None]
-        covariance = _moved(self.covariance[row : row + 1], self._acceleration[row : row + 1], self._age_s[row])
+        here = slice(row, row + 1)
+        moving = _moving(self._age_s[here])
+        covariance = _moved(self.covariance[here], moving, self._acceleration[here], self._age_s[here])
         return mean, covariance[0, :2, :2] + (spread * weight) @ spread.T
 
     def velocity_m_s(self, vehicle: str) -> Array:
@@ -460,22 +470,24 @@ def _acceleration(heading_rad: float | None, acceleration_m2_s4: float) -> Array
     return np.asarray(acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across)))
 
 
-def _moved(covariance: Array, acceleration: Array, elapsed_s: Array) -> Array:
-    """Covariances (M, 4, 4) after `elapsed_s` (M,) or (): constant velocity and white acceleration (M, 2, 2)."""
-    t = np.broadcast_to(elapsed_s, len(covariance))[:, None, None]
-    moved = np.empty_like(covariance)
-    cross = covariance[:, :2, 2:] + t * covariance[:, 2:, 2:]
-    moved[:, :2, :2] = covariance[:, :2, :2] + t * (covariance[:, 2:, :2] + cross) + t**4 / 4 * acceleration
-    moved[:, :2, 2:] = cross + t**3 / 2 * acceleration
-    moved[:, 2:, :2] = moved[:, :2, 2:].transpose(0, 2, 1)
-    moved[:, 2:, 2:] = covariance[:, 2:, 2:] + t**2 * acceleration
-    return moved
+def _moving(elapsed_s: Array) -> Array:
+    """Transitions (M, 4, 4) over `elapsed_s` (M,): constant velocity."""
+    return np.asarray(np.eye(4) + elapsed_s[:, None, None] * np.eye(4, k=2))
 
 
-def _inverse_2x2(matrix: Array) -> Array:
-    """Inverses of (M, 2, 2): faster than the general routine."""
-    a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
-    determinant = a * d - b * c
-    inverse = np.empty_like(matrix)
-    inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 0], inverse[:, 1, 1] = d, -b, -c, a
-    return np.asarray(inverse / determinant[:, None, None])
+def _moved(covariance: Array, moving: Array, acceleration: Array, elapsed_s: Array) -> Array:
+    """Covariances (M, 4, 4) after `moving`, with white acceleration (M, 4, 4) for `elapsed_s`."""
+    half = elapsed_s**2 / 2
+    push = np.array([half, half, elapsed_s, elapsed_s]).T
+    process = push[:, :, None] * push[:, None, :] * acceleration
+    return np.asarray(moving @ covariance @ moving.transpose(0, 2, 1) + process)
+
+
+def _whitening(covariance: Array) -> Array:
+    """W with WᵀW = S⁻¹ for covariances S (M, 2, 2): the inverse of Cholesky's factor."""
+    first = np.sqrt(covariance[:, 0, 0])
+    slope = covariance[:, 1, 0] / covariance[:, 0, 0]
+    second = np.sqrt(covariance[:, 1, 1] - slope * covariance[:, 1, 0])
+    whitening = np.zeros(covariance.shape)
+    whitening[:, 0, 0], whitening[:, 1, 0], whitening[:, 1, 1] = 1 / first, -slope / second, 1 / second
+    return whitening
