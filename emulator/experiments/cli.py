@@ -103,6 +103,24 @@ def tempering(
         _show(study.report(results), folder / "tempering.md")
 
 
+@app.command()
+def divergence(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 100,
+    duration: Annotated[float, typer.Option(min=1, help="Emulated seconds on N1 and N2; N3 runs for 100.")] = 30.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """Does the default profile ever diverge? Many seeds on each network, the worst of them, N3 in full."""
+    from emulator.experiments import divergence as study
+
+    with one_line_errors():
+        folder = _folder(out, "divergence")
+        cells = study.divergence_cells(paper.network_sections(networks), range(1, seeds + 1), duration)
+        results = _run(cells, folder, "divergence", only)
+        _show(study.report(results), folder / "divergence.md")
+
+
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,
