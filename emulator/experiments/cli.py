@@ -88,6 +88,39 @@ def default(
             _show(reports.default_profile(results), folder / "default.md")
 
 
+@app.command()
+def tempering(
+    networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
+) -> None:
+    """How often roads count anew: ANEES and error of the limit, on N3 of the default too, against lateral_tau_s."""
+    from emulator.experiments import tempering as study
+
+    with one_line_errors():
+        folder = _folder(out, "tempering")
+        cells = study.tempering_cells(paper.network_sections(networks), range(1, seeds + 1))
+        results = _run(cells, folder, "tempering", only)
+        print(study.tempering_curve(results, folder / "tempering"))
+        _show(study.report(results), folder / "tempering.md")
+
+
+@app.command()
+def divergence(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 100,
+    duration: Annotated[float, typer.Option(min=1, help="Emulated seconds on N1 and N2; N3 runs for 100.")] = 30.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """Does the default profile ever diverge? Many seeds on each network, the worst of them, N3 in full."""
+    from emulator.experiments import divergence as study
+
+    with one_line_errors():
+        folder = _folder(out, "divergence")
+        cells = study.divergence_cells(paper.network_sections(networks), range(1, seeds + 1), duration)
+        results = _run(cells, folder, "divergence", only)
+        _show(study.report(results), folder / "divergence.md")
+
+
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,
@@ -130,7 +163,7 @@ def _folder(out: Path | None, name: str) -> Path:
 
 
 def _run(
-    cells: Sequence[Cell], folder: Path, name: str, only: list[str] | None, live: bool
+    cells: Sequence[Cell], folder: Path, name: str, only: list[str] | None, live: bool = False
 ) -> list[dict[str, Any]]:
     """Run the cells that are asked for; print the figures of single ones, keep all as Parquet."""
     fix_hash_seed("emulator.cli")  # as in every process that runs programs

@@ -50,7 +50,7 @@ TIME_COLUMNS = {
     "deviation_m": "deviation across\nthe network (m)",
 }
 
-_styled = matplotlib.rc_context(
+styled = matplotlib.rc_context(
     {
         "font.family": "DejaVu Sans",
         "font.size": 10,
@@ -97,10 +97,10 @@ _COMPONENT_LOOKS = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANG
 
 def degree_histogram(networks: Networks, out: Path, range_m: float = REFERENCE_RANGE_M) -> Path:
     """How many vehicles have how many others in range; a panel a network."""
-    return _save(draw_degree_histogram(networks, range_m), out)
+    return save(draw_degree_histogram(networks, range_m), out)
 
 
-@_styled
+@styled
 def draw_degree_histogram(networks: Networks, range_m: float) -> Figure:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     panels = figure.subplots(1, len(networks), sharex=True, sharey=True, squeeze=False)[0]
@@ -122,10 +122,10 @@ def draw_degree_histogram(networks: Networks, range_m: float) -> Figure:
 
 def road_angle_histogram(networks: Networks, out: Path) -> Path:
     """Which way the roads lead: vehicles a sector of 15°, east at the right, north at the top."""
-    return _save(draw_road_angle_histogram(networks), out)
+    return save(draw_road_angle_histogram(networks), out)
 
 
-@_styled
+@styled
 def draw_road_angle_histogram(networks: Networks) -> Figure:
     figure = Figure(figsize=(10, 4.3), layout="constrained")
     grid: dict[str, Any] = {"subplot_kw": {"projection": "polar"}, "squeeze": False}
@@ -147,10 +147,10 @@ def draw_road_angle_histogram(networks: Networks) -> Figure:
 
 def graphs(networks: Networks, out: Path, range_m: float = REFERENCE_RANGE_M) -> Path:
     """The networks as maps at one scale: vehicles, their headings, links in range, connected components."""
-    return _save(draw_graphs(networks, range_m), out)
+    return save(draw_graphs(networks, range_m), out)
 
 
-@_styled
+@styled
 def draw_graphs(networks: Networks, range_m: float) -> Figure:
     middles, sizes = zip(*(_extent_km(position_m, range_m) for position_m, _ in networks.values()), strict=True)
     height_km = max(size[1] for size in sizes)
@@ -208,10 +208,10 @@ def against_time(
     `series` has the metrics of each seed for each mechanism. `references` are levels of the RMSE (m) by label, as
     the paper's; one whose label ends with a mechanism's name has its colour.
     """
-    return _save(draw_against_time(series, title, references or {}, log), out)
+    return save(draw_against_time(series, title, references or {}, log), out)
 
 
-@_styled
+@styled
 def draw_against_time(
     series: Mapping[str, Sequence[pa.Table]], title: str, references: Mapping[str, float], log: bool
 ) -> Figure:
@@ -284,10 +284,10 @@ def alpha_curve(
     `rows` are results with `weights` ("optimized" or a number), `seed` and the two `columns`; `paper` has the
     paper's √variance and √MSE (m) by α, and by "optimized" if wanted.
     """
-    return _save(draw_alpha_curve(rows, paper, columns), out)
+    return save(draw_alpha_curve(rows, paper, columns), out)
 
 
-@_styled
+@styled
 def draw_alpha_curve(
     rows: Sequence[Mapping[str, Any]], paper: Mapping[float | str, tuple[float, float]], columns: tuple[str, str]
 ) -> Figure:
@@ -360,10 +360,10 @@ def ratio_bars(
     `rows` are results with `network`, `mechanism`, `seed` and `column`; seeds are paired. `lines` are levels to
     mark, and what to write there.
     """
-    return _save(draw_ratio_bars(rows, column, limit, RATIO_LINES if lines is None else lines), out)
+    return save(draw_ratio_bars(rows, column, limit, RATIO_LINES if lines is None else lines), out)
 
 
-@_styled
+@styled
 def draw_ratio_bars(
     rows: Sequence[Mapping[str, Any]], column: str, limit: str, lines: Mapping[float, str]
 ) -> Figure:
@@ -452,8 +452,8 @@ def _scale_ratios(axes: Axes, values: Sequence[float]) -> None:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-@_styled
-def _save(figure: Figure, out: Path) -> Path:
+@styled
+def save(figure: Figure, out: Path) -> Path:
     """`out`.png and `out`.svg; the same figure gives the same bytes."""
     out.parent.mkdir(parents=True, exist_ok=True)
     png = out.with_name(out.name + ".png")

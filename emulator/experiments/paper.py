@@ -34,8 +34,12 @@ DEFAULT_ROWS: dict[str, dict[str, Any]] = {
     "none": {"fusion": "none"},
 }
 ONE_HOP_ROWS: dict[str, dict[str, Any]] = {
-    f"{name}, one hop": {"relay": False, "exchange": "particles", "fusion_interval_s": 0.5} | options
-    for name, options in DEFAULT_ROWS.items()
+    "optimized, one hop": {
+        "fusion": "optimized",
+        "relay": False,
+        "exchange": "particles",
+        "fusion_interval_s": 0.5,
+    }
 }
 
 
@@ -105,11 +109,18 @@ def write_crossing(path: Path) -> None:
     path.write_text("\n".join(["id,x_m,y_m,heading_rad", *lines]) + "\n")
 
 
-def default_scenario(network: dict[str, Any], seed: int, options: dict[str, Any]) -> Scenario:
+def counted_from(duration_s: float) -> float:
+    """From when on a run of the default profile counts: SETTLED_S, or two thirds of a short run."""
+    return min(SETTLED_S, duration_s * 2 / 3)
+
+
+def default_scenario(
+    network: dict[str, Any], seed: int, options: dict[str, Any], duration_s: float = DEFAULT_S
+) -> Scenario:
     """A cooperative run in the default world, 10 % loss."""
     return Scenario.model_validate(
         {
-            "run": {"name": "cell", "seed": seed, "duration_s": DEFAULT_S},
+            "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
             "network": network,
             "radio": {"range_m": RANGE_M, "loss": 0.1},
             "program": {"entry": "agents.cooperative:main", "options": options},
@@ -117,18 +128,24 @@ def default_scenario(network: dict[str, Any], seed: int, options: dict[str, Any]
     )
 
 
-def bound_scenario(network: dict[str, Any], seed: int, by_component: bool) -> Scenario:
-    """One filter that hears every fix without loss; or one a connected component."""
+def bound_scenario(
+    network: dict[str, Any],
+    seed: int,
+    by_component: bool,
+    options: dict[str, Any] | None = None,
+    duration_s: float = DEFAULT_S,
+) -> Scenario:
+    """One filter that hears every fix without loss; or one a connected component. `options` are the filter's."""
     world = build_world(default_scenario(network, seed, {}))
     label = components(world.at(0).position_m, RANGE_M) if by_component else np.zeros(len(world.node_ids))
     return Scenario.model_validate(
         {
-            "run": {"name": "cell", "seed": seed, "duration_s": DEFAULT_S},
+            "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
             "network": network,
             "radio": _everybody(label[:, None] == label[None, :]),
             "program": {
                 "entry": "agents.centralized:main",
-                "options": {"particles": CENTRALIZED_PARTICLES},
+                "options": {"particles": CENTRALIZED_PARTICLES} | (options or {}),
             },
         }
     )

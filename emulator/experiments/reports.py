@@ -12,6 +12,8 @@ from emulator.experiments.paper import ALPHAS
 from emulator.experiments.tables import markdown_table, mean_and_error, paired_difference, paired_ratio
 
 Result = Mapping[str, Any]
+LIMIT_RATIO = 1.35
+"""Optimized weights are wanted within so many times the limit, on each network and in each component."""
 
 PAPER_TABLE1: dict[float | str, tuple[float, float]] = {
     "optimized": (0.13, 0.58),
@@ -118,6 +120,12 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
     return markdown_table(header, [*rows, row])
 
 
+def anees_band(runs: int) -> tuple[float, float]:
+    """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
+    low, high = chi2.ppf([0.025, 0.975], 2 * runs) / (2 * runs)
+    return float(low), float(high)
+
+
 def default_profile(results: Sequence[Result]) -> str:
     """vnet's own profile: RMSE, the ratio to the limit, consistency and cost of each mechanism."""
     networks = unique(results, "network")
@@ -136,6 +144,7 @@ def default_profile(results: Sequence[Result]) -> str:
 
     parts = [
         "# The default profile",
+        _wanted(results, networks),
         table("RMSE of the common error [m]", lambda a, _: mean_and_error(column(a, "rmse_m"))),
         table("Relative to the limit, the same seeds", _ratio_to_limit),
         table("Relative to the limit, by component", _component_ratios),
@@ -143,7 +152,7 @@ def default_profile(results: Sequence[Result]) -> str:
         table("RMSE of the position [m]", lambda a, _: mean_and_error(column(a, "position_rmse_m"))),
         table("ANEES of the common error", lambda a, _: mean_and_error(column(a, "common_error_anees"), 2)),
         table("ANEES of the position", lambda a, _: mean_and_error(column(a, "position_anees"), 2)),
-        table("Bytes a frame; vehicles that diverged", _cost),
+        table("Bytes a vehicle sends in a period; vehicles that diverged", _cost),
         _paired(results, networks),
         _notes(results),
     ]
@@ -161,41 +170,92 @@ def _ratio_to_limit(rows: list[Result], limit: list[Result]) -> str:
 
 
 def _component_ratios(rows: list[Result], limit: list[Result]) -> str:
+    return " / ".join(f"{ratio:.2f}" for ratio in _by_component(rows, limit)) or "–"
+
+
+def _by_component(rows: list[Result], limit: list[Result]) -> list[float]:
+    """Ratios to the limit of each component; none if the components are not the same."""
     ours, bound = (np.array([row["component_rmse_m"] for row in some]) for some in (rows, limit))
     if ours.shape != bound.shape:
-        return "–"
-    return " / ".join(
-        f"{paired_ratio(a.tolist(), b.tolist())[0]:.2f}" for a, b in zip(ours.T, bound.T, strict=True)
-    )
+        return []
+    return [paired_ratio(a.tolist(), b.tolist())[0] for a, b in zip(ours.T, bound.T, strict=True)]
 
 
 def _cost(rows: list[Result], _: list[Result]) -> str:
     size = [row["bytes"] for row in rows if row["bytes"] is not None]
     text = f"{np.mean(size):.0f} B" if size else "–"
-    return f"{text}; {sum(row['divergent'] for row in rows)} of {len(rows)} runs"
+    return f"{text}; {sum(row['divergent'] for row in rows)} in {len(rows)} runs"
+
+
+def _wanted(results: Sequence[Result], networks: Sequence[str]) -> str:
+    """What is wanted of optimized weights, and whether it is so."""
+    names = [f"at most {LIMIT_RATIO} × the limit", "in each component", "no vehicle diverged"]
+    names += [f"{a} not worse than {b}" for a, b in COMPARED]
+    columns = []
+    for network in networks:
+        rows = select(results, network=network, mechanism="optimized")
+        pair = _same_seeds(rows, select(results, network=network, mechanism="limit"))
+        if not rows or len(pair[1]) != len(rows):
+            columns.append(["–"] * len(names))
+            continue
+        ratio, error = paired_ratio(column(rows, "rmse_m"), column(pair[1], "rmse_m"))
+        largest = max(_by_component(*pair), default=float("nan"))
+        diverged = sum(column(rows, "divergent"))
+        columns.append(
+            [
+                f"{_yes(ratio <= LIMIT_RATIO)}: {ratio:.2f} ± {error:.2f}",
+                f"{_yes(largest <= LIMIT_RATIO)}: {largest:.2f}",
+                f"{_yes(diverged == 0)}: {diverged} in {len(rows)} runs",
+                *(_not_worse(*_difference(results, network, a, b)) for a, b in COMPARED),
+            ]
+        )
+    table = markdown_table(["", *(n.upper() for n in networks)], list(zip(names, *columns, strict=True)))
+    return f"## What is wanted of optimized weights\n\n{table}"
+
+
+COMPARED = (("optimized", "random"), ("random", "none"))
+"""The first is wanted not worse than the second, by more than two standard errors of the paired difference."""
+
+
+def _yes(so: bool) -> str:
+    return "yes" if so else "**no**"
+
+
+def _not_worse(difference: float, error: float, seeds: int) -> str:
+    """Whether a difference of errors is not above zero by more than two standard errors; unknown of one seed."""
+    if seeds < 2:
+        return "unknown" if seeds else "–"
+    if difference > 2 * error:
+        return f"**no**: worse by {difference:.3f} m"
+    return "yes: better" if difference < -2 * error else "yes: no difference seen"
+
+
+def _difference(results: Sequence[Result], network: str, a: str, b: str) -> tuple[float, float, int]:
+    """RMSE of a less that of b over the seeds that both have: mean, standard error, seeds."""
+    one, other = (select(results, network=network, mechanism=m) for m in (a, b))
+    common = {row["seed"] for row in one} & {row["seed"] for row in other}
+    values = [column([row for row in rows if row["seed"] in common], "rmse_m") for rows in (one, other)]
+    return *paired_difference(*values), len(common)
 
 
 def _paired(results: Sequence[Result], networks: Sequence[str]) -> str:
-    lines = ["## Paired differences [m]", ""]
     rows = []
-    for a, b in (("optimized", "random"), ("random", "none")):
+    for a, b in (*COMPARED, ("optimized", "optimized, one hop")):
         row = [f"{a} − {b}"]
         for network in networks:
-            one, other = (select(results, network=network, mechanism=m) for m in (a, b))
-            common = {r["seed"] for r in one} & {r["seed"] for r in other}
-            one, other = ([r for r in some if r["seed"] in common] for some in (one, other))
-            difference, error = paired_difference(column(one, "rmse_m"), column(other, "rmse_m"))
-            row.append(f"{difference:+.3f} ± {error:.3f} ({len(common)} seeds)" if common else "–")
+            difference, error, seeds = _difference(results, network, a, b)
+            row.append(f"{difference:+.3f} ± {error:.3f} ({seeds} seeds)" if seeds else "–")
         rows.append(row)
-    return "\n".join(lines) + "\n" + markdown_table(["", *(n.upper() for n in networks)], rows)
+    return "## Paired differences [m]\n\n" + markdown_table(["", *(n.upper() for n in networks)], rows)
 
 
 def _notes(results: Sequence[Result]) -> str:
     runs = len(unique(results, "seed"))
-    low, high = chi2.ppf([0.025, 0.975], 2 * runs) / (2 * runs)
+    low, high = anees_band(runs)
     return (
         f"100 s, counted from 20 s on; up to {runs} seeds, ± standard error. `limit` is one centralized filter "
         "a connected component, `centralized` one over all. `one hop` mixes particles as the paper does and passes "
-        f"no fixes on. ANEES is 1 for a consistent filter; the 95 % band of {runs} independent samples of two "
-        f"degrees of freedom is {low:.2f} to {high:.2f} (the samples within a run are not independent)."
+        "no fixes on. Not worse: not by more than two standard errors of the paired difference. ANEES is 1 for a "
+        f"consistent filter; the 95 % band of {runs} independent samples of two degrees of freedom is {low:.2f} to "
+        f"{high:.2f} (the samples within a run are not independent)."
     )

@@ -125,4 +125,33 @@ def test_the_default_report_divides_by_the_limit_of_the_same_seeds() -> None:
     text = reports.default_profile(made_up({"limit": 0.2, "optimized": 0.3, "random": 0.4, "none": 0.4}))
     assert "1.50 ± 0.00" in text
     assert "-0.150 ± 0.050 (2 seeds)" in text
-    assert "900 B; 0 of 2 runs" in text
+    assert "900 B; 0 in 2 runs" in text
+
+
+def wanted(**rmse: float) -> dict[str, str]:
+    """What the report says of what is wanted, on the one network there is."""
+    section = reports.default_profile(made_up(rmse)).split("## ")[1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if "|" in line]
+    return {row[0]: row[1] for row in rows[2:]}
+
+
+def test_the_default_report_says_what_is_as_wanted_and_what_is_not() -> None:
+    good = wanted(limit=0.2, optimized=0.22, random=0.4, none=0.4)
+    assert good["at most 1.35 × the limit"] == "yes: 1.10 ± 0.00"
+    assert good["in each component"] == "yes: 1.10"
+    assert good["no vehicle diverged"] == "yes: 0 in 2 runs"
+    assert good["optimized not worse than random"] == "yes: better"
+    assert good["random not worse than none"] == "yes: no difference seen"
+    bad = wanted(limit=0.2, optimized=0.3, random=0.2)
+    assert bad["at most 1.35 × the limit"] == "**no**: 1.50 ± 0.00"
+    assert bad["in each component"] == "**no**: 1.50"
+    assert bad["optimized not worse than random"] == "**no**: worse by 0.150 m"
+    assert bad["random not worse than none"] == "–"
+
+
+def test_the_default_experiment_has_one_row_of_one_hop() -> None:
+    cells = paper.default_cells({"n1": TINY}, [1, 2])
+    mechanisms = [cell.labels["mechanism"] for cell in cells if cell.labels["seed"] == 2]
+    assert mechanisms == ["centralized", "limit", "optimized", "random", "none", "optimized, one hop"]
+    options = next(c for c in cells if c.labels["mechanism"] == "optimized, one hop").scenario.program.options
+    assert options["relay"] is False and options["exchange"] == "particles"

@@ -1,0 +1,74 @@
+"""Does the default profile ever lose its way? Many seeds on each network, and the worst of them (MODEL 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from emulator.experiments.cells import DIVERGENT_M, DIVERGENT_S, Cell
+from emulator.experiments.paper import DEFAULT_ROWS, DEFAULT_S, Labels, counted_from, default_scenario
+from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.tables import MISSING, markdown_table
+
+IN_FULL = "n3"
+"""The sparsest network, where a vehicle goes astray first: its runs have their full length."""
+SHORT_S = 30.0
+
+
+def divergence_cells(
+    networks: dict[str, dict[str, Any]], seeds: Sequence[int], duration_s: float = SHORT_S
+) -> list[Cell]:
+    """Optimized weights on all networks; N3 in full, the others for `duration_s`."""
+    cells = []
+    for network, section in networks.items():
+        length_s = DEFAULT_S if network == IN_FULL else duration_s
+        for seed in seeds:
+            labels: Labels = {"network": network, "mechanism": "optimized", "seed": seed, "duration_s": length_s}
+            scenario = default_scenario(section, seed, DEFAULT_ROWS["optimized"], length_s)
+            cells.append(Cell(labels, scenario, counted_from(length_s)))
+    return cells
+
+
+def report(results: Sequence[Result]) -> str:
+    """How many vehicles diverged, and RMSE over the seeds, in Markdown."""
+    header = ["network", "runs", "emulated [s]", "counted from [s]", "divergent vehicles", "runs with any"]
+    header += ["RMSE, median [m]", "95th percentile [m]", "worst [m]"]
+    rows = [_row(select(results, network=network)) for network in unique(results, "network")]
+    return (
+        "# Divergence: the default profile over many seeds\n\n"
+        f"{markdown_table(header, rows)}\n\n"
+        f"{_summary(results)} A vehicle is divergent whose common error is over {DIVERGENT_M:g} m for "
+        f"{DIVERGENT_S:g} s at any time of the run. RMSE is that of the common error over all vehicles of a run, "
+        "and its percentiles are over the seeds. "
+        f"{sum(row['not_finite'] for row in results)} reports were not finite.\n"
+    )
+
+
+def _summary(results: Sequence[Result]) -> str:
+    """How many runs had a divergent vehicle; where none, how many may have had one at most."""
+    diverged = sum(row["divergent"] > 0 for row in results)
+    text = f"{diverged} of {len(results)} runs had a vehicle that diverged"
+    if diverged:
+        return f"{text}."
+    least = min(len(select(results, network=network)) for network in unique(results, "network"))
+    return f"{text}: with 95 % confidence, less than {100 * (1 - 0.05 ** (1 / least)):.2g} % on each network do."
+
+
+def _row(rows: Sequence[Result]) -> list[str]:
+    durations = unique(rows, "duration_s")
+    known = [row for row in rows if row["rmse_m"] is not None]
+    error = np.array(column(known, "rmse_m"), dtype=float)
+    worst = max(known, key=lambda row: float(row["rmse_m"]), default=None)
+    return [
+        rows[0]["network"].upper(),
+        str(len(rows)),
+        " ".join(f"{duration_s:g}" for duration_s in durations),
+        " ".join(f"{counted_from(duration_s):g}" for duration_s in durations),
+        str(sum(column(rows, "divergent"))),
+        str(sum(row["divergent"] > 0 for row in rows)),
+        f"{np.median(error):.3f}" if worst else MISSING,
+        f"{np.percentile(error, 95):.3f}" if worst else MISSING,
+        f"{worst['rmse_m']:.3f} (seed {worst['seed']})" if worst else MISSING,
+    ]
