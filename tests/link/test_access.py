@@ -36,7 +36,7 @@ def test_files_with_credentials_are_for_their_owner_only(listen: str, tmp_path: 
     create(listen).save(folder, listen, folder)
     create(listen).save(folder, listen, folder)  # also where they are written again
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in [folder, *folder.rglob("*")]}
-    assert len(modes) == 9
+    assert len(modes) == 10
     assert {modes[path] for path in modes if path.is_dir()} == {0o700}
     assert {modes[path] for path in modes if path.is_file()} == {0o600}
 

@@ -101,11 +101,6 @@ class Access:
     tls: Certificates | None = None
 
     @classmethod
-<<<<<<< HEAD
-    def create(cls, run: str, processes: Sequence[Sequence[str]]) -> Access:
-        """Draw new passwords for every process and role of a run."""
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
-=======
     def create(
         cls,
         run: str,
@@ -118,8 +113,7 @@ class Access:
         That is where the router listens, and `tls_names` are further names or addresses that it goes by: clients
         verify that they met one of these. Raises LinkError where certificates cannot be made.
         """
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER]
->>>>>>> c243404 (TLS with client certificates beside passwords, and access files that are checked as they are read)
+        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
