@@ -36,7 +36,7 @@ def test_files_with_credentials_are_for_their_owner_only(listen: str, tmp_path: 
     create(listen).save(folder, listen, folder)
     create(listen).save(folder, listen, folder)  # also where they are written again
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in [folder, *folder.rglob("*")]}
-    assert len(modes) == 9
+    assert len(modes) == 10
     assert {modes[path] for path in modes if path.is_dir()} == {0o700}
     assert {modes[path] for path in modes if path.is_file()} == {0o600}
 
@@ -63,7 +63,7 @@ def test_every_user_has_a_key_pair_and_a_rule_of_its_own() -> None:
     access = create(TLS)
     assert access.tls is not None
     pairs = [access.tls.router, *access.tls.users.values()]
-    assert len({pair.private_key for pair in pairs}) == len({pair.certificate for pair in pairs}) == 5
+    assert len({pair.private_key for pair in pairs}) == len({pair.certificate for pair in pairs}) == 6
     subjects = access.access_control()["subjects"]
     assert all(subject["usernames"] == subject["cert_common_names"] == [subject["id"]] for subject in subjects)
 

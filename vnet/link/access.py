@@ -101,11 +101,6 @@ class Access:
     tls: Certificates | None = None
 
     @classmethod
-<<<<<<< HEAD
-    def create(cls, run: str, processes: Sequence[Sequence[str]]) -> Access:
-        """Draw new passwords for every process and role of a run."""
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
-=======
     def create(
         cls,
         run: str,
@@ -118,8 +113,7 @@ class Access:
         That is where the router listens, and `tls_names` are further names or addresses that it goes by: clients
         verify that they met one of these. Raises LinkError where certificates cannot be made.
         """
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER]
->>>>>>> c243404 (TLS with client certificates beside passwords, and access files that are checked as they are read)
+        users = _users(processes)
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
@@ -219,14 +213,10 @@ class Access:
     def _check(self) -> None:
         """Raises ValueError if this is not what `create` makes: rules and the dictionary are written from it."""
         names = [self.run, *(node for nodes in self.processes for node in nodes)]
-        users = [node_user(nodes[0]) for nodes in self.processes if nodes] + [EMULATOR, OBSERVER]
-        if (
-            not all(map(keys.is_segment, names))
-            or not all(self.processes)
-            or sorted(users) != sorted(self.passwords)
-        ):
+        if not all(map(keys.is_segment, names)) or not all(self.processes):
             raise ValueError
-        if self.tls is not None and sorted(users) != sorted(self.tls.users):
+        users = sorted(_users(self.processes))
+        if users != sorted(self.passwords) or (self.tls is not None and users != sorted(self.tls.users)):
             raise ValueError
         for user, password in self.passwords.items():
             _check_user(user, password)
@@ -254,6 +244,11 @@ EVERYTHING = [
     "declare_liveliness_subscriber",
     "liveliness_query",
 ]
+
+
+def _users(processes: Sequence[Sequence[str]]) -> list[str]:
+    """All users of a run: one for each process, and the other roles."""
+    return [*(node_user(nodes[0]) for nodes in processes), EMULATOR, OBSERVER, OPERATOR]
 
 
 def node_user(lead: str) -> str:
