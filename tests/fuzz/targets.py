@@ -244,7 +244,8 @@ _FAULT_WORDS = tuple(
     for word in (*KINDS, "kind", "nodes", "ids", "fraction", "random", "disc", "polygon", "degree")
 )
 _ACCESS = (
-    b'{"run": "r", "processes": [["v01", "v02"]], "passwords": {"node-v01": "a", "emulator": "b", "observer": "c"}}'
+    b'{"run": "r", "processes": [["v01", "v02"]], '
+    b'"passwords": {"node-v01": "a", "emulator": "b", "observer": "c", "operator": "d"}}'
 )
 
 

@@ -63,7 +63,7 @@ def test_every_user_has_a_key_pair_and_a_rule_of_its_own() -> None:
     access = create(TLS)
     assert access.tls is not None
     pairs = [access.tls.router, *access.tls.users.values()]
-    assert len({pair.private_key for pair in pairs}) == len({pair.certificate for pair in pairs}) == 5
+    assert len({pair.private_key for pair in pairs}) == len({pair.certificate for pair in pairs}) == 6
     subjects = access.access_control()["subjects"]
     assert all(subject["usernames"] == subject["cert_common_names"] == [subject["id"]] for subject in subjects)
 

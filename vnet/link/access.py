@@ -113,7 +113,7 @@ class Access:
         That is where the router listens, and `tls_names` are further names or addresses that it goes by: clients
         verify that they met one of these. Raises LinkError where certificates cannot be made.
         """
-        users = [node_user(nodes[0]) for nodes in processes] + [EMULATOR, OBSERVER, OPERATOR]
+        users = _users(processes)
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
@@ -213,14 +213,10 @@ class Access:
     def _check(self) -> None:
         """Raises ValueError if this is not what `create` makes: rules and the dictionary are written from it."""
         names = [self.run, *(node for nodes in self.processes for node in nodes)]
-        users = [node_user(nodes[0]) for nodes in self.processes if nodes] + [EMULATOR, OBSERVER]
-        if (
-            not all(map(keys.is_segment, names))
-            or not all(self.processes)
-            or sorted(users) != sorted(self.passwords)
-        ):
+        if not all(map(keys.is_segment, names)) or not all(self.processes):
             raise ValueError
-        if self.tls is not None and sorted(users) != sorted(self.tls.users):
+        users = sorted(_users(self.processes))
+        if users != sorted(self.passwords) or (self.tls is not None and users != sorted(self.tls.users)):
             raise ValueError
         for user, password in self.passwords.items():
             _check_user(user, password)
@@ -248,6 +244,11 @@ EVERYTHING = [
     "declare_liveliness_subscriber",
     "liveliness_query",
 ]
+
+
+def _users(processes: Sequence[Sequence[str]]) -> list[str]:
+    """All users of a run: one for each process, and the other roles."""
+    return [*(node_user(nodes[0]) for nodes in processes), EMULATOR, OBSERVER, OPERATOR]
 
 
 def node_user(lead: str) -> str:
