@@ -192,6 +192,10 @@ class Estimator:
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
+        return encode(self.compose(fix, max_payload))
+
+    def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
+        """The frame with the newest fix, as long as `max_payload` bytes allow."""
         share = self._share
         self._said = self._estimate()
         heard = {name: name in share.takers for name in sorted(share.heard)[:255]}
@@ -199,7 +203,7 @@ class Estimator:
         mixes = self._options.exchange == "particles" and self._options.fusion != "none"
         count = min(self._options.particles, left // 4) if mixes else 0
         most = min(RELAY_LIMIT, (left - 4 * count) // RELAYED.itemsize) if self._options.relay else 0
-        frame = CooperativeFrame(
+        return CooperativeFrame(
             fix.time_ns,
             fix.position_m,
             fix.heading_rad,
@@ -211,7 +215,6 @@ class Estimator:
             self._sightings.freshest(fix.time_ns, most),
             min(self._largest_degree, 255),
         )
-        return encode(frame)
 
 
 def _consensus(options: Options, name: str) -> Consensus:
@@ -231,7 +234,11 @@ def _share(frame: CooperativeFrame) -> Share:
 async def main(node: Node) -> None:
     """Cooperate until the run ends."""
     options = Options.parse(node.options)
-    estimator = Estimator(node.id, options, node.map, node.rng, node.period_ns)
+    await cooperate(node, options, Estimator(node.id, options, node.map, node.rng, node.period_ns))
+
+
+async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
+    """The vehicle's loop around its `estimator`, until the run ends."""
     periods_a_second = max(1, NS_PER_S // node.period_ns)
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
