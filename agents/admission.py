@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from agents.cooperative_frame import CooperativeFrame, FrameError, decode, short_name
+from agents.cooperative_frame import CooperativeFrame, FrameError, centimetres, decode, short_name
 from vnet import Packet
 
 STALE_PERIODS = 3
@@ -33,7 +33,7 @@ class Admission:
         self._period_ns = period_ns
         self._again = again
         self._newest_ns: dict[str, int] = {}
-        self._said_by: dict[tuple[int, bytes], str] = {}
+        self._said_by: dict[tuple[int, int, int], str] = {}
         self._early: dict[tuple[str, int], tuple[str, CooperativeFrame]] = {}
         self._forgot_ns = 0
 
@@ -73,15 +73,17 @@ class Admission:
             return "stale"
         if frame.epoch > EPOCH_MARGIN + now_ns // self._period_ns:
             return "absurd"
-        newest_ns = self._newest_ns.get(sender)
-        if newest_ns is None and len(self._newest_ns) + len(self._early) >= MOST_SENDERS:
+        if sender not in self._newest_ns and len(self._newest_ns) + len(self._early) >= MOST_SENDERS:
             return "crowd"
-        known = (sender, frame.fix_time_ns) in self._early or (newest_ns or -1) >= frame.fix_time_ns
+        known = (sender, frame.fix_time_ns) in self._early or self._newest_ns.get(sender, -1) >= frame.fix_time_ns
         if known and not self._again:
             return "old"
-        # Two receivers never agree to the centimetre: whoever says so second has it from the first.
-        key = (frame.fix_time_ns, frame.fix_m.tobytes())
-        return None if self._said_by.setdefault(key, sender) == sender else "copy"
+        return None if self.said(sender, frame) else "copy"
+
+    def said(self, sender: str, frame: CooperativeFrame) -> bool:
+        """Whether `sender` is the first to say where it is. Two receivers never agree to the centimetre."""
+        key = (frame.fix_time_ns, *centimetres(frame.fix_m))
+        return self._said_by.setdefault(key, sender) == sender
 
     def _forget(self, now_ns: int) -> None:
         """Drop what frames that are not stale cannot bear upon."""

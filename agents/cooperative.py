@@ -206,7 +206,9 @@ class Estimator:
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
-        return encode(self.compose(fix, max_payload))
+        frame = self.compose(fix, max_payload)
+        self._admission.said(self.name, frame)
+        return encode(frame)
 
     def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
         """The frame with the newest fix, as long as `max_payload` bytes allow."""

@@ -78,7 +78,7 @@ class CooperativeFrame:
 
     def own_fix(self, code: int) -> NDArray[np.void]:
         """The sender's own fix, (1,) of `RELAYED`, under its code."""
-        x_cm, y_cm = _cm(self.fix_m)
+        x_cm, y_cm = centimetres(self.fix_m)
         return np.array([(code, 0, _heading_code(self.heading_rad), x_cm, y_cm)], dtype=RELAYED)
 
 
@@ -110,7 +110,7 @@ def encode(frame: CooperativeFrame) -> bytes:
         _heading_code(frame.heading_rad),
         int(frame.name, 16),
         frame.fix_time_ns,
-        *_cm(frame.fix_m),
+        *centimetres(frame.fix_m),
         *frame.estimate_m,
         covariance[0, 0],
         covariance[0, 1],
@@ -177,7 +177,8 @@ def decode(payload: bytes) -> CooperativeFrame:
     )
 
 
-def _cm(position_m: Array) -> tuple[int, int]:
+def centimetres(position_m: Array) -> tuple[int, int]:
+    """A position (2,) as it is said."""
     x, y = position_m.tolist()
     return round(x * 100), round(y * 100)
 

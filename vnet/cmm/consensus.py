@@ -47,16 +47,18 @@ class ConsensusConfig:
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
     last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
     `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
-    `epochs`, `epochs_rounds`: so many epochs at once may a peer be the first to bring, and one more in so many
-    rounds; who brings more is not heard for `exile_rounds`.
+    `blame`: so much may a peer be blamed at once, and one more in `blame_rounds` (a leaky bucket); beyond that it
+    is not heard for `exile_rounds`. To be the first to bring a new epoch counts 1, a leap of epochs up to `leap`,
+    and so much do false sums.
     """
 
     silence_rounds: int = 20
     steady_rounds: int = 5
     settle_rounds: int = 30
     gate_m: float = math.inf
-    epochs: int = 10
-    epochs_rounds: int = 10
+    blame: int = 10
+    blame_rounds: int = 50
+    leap: int = 5
     exile_rounds: int = 600
 
 
@@ -96,6 +98,11 @@ class Peers:
         """Peers heard lately that hear this node as well."""
         return frozenset(peer for peer, hears in self._hears_us.items() if hears)
 
+    def drop(self, peer: str) -> None:
+        """Forget a peer at once."""
+        self._silent.pop(peer, None)
+        self._hears_us.pop(peer, None)
+
     def listen(self, shares: Mapping[str, Share]) -> None:
         """Take note of one round's shares."""
         for peer in list(self._silent):
@@ -113,11 +120,11 @@ class RatioConsensus:
     def __init__(
         self, node: str, config: ConsensusConfig | None = None, rejected: Counter[str] | None = None
     ) -> None:
-        """`rejected` counts shares that are not believed, by reason: `sums`, `epoch`."""
+        """`rejected` counts shares that are not believed, by reason: `sums`, `exile`."""
         self._node = node
         self._config = config or ConsensusConfig()
         self._rejected = Counter() if rejected is None else rejected
-        self._brought: dict[str, float] = {}
+        self._blamed: dict[str, float] = {}
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
@@ -156,34 +163,41 @@ class RatioConsensus:
         return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
 
     def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
-        """Without the shares of those who bring false mass or epoch after epoch: as if these were not heard.
+        """Without the shares of those who bring false sums, or epoch after epoch: as if these were not heard.
 
-        What they have been given is given to them in vain, until they have not been heard for so long that they are
-        left out of a new epoch; the ratio of what is left is the mean all the same.
+        What they have been given is given to them in vain, until a new epoch starts without them; the ratio of what
+        is left is the mean all the same.
         """
-        self._count_epochs(shares)
+        leak = 1 / self._config.blame_rounds
+        self._blamed = {peer: blame - leak for peer, blame in self._blamed.items() if blame > leak}
+        self._blame_for_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._brought.get(peer, 0.0) > self._config.epochs:
-                self._rejected["epoch"] += 1
+            if self._blamed.get(peer, 0.0) > self._config.blame:
+                self._rejected["exile"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["sums"] += 1
+                self._blame(peer, self._config.leap)
             else:
                 believed[peer] = share
         return believed
 
-    def _count_epochs(self, shares: Mapping[str, Share]) -> None:
-        leak = 1 / self._config.epochs_rounds
-        self._brought = {peer: count - leak for peer, count in self._brought.items() if count > leak}
+    def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
         newest = max((share.epoch for share in shares.values()), default=0)
-        if newest <= self._highest:
-            return
-        for peer, share in shares.items():
-            count = self._brought.get(peer, 0.0)
-            if share.epoch == newest and count <= self._config.epochs:
-                exiled = count + 1 > self._config.epochs
-                self._brought[peer] = count + 1 + (self._config.exile_rounds * leak if exiled else 0)
+        if newest > self._highest:
+            for peer, share in shares.items():
+                if share.epoch == newest:
+                    self._blame(peer, min(newest - self._highest, self._config.leap))
+
+    def _blame(self, peer: str, blame: int) -> None:
+        blamed = self._blamed.get(peer, 0.0)
+        if blamed <= self._config.blame:
+            exiled = blamed + blame > self._config.blame
+            rounds = self._config.exile_rounds if exiled else 0
+            self._blamed[peer] = blamed + blame + rounds / self._config.blame_rounds
+            if exiled:
+                self._peers.drop(peer)
 
     def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
         """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from vnet.roads.lanes import Array
 
-GATE_SIGMAS = 4.0
+GATE_SIGMAS = 5.0
 GATE_FLOOR_M = 0.25
 """Added in quadrature: filters are a little surer of themselves than they should be, and drift apart by chance."""
 
