@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-from agents.cooperative_frame import CooperativeFrame, FrameError, centimetres, decode, short_name
+from agents.cooperative_frame import CooperativeFrame, FrameError, decode, short_name
 from vnet import Packet
+from vnet.roads.lanes import Array
 
 STALE_PERIODS = 3
 EPOCH_MARGIN = 10
@@ -33,7 +34,7 @@ class Admission:
         self._period_ns = period_ns
         self._again = again
         self._newest_ns: dict[str, int] = {}
-        self._said_by: dict[tuple[int, int, int], str] = {}
+        self._said_by: dict[tuple[int, bytes], str] = {}
         self._early: dict[tuple[str, int], tuple[str, CooperativeFrame]] = {}
         self._forgot_ns = 0
 
@@ -78,12 +79,11 @@ class Admission:
         known = (sender, frame.fix_time_ns) in self._early or self._newest_ns.get(sender, -1) >= frame.fix_time_ns
         if known and not self._again:
             return "old"
-        return None if self.said(sender, frame) else "copy"
+        return None if self.said(sender, frame.fix_time_ns, frame.fix_m) else "copy"
 
-    def said(self, sender: str, frame: CooperativeFrame) -> bool:
-        """Whether `sender` is the first to say where it is. Two receivers never agree to the centimetre."""
-        key = (frame.fix_time_ns, *centimetres(frame.fix_m))
-        return self._said_by.setdefault(key, sender) == sender
+    def said(self, sender: str, time_ns: int, fix_m: Array) -> bool:
+        """Whether `sender` is the first with this fix (2,), as frames say it: no two agree to the centimetre."""
+        return self._said_by.setdefault((time_ns, fix_m.tobytes()), sender) == sender
 
     def _forget(self, now_ns: int) -> None:
         """Drop what frames that are not stale cannot bear upon."""

@@ -20,6 +20,7 @@ from agents.cooperative_frame import (
     RELAY_LIMIT,
     RELAYED,
     CooperativeFrame,
+    centimetres,
     encode,
     name_of_code,
     room,
@@ -207,7 +208,7 @@ class Estimator:
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
         frame = self.compose(fix, max_payload)
-        self._admission.said(self.name, frame)
+        self._admission.said(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
         return encode(frame)
 
     def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
