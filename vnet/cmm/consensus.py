@@ -15,6 +15,8 @@ starts again under a new epoch: the highest spreads, and the old mean serves unt
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -44,11 +46,24 @@ class ConsensusConfig:
 
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
     last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
+    `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
+    `blame`: so much may a peer be blamed at once, and one more in `blame_rounds` (a leaky bucket); beyond that it
+    is not heard for `exile_rounds`. To be the first to bring a new epoch counts 1, a leap of epochs up to `leap`,
+    and so much do false sums.
     """
 
     silence_rounds: int = 20
     steady_rounds: int = 5
     settle_rounds: int = 30
+    gate_m: float = math.inf
+    blame: int = 10
+    blame_rounds: int = 50
+    leap: int = 5
+    exile_rounds: int = 600
+
+
+LEAST_MASS = 0.1
+"""Tracking adds the change of the input to masses of any size: small ones need not have a sensible ratio."""
 
 
 class Consensus(Protocol):
@@ -83,6 +98,11 @@ class Peers:
         """Peers heard lately that hear this node as well."""
         return frozenset(peer for peer, hears in self._hears_us.items() if hears)
 
+    def drop(self, peer: str) -> None:
+        """Forget a peer at once."""
+        self._silent.pop(peer, None)
+        self._hears_us.pop(peer, None)
+
     def listen(self, shares: Mapping[str, Share]) -> None:
         """Take note of one round's shares."""
         for peer in list(self._silent):
@@ -97,9 +117,14 @@ class Peers:
 class RatioConsensus:
     """The consensus state of one node. Epoch 0 means: not taking part yet."""
 
-    def __init__(self, node: str, config: ConsensusConfig | None = None) -> None:
+    def __init__(
+        self, node: str, config: ConsensusConfig | None = None, rejected: Counter[str] | None = None
+    ) -> None:
+        """`rejected` counts shares that are not believed, by reason: `sums`, `exile`."""
         self._node = node
         self._config = config or ConsensusConfig()
+        self._rejected = Counter() if rejected is None else rejected
+        self._blamed: dict[str, float] = {}
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
@@ -126,6 +151,7 @@ class RatioConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        shares = self._believed(value, shares)
         self._peers.listen(shares)
         self._highest = max([self._highest, *(share.epoch for share in shares.values())])
         self._follow(value)
@@ -135,6 +161,51 @@ class RatioConsensus:
         self._input = np.array(value, dtype=float)
         s_x, s_y, w = self._running_sum.tolist()
         return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
+
+    def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
+        """Without the shares of those who bring false sums, or epoch after epoch: as if these were not heard.
+
+        What they have been given is given to them in vain, until a new epoch starts without them; the ratio of what
+        is left is the mean all the same.
+        """
+        leak = 1 / self._config.blame_rounds
+        self._blamed = {peer: blame - leak for peer, blame in self._blamed.items() if blame > leak}
+        self._blame_for_epochs(shares)
+        x, y = value.tolist()
+        believed = {}
+        for peer, share in shares.items():
+            if self._blamed.get(peer, 0.0) > self._config.blame:
+                self._rejected["exile"] += 1
+            elif not self._is_plausible(peer, share, x, y):
+                self._rejected["sums"] += 1
+                self._blame(peer, self._config.leap)
+            else:
+                believed[peer] = share
+        return believed
+
+    def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
+        newest = max((share.epoch for share in shares.values()), default=0)
+        if newest > self._highest:
+            for peer, share in shares.items():
+                if share.epoch == newest:
+                    self._blame(peer, min(newest - self._highest, self._config.leap))
+
+    def _blame(self, peer: str, blame: int) -> None:
+        blamed = self._blamed.get(peer, 0.0)
+        if blamed <= self._config.blame:
+            exiled = blamed + blame > self._config.blame
+            rounds = self._config.exile_rounds if exiled else 0
+            self._blamed[peer] = blamed + blame + rounds / self._config.blame_rounds
+            if exiled:
+                self._peers.drop(peer)
+
+    def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
+        """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
+        if share.epoch != self.epoch or self._node not in share.takers:
+            return True
+        seen = self._seen.get(peer)
+        s_x, s_y, w = share.running_sum if seen is None else (np.array(share.running_sum) - seen).tolist()
+        return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + LEAST_MASS)
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
@@ -212,11 +283,20 @@ class AveragingConsensus:
     Raises VnetError for another rule.
     """
 
-    def __init__(self, node: str, rule: str, config: ConsensusConfig | None = None) -> None:
+    def __init__(
+        self,
+        node: str,
+        rule: str,
+        config: ConsensusConfig | None = None,
+        rejected: Counter[str] | None = None,
+    ) -> None:
+        """`rejected` counts states that are not believed as `sums`."""
         if rule not in AVERAGING_RULES:
             raise VnetError(f"averaging rule {rule!r}: allowed: {', '.join(AVERAGING_RULES)}")
         self._rule = rule
-        self._peers = Peers(node, (config or ConsensusConfig()).silence_rounds)
+        self._config = config or ConsensusConfig()
+        self._rejected = Counter() if rejected is None else rejected
+        self._peers = Peers(node, self._config.silence_rounds)
         self._input: Array | None = None
         self._state: Array | None = None
         self._degree = 1.0
@@ -228,6 +308,7 @@ class AveragingConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        shares = self._believed(value, shares)
         self._peers.listen(shares)
         mutual = self._peers.mutual
         said = {peer: shares[peer].running_sum for peer in sorted(shares) if peer in mutual}
@@ -245,6 +326,17 @@ class AveragingConsensus:
         self._state, self._input = state, np.array(value, dtype=float)
         x, y = state.tolist()
         return Share(0, (x, y, self._degree), mutual, self._peers.heard)
+
+    def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
+        x, y = value.tolist()
+        believed = {
+            peer: share
+            for peer, share in shares.items()
+            if math.hypot(share.running_sum[0] - x, share.running_sum[1] - y) <= self._config.gate_m
+        }
+        if len(believed) < len(shares):
+            self._rejected["sums"] += len(shares) - len(believed)
+        return believed
 
 
 def _towards(state: Array, degree: float, other: tuple[float, float, float]) -> Array:
