@@ -8,7 +8,7 @@ one round of mean consensus, come together with the neighbours, and report. The 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -54,6 +54,8 @@ NS_PER_S = 1_000_000_000
 SUMS_GATE_SIGMAS = 5.0
 """Sums of the consensus that are further from one's own estimate, in deviations of the common error, are false."""
 CLOUD_REPORT_PARTICLES = 50
+CLOCK_FIXES = 10
+"""So many fixes a clock is judged by: after it has jumped ahead it is wrong for so long."""
 SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.85, 0.97
 """Shares of the period: within the first every vehicle sends, at the end of the second it computes."""
 
@@ -268,29 +270,53 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
     periods_a_second = max(1, NS_PER_S // node.period_ns)
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
+    clock = _GnssClock(node)
     async for fix in node.gnss:
-        await _sleep_until(node, fix.time_ns + slot_ns)
-        estimator.read(node.radio.drain(), node.now_ns)
+        # After standing still a vehicle goes on from the newest fix: nobody wants what it saw meanwhile.
+        fix = (node.gnss.drain() or [fix])[-1]
+        clock.set_by(fix)
+        await clock.sleep_until(fix.time_ns + slot_ns)
+        estimator.read(node.radio.drain(), clock.now_ns)
         payload = b""
         if usable(fix):
             payload = estimator.frame(fix, node.radio.max_payload)
             await node.radio.broadcast(payload)
-        await _sleep_until(node, fix.time_ns + round(LISTENING_SHARE * node.period_ns))
+        await clock.sleep_until(fix.time_ns + round(LISTENING_SHARE * node.period_ns))
         packets = node.radio.drain()
-        estimator.read(packets, node.now_ns)
+        estimator.read(packets, clock.now_ns)
         estimator.filter(fix)
         if options.two_frames and usable(fix):
             await node.radio.broadcast(estimator.frame(fix, node.radio.max_payload))
-            await _sleep_until(node, fix.time_ns + round(REPORTING_SHARE * node.period_ns))
-            estimator.read(node.radio.drain(), node.now_ns)
+            await clock.sleep_until(fix.time_ns + round(REPORTING_SHARE * node.period_ns))
+            estimator.read(node.radio.drain(), clock.now_ns)
         estimator.agree()
         in_full = (fix.time_ns // node.period_ns) % periods_a_second == 0
         _report(node, estimator, fix, len(packets), len(payload), in_full)
 
 
-async def _sleep_until(node: Node, time_ns: int) -> None:
-    if time_ns > node.now_ns:
-        await asyncio.sleep((time_ns - node.now_ns) / NS_PER_S)
+class _GnssClock:
+    """GNSS time, kept by the vehicle's own clock, which may be wrong.
+
+    A fix is met at its time or later: the least that the clock was ahead of the last fixes is its error.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._ahead_ns: deque[int] = deque(maxlen=CLOCK_FIXES)
+
+    def set_by(self, fix: Fix) -> None:
+        """Take note of a fix that has just come."""
+        self._ahead_ns.append(self._node.now_ns - fix.time_ns)
+
+    @property
+    def now_ns(self) -> int:
+        """GNSS time in nanoseconds."""
+        return self._node.now_ns - min(self._ahead_ns)
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Sleep until this GNSS time."""
+        if time_ns > self.now_ns:
+            await asyncio.sleep((time_ns - self.now_ns) / NS_PER_S)
 
 
 def _report(node: Node, estimator: Estimator, fix: Fix, heard: int, size: int, in_full: bool) -> None:
