@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import faulthandler
 import signal
 import sys
@@ -16,6 +18,8 @@ from vnet.link.access import Credentials
 from vnet.link.hosting import fix_hash_seed
 from vnet.link.keys import is_segment
 from vnet.link.session import quiet_zenoh
+
+_PR_SET_PDEATHSIG = 1
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -34,6 +38,7 @@ def agent(
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     faulthandler.register(signal.SIGUSR1)
+    _go_on_without_parent()
     sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quiet_zenoh()
@@ -48,6 +53,16 @@ def agent(
         sys.exit(2 if isinstance(error, ProgramError) else 3)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _go_on_without_parent() -> None:
+    """Have the kernel continue this process when the one that started it dies.
+
+    An emulator that is killed while its agents stand still (the fault `pause`) cannot; they then find that they are
+    orphans, and end.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # Linux only
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
 def main() -> None:

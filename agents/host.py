@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
@@ -82,6 +83,7 @@ class _Attachment:
         self.nodes = list(nodes)
         self.nonce = secrets.token_bytes(16)
         self.inbox: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._set_aside: deque[Item] = deque()
         self.on_message: Callable[[bytes], None] = _no_wake
         self.orphan_timeout_s = 5.0
         self._patience_until = 0.0
@@ -182,7 +184,7 @@ class _Attachment:
 
     def _next(self, timeout_s: float | None) -> wire.EmulatorMessage | None:
         try:
-            item = self.inbox.get(timeout=timeout_s)
+            item = self._set_aside.popleft() if self._set_aside else self.inbox.get(timeout=timeout_s)
         except queue.Empty:
             return None
         if item is _Lost:
@@ -210,18 +212,28 @@ class _Attachment:
         return max(self.orphan_timeout_s, self._patience_until - time.monotonic())
 
     def _wait_as_orphan(self) -> None:
-        deadline = time.monotonic() + self.patience_s
+        """Wait until the emulator is back; its first messages may be faster than the news of it."""
+        patience_s = self.patience_s
+        deadline = time.monotonic() + patience_s
         while (wait_s := deadline - time.monotonic()) > 0:
             try:
-                if self.inbox.get(timeout=wait_s) is _Found:
-                    return
+                item = self.inbox.get(timeout=wait_s)
             except queue.Empty:
                 break
-        raise LinkError(self.orphaned())
+            if item is _Found:
+                self.found()
+                return
+            if isinstance(item, tuple):
+                self._set_aside.append(item)
+        raise LinkError(self.orphaned(patience_s))
 
-    def orphaned(self) -> str:
-        """The one line of an agent that has lost its emulator."""
-        return f"{self.nodes[0]}: the emulator has been gone for {self.orphan_timeout_s:g} s; ending"
+    def found(self) -> None:
+        """The emulator is back: it has said nothing about when it goes the next time."""
+        self._patience_until = 0.0
+
+    def orphaned(self, patience_s: float) -> str:
+        """The one line of an agent that has lost its emulator for so long."""
+        return f"{self.nodes[0]}: the emulator has been gone for {patience_s:.3g} s; ending"
 
 
 def _no_wake(payload: bytes) -> None:
@@ -357,12 +369,15 @@ class _RealTimeAgent:
         if self._orphan_timer is not None:
             self._orphan_timer.cancel()
             self._orphan_timer = None
+            if present:
+                self._attachment.found()
         if not present:
-            self._orphan_timer = self._loop.call_later(self._attachment.patience_s, self._orphaned)
+            patience_s = self._attachment.patience_s
+            self._orphan_timer = self._loop.call_later(patience_s, self._orphaned, patience_s)
 
-    def _orphaned(self) -> None:
+    def _orphaned(self, patience_s: float) -> None:
         if not self._over.done():
-            self._over.set_exception(LinkError(self._attachment.orphaned()))
+            self._over.set_exception(LinkError(self._attachment.orphaned(patience_s)))
 
     def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
         if batch.seq > self._expected:

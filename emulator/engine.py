@@ -114,7 +114,7 @@ class Engine:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
-                frame = Frame(node, outgoing.seq, time_ns, len(outgoing.payload), outgoing.copy)
+                frame = Frame(node, outgoing.seq, time_ns, len(outgoing.payload), outgoing.copy, outgoing.draw)
                 self._transmit(frame, outgoing)
 
     def _transmit(self, frame: Frame, outgoing: Outgoing) -> None:

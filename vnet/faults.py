@@ -6,11 +6,12 @@ itself. What a kind does is in `emulator.faults`; here is what may be written do
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
 
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, shown
 from vnet.sections import Section, first_problem
 
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -97,6 +98,19 @@ class Partition(_Fault):
 
     kind: Literal["partition"]
     groups: Literal["halves", "one", "ring"] | tuple[tuple[str, ...], ...] = "halves"
+
+    @field_validator("groups", mode="before")
+    @classmethod
+    def _groups_are_named_or_listed(cls, groups: Any) -> Any:
+        if isinstance(groups, str) and groups in ("halves", "one", "ring"):
+            return groups
+        listed = isinstance(groups, (list, tuple)) and all(isinstance(group, (list, tuple)) for group in groups)
+        ids = [node for group in groups for node in group] if listed else []
+        if not listed or not all(isinstance(node, str) for node in ids):
+            raise ValueError("write halves, one, ring, or lists of ids")
+        if twice := [node for node, count in Counter(ids).items() if count > 1]:
+            raise ValueError(f"{shown(twice[0])} is in two groups")
+        return groups
 
 
 class Block(_LinkFault):
@@ -243,7 +257,7 @@ class ConstPosOffset(_NodeFault):
 
 
 class RandomPos(_NodeFault):
-    """The nodes' own fixes are anywhere within `radius_m` of the truth, a new place each time."""
+    """The nodes' own fixes are anywhere within `radius_m` of where they would be, a new place each time."""
 
     kind: Literal["RandomPos"]
     radius_m: float = Field(300.0, gt=0)

@@ -8,7 +8,7 @@ state of two receivers, so that the engine can be split by receiver; the transmi
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,7 +28,8 @@ MIN_LATENCY_NS = 1_000
 class Frame:
     """One broadcast as the channel sees it; `sender` is a receiver number, `seq` counts the sender's frames.
 
-    `copy` counts the times that a frame is sent again (by a fault); such a copy has a row, and luck, of its own.
+    `copy` counts the times that a frame is sent again (by a fault); such a copy has a row, and luck, of its own:
+    `draw` tells its draws from the original's, and depends only on the fault and on what it sends again.
     """
 
     sender: int
@@ -36,6 +37,7 @@ class Frame:
     sent_ns: int
     size_bytes: int
     copy: int = 0
+    draw: int = 0
 
 
 @dataclass(slots=True)
@@ -142,39 +144,76 @@ class PayloadLimit:
             pairs.decide(True, Outcome.oversize)
 
 
+@dataclass
+class _Backlog:
+    """What a sender has still to send: when each waiting frame starts, and when the last one ends."""
+
+    starts_ns: deque[int] = field(default_factory=deque)
+    busy_until_ns: int = 0
+
+    def room(self, time_ns: int, limit: int) -> bool:
+        """Whether another frame finds a place at `time_ns`."""
+        while self.starts_ns and self.starts_ns[0] <= time_ns:
+            self.starts_ns.popleft()
+        return len(self.starts_ns) < limit
+
+    def take(self, ready_ns: int, airtime_ns: int) -> int:
+        """Put one more frame at the end; returns when it will have been sent."""
+        start_ns = max(ready_ns, self.busy_until_ns)
+        self.starts_ns.append(start_ns)
+        self.busy_until_ns = start_ns + airtime_ns
+        return self.busy_until_ns
+
+
 class TransmitQueue:
     """The sender's own queue: random access delay, airtime at `radio.bitrate_mbps`, at most `queue_frames` waiting.
 
-    Sets the arrival to the end of the transmission. `throttled_mbps` is the bitrate of senders that a fault slows.
+    Sets the arrival to the end of the transmission. Faults `throttle` some senders.
     """
 
     def __init__(self, seed: int, radio: Radio) -> None:
         self._draws = Draws(seed, "access")
         self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._bitrate_mbps = radio.bitrate_mbps
-        self.throttled_mbps: dict[int, float] = {}
         self._max_payload_bytes = radio.max_payload_bytes
         self._limit = radio.queue_frames
-        self._starts_ns: dict[int, deque[int]] = {}
-        self._busy_until_ns: dict[int, int] = {}
+        self._backlogs: dict[int, _Backlog] = {}
+        self._throttled_mbps: dict[int, float] = {}
+        self._unthrottled: dict[int, _Backlog] = {}
+
+    def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
+        """From now on these senders send at these bitrates, and no others are slowed.
+
+        Who no longer is goes on as if it had never been: what waits is sent as it was decided, but nothing new
+        waits behind it, so that the fault ends with its end however slow it was.
+        """
+        for sender in self._throttled_mbps.keys() - bitrate_mbps.keys():
+            self._backlogs[sender] = self._unthrottled.pop(sender)
+        for sender in bitrate_mbps.keys() - self._throttled_mbps.keys():
+            backlog = self._backlogs.get(sender, _Backlog())
+            self._unthrottled[sender] = _Backlog(backlog.starts_ns.copy(), backlog.busy_until_ns)
+        self._throttled_mbps = dict(bitrate_mbps)
 
     def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `queue_full`, or when the frame has left the sender."""
         if frame.size_bytes > self._max_payload_bytes:  # never got as far as the queue
             return
-        waiting = self._starts_ns.setdefault(frame.sender, deque())
-        while waiting and waiting[0] <= frame.sent_ns:
-            waiting.popleft()
-        if len(waiting) >= self._limit:
+        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
+        bitrate_mbps = self._bitrate_mbps
+        if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
+            self._put(frame, unthrottled, jitter_ns, bitrate_mbps)
+            bitrate_mbps = min(bitrate_mbps, self._throttled_mbps[frame.sender])
+        backlog = self._backlogs.setdefault(frame.sender, _Backlog())
+        end_ns = self._put(frame, backlog, jitter_ns, bitrate_mbps)
+        if end_ns is None:
             pairs.decide(True, Outcome.queue_full)
-            return
-        jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.copy)[0])
-        start_ns = max(frame.sent_ns + jitter_ns, self._busy_until_ns.get(frame.sender, 0))
-        bitrate_mbps = min(self._bitrate_mbps, self.throttled_mbps.get(frame.sender, self._bitrate_mbps))
-        end_ns = start_ns + round(frame.size_bytes * 8_000 / bitrate_mbps)
-        waiting.append(start_ns)
-        self._busy_until_ns[frame.sender] = end_ns
-        pairs.arrival_ns[:] = end_ns
+        else:
+            pairs.arrival_ns[:] = end_ns
+
+    def _put(self, frame: Frame, backlog: _Backlog, jitter_ns: int, bitrate_mbps: float) -> int | None:
+        if not backlog.room(frame.sent_ns, self._limit):
+            return None
+        return backlog.take(frame.sent_ns + jitter_ns, round(frame.size_bytes * 8_000 / bitrate_mbps))
 
 
 class PeerCap:
@@ -198,7 +237,7 @@ class Loss:
     def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Decide `lost`."""
         if self._loss > 0:
-            draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.copy)
+            draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.draw)
             pairs.decide(draws < self._loss, Outcome.lost)
 
 
@@ -213,7 +252,7 @@ class Latency:
 
     def __call__(self, frame: Frame, pairs: Pairs) -> None:
         """Set when each pair arrives."""
-        draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.copy)
+        draws = self._draws.uniform(frame.sender, frame.seq, len(pairs.outcome), frame.draw)
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = pairs.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:

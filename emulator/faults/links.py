@@ -39,6 +39,7 @@ class LinkFaults:
         self._count = count
         self._random: dict[int, _Random] = {}
         self._cut: Sequence[tuple[int, Mask]] = ()
+        self._short: Sequence[tuple[int, Mask, float]] = ()
         self._losing: Sequence[_Random] = ()
         self._delaying: Sequence[_Random] = ()
         self._copying: Sequence[_Random] = ()
@@ -47,13 +48,14 @@ class LinkFaults:
     def update(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """From now on, at `time_ns`, these act and no others."""
         self._cut = [(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None]
+        self._short = [(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)]
         random = {p.number: self._random.get(p.number) or self._begin(p) for p in active if p.links is not None}
         self._random = random
         self._losing = _of(random, Loss, BurstLoss)
         self._delaying = _of(random, Delay, Jitter, Reorder)
         self._copying = _of(random, Duplicate)
         self._corrupting = _of(random, Corrupt)
-        self._queue.throttled_mbps = self._throttled(active)
+        self._queue.throttle(self._throttled(active))
 
     def _begin(self, planned: PlannedFault) -> _Random:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, BurstLoss) else (0, 0), dtype=bool)
@@ -64,10 +66,6 @@ class LinkFaults:
         match planned.fault.kind:
             case "partition" | "block":
                 return planned.links
-            case "range":
-                assert isinstance(planned.fault, Range)
-                beyond = self._topology.distance_m > planned.fault.range_m
-                return np.asarray(beyond & (planned.nodes[:, None] | planned.nodes[None, :]))
             case "swizzle":
                 off = np.zeros(self._count, dtype=bool)
                 for node, off_ns, back_ns in swizzle_times_ns(planned, self._seed):
@@ -90,13 +88,16 @@ class LinkFaults:
         """A stage: decide `fault` where a link is cut, or loses this frame."""
         for number, cut in self._cut:
             pairs.decide(cut[frame.sender], Outcome.fault, cause=number)
+        for number, nodes, range_m in self._short:
+            beyond = self._topology.distance_m[frame.sender] > range_m
+            pairs.decide(beyond & (nodes | nodes[frame.sender]), Outcome.fault, cause=number)
         for one in self._losing:
             number, lost = one.planned.number, self._lost(one, frame)
             pairs.decide(lost & _links(one)[frame.sender], Outcome.fault, cause=number)
 
     def _lost(self, one: _Random, frame: Frame) -> Mask:
         fault = one.planned.fault
-        draws = one.draws.uniform(frame.sender, frame.seq, 2 * self._count, frame.copy).reshape(-1, 2).T
+        draws = one.draws.uniform(frame.sender, frame.seq, 2 * self._count, frame.draw).reshape(-1, 2).T
         if isinstance(fault, Loss):
             return np.asarray(draws[0] < fault.probability)
         assert isinstance(fault, BurstLoss), fault
@@ -107,13 +108,13 @@ class LinkFaults:
     def change(self, frame: Frame, pairs: Pairs) -> None:
         """A stage, after the latency: what does not lose a pair; later arrivals, copies, other bytes."""
         for one in self._delaying:
-            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.copy)
+            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
             later = _links(one)[frame.sender] & (pairs.outcome == Outcome.pending)
             pairs.arrival_ns = pairs.arrival_ns + np.where(later, _later_ns(one.planned, draws), 0)
         for one in self._copying:
             fault = one.planned.fault
             assert isinstance(fault, Duplicate)
-            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.copy)
+            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
             again = _links(one)[frame.sender] & (draws < fault.probability)
             pairs.copies += [
                 (again, round((number + 1) * fault.delay_ms * NS_PER_MS), one.planned.number)
@@ -125,13 +126,13 @@ class LinkFaults:
     def _corrupt(self, one: _Random, frame: Frame, pairs: Pairs) -> None:
         fault = one.planned.fault
         assert isinstance(fault, Corrupt)
-        draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.copy)
+        draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
         hit = _links(one)[frame.sender] & (pairs.outcome == Outcome.pending) & (draws < fault.probability)
         for receiver in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
             # What is left of the draw beneath the probability says which bytes: each receiver gets its own.
             rng = np.random.default_rng(int(draws[receiver] * 2**53))
-            place = rng.integers(frame.size_bytes, size=fault.flips)
-            change = rng.integers(1, 256, size=fault.flips)
+            place = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
+            change = rng.integers(1, 256, size=len(place))
             pairs.flips.setdefault(receiver, []).extend(zip(place.tolist(), change.tolist(), strict=True))
             pairs.cause[receiver] = one.planned.number
 

@@ -17,6 +17,9 @@ from vnet.errors import ScenarioError
 from vnet.faults import Fault, Infrastructure, LinkFault, NodeFault, Partition, Swizzle
 from vnet.scenario import NS_PER_S, Scenario
 
+NEVER_NS = 0.1
+"""Less than an instant: a fault that lasts so long does not act."""
+
 
 @dataclass(frozen=True)
 class PlannedFault:
@@ -61,7 +64,7 @@ class FaultPlan:
         if start_ns >= self._healed_ns:
             limit_s = self._healed_ns / NS_PER_S
             raise ScenarioError(f"{fault.kind}: at_s = {fault.at_s:g}: must be less than {limit_s:g}")
-        end_ns = min(start_ns + max(1, round(fault.duration_s * NS_PER_S)), self._healed_ns)
+        end_ns = min(start_ns + round(fault.duration_s * NS_PER_S), self._healed_ns)
         rng = stream(self._seed, number, "select")
         try:
             nodes, links = _places(fault, self._nodes, rng)
@@ -112,7 +115,7 @@ class FaultPlan:
 
 
 def _as_written(planned: PlannedFault) -> Fault:
-    lasting_ns = max(planned.end_ns - planned.start_ns, 1)
+    lasting_ns = planned.end_ns - planned.start_ns or NEVER_NS  # healed before it began: it keeps its number
     update = {"at_s": planned.start_ns / NS_PER_S, "duration_s": lasting_ns / NS_PER_S}
     if isinstance(planned.fault, Swizzle):
         update["over_s"] = planned.fault.over_s or planned.fault.duration_s

@@ -89,9 +89,10 @@ def severed_by(fault: Partition, nodes: Nodes, rng: np.random.Generator) -> Mask
 
 
 def _outside_majority(order: NDArray[np.int64]) -> Mask:
-    """Links between nodes that are not of each other's majority: the nearest on a ring in this `order`."""
+    """Links to nodes from those outside their majority: themselves and the nearest on a ring in this `order`."""
     count = len(order)
     place = np.empty(count, dtype=int)
     place[order] = np.arange(count)
-    apart = np.abs(place[:, None] - place[None, :])
-    return np.asarray(np.minimum(apart, count - apart) > count // 4)
+    ahead = (place[:, None] - place[None, :]) % count
+    others = count // 2  # of a majority, without the node itself: half of them on either side, or one more ahead
+    return np.asarray((ahead > (others + 1) // 2) & (count - ahead > others // 2))

@@ -19,11 +19,15 @@ REMEMBERED_FRAMES = 4096
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """A frame on its way to the radio: the `copy`-th of frame `seq`; `alias` is another name that it goes under."""
+    """A frame on its way to the radio: the `copy`-th of frame `seq`; `alias` is another name that it goes under.
+
+    `draw` tells its draws from those of the other copies.
+    """
 
     payload: bytes
     seq: int
     copy: int = 0
+    draw: int = 0
     cause: int = NO_CAUSE
     alias: str | None = None
 
@@ -56,24 +60,30 @@ class SenderFaults:
         original = Outgoing(payload, seq)
         for planned in acting:
             if isinstance(planned.fault, StaleMessages) and (old := self._from(node, time_ns, planned.fault.age_s)):
-                original = Outgoing(old[2], seq, 0, planned.number)
+                original = Outgoing(old[2], seq, cause=planned.number)
         yield original
         for planned in acting:
             yield from self._again(planned, time_ns, node, original)
 
     def _again(self, planned: PlannedFault, time_ns: int, node: int, original: Outgoing) -> Iterator[Outgoing]:
-        payload, seq, number = original.payload, original.seq, planned.number
+        payload, seq = original.payload, original.seq
         match planned.fault:
             case DoS(factor=factor):
-                for _ in range(factor - 1):
-                    yield Outgoing(payload, seq, self._next_copy(node, seq), number)
+                for place in range(1, factor):
+                    yield self._copy(planned, node, payload, seq, place)
             case Sybil(ghosts=ghosts):
                 for ghost in range(1, ghosts + 1):
-                    alias = f"{self._node_ids[node]}~{ghost}"
-                    yield Outgoing(payload, seq, self._next_copy(node, seq), number, alias)
+                    yield self._copy(planned, node, payload, seq, ghost, f"{self._node_ids[node]}~{ghost}")
             case DataReplay(age_s=age_s):
                 if old := self._from(node, time_ns, age_s):
-                    yield Outgoing(old[2], old[1], self._next_copy(node, old[1]), number)
+                    yield self._copy(planned, node, old[2], old[1], seq - old[1])
+
+    def _copy(
+        self, planned: PlannedFault, node: int, payload: bytes, seq: int, place: int, alias: str | None = None
+    ) -> Outgoing:
+        """Another copy of frame `seq`; of those that a fault makes of it, each has another `place`."""
+        draw = (planned.number + 1 << 32) + place
+        return Outgoing(payload, seq, self._next_copy(node, seq), draw, planned.number, alias)
 
     def _from(self, node: int, time_ns: int, age_s: float) -> tuple[int, int, bytes] | None:
         """The latest frame of `node` that is at least `age_s` old."""

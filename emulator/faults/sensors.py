@@ -86,13 +86,12 @@ class BentGnss:
 
 
 def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockBend:
-    """How the clock of a vehicle goes at `time_ns`: skews and drifts add up."""
-    offset_ns, rate = 0.0, 0.0
-    for planned in faults:
-        if planned.acts_at(time_ns) and planned.nodes[number]:
-            if isinstance(planned.fault, Skew):
-                offset_ns += planned.fault.offset_ms * 1e6
-            elif isinstance(planned.fault, Drift):
-                offset_ns += planned.fault.rate_ppm / 1e6 * (time_ns - planned.start_ns)
-                rate += planned.fault.rate_ppm / 1e6
-    return ClockBend(node, time_ns, round(offset_ns), rate)
+    """How the clock of a vehicle goes at `time_ns`: skews add up; drifts multiply, so that it never stands."""
+    acting = [planned for planned in faults if planned.acts_at(time_ns) and planned.nodes[number]]
+    offset_ns = sum(p.fault.offset_ms * 1e6 for p in acting if isinstance(p.fault, Skew))
+    drifts = [(p.start_ns, p.fault.rate_ppm / 1e6) for p in acting if isinstance(p.fault, Drift)]
+    pace, since_ns = 1.0, 0
+    for start_ns, rate in [*sorted(drifts), (time_ns, 0.0)]:
+        offset_ns += (pace - 1) * (start_ns - since_ns)
+        pace, since_ns = pace * (1 + rate), start_ns
+    return ClockBend(node, time_ns, round(offset_ns), pace - 1)

@@ -75,8 +75,11 @@ class Emulation:
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
         self._down_by_fault: set[str] = set()
+        self._starting: set[str] = set()
+        self._ended: set[str] = set()
         self._acting: set[str] = set()
-        self._next_fault_ns = self.faults.next_change_ns(-1)
+        self._acted_ns = -1
+        self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
         component = components(start.position_m, scenario.radio.range_m, world.links)
         self.metrics = Metrics(world.node_ids, component, world.period_ns)
@@ -121,6 +124,7 @@ class Emulation:
             scenario.run.orphan_timeout_s,
             scenario.run.spin_limit,
             wire.boot_id(),
+            node not in self._ended,
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -130,7 +134,7 @@ class Emulation:
         for part in traffic:
             for frame in part.frames:
                 frames.setdefault(frame.node, []).append(frame.payload)
-            self._reports.extend(part.reports)
+            self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
         for node in sorted(frames, key=self.number.__getitem__):
             if self.up[node]:
@@ -145,12 +149,14 @@ class Emulation:
         if ending.error:
             details = {"error": ending.error, "where": ending.details}
         self.folder.event(time_ns, ending.kind, ending.node, **details)
+        self._ended.add(ending.node)
         self._take_down(ending.node)
 
     def died(self, time_ns: int, node: str, **details: Any) -> None:
         """A node's process ended without being told to."""
         if self.up[node]:
             self.folder.event(time_ns, "died", node, **details)
+            self._ended.add(node)
             self._take_down(node)
 
     def _take_down(self, node: str) -> None:
@@ -169,6 +175,7 @@ class Emulation:
         The caller has taken all that arrived before `time_ns`. Without `starts_at_once` nodes that start anew are
         up only when it says that they `come_back`.
         """
+        self._acted_ns = time_ns
         self._next_fault_ns = self.faults.next_change_ns(time_ns)
         active = self.faults.active(time_ns)
         self.engine.set_faults(active, time_ns)
@@ -176,13 +183,14 @@ class Emulation:
         down = self._nodes_under(active, "kill", "restart")
         paused = self._nodes_under(active, "pause")
         killed = self._nodes_under(active, "kill")
-        up = [node for node in self.world.node_ids if self.up[node]]
-        stop = {node: node in killed for node in up if node in down}
+        living = [node for node in self.world.node_ids if self.up[node] or node in self._starting]
+        stop = {node: node in killed for node in living if node in down}
         start = [n for n in self.world.node_ids if n in self._down_by_fault and n not in down]
         for node in stop:
             self._take_down(node)
         for node in start:
             self.incarnation[node] += 1
+        self._starting = (self._starting - stop.keys()) | set(start)
         if starts_at_once:
             self.come_back(start, time_ns)
         self._down_by_fault = (self._down_by_fault | stop.keys()) - set(start)
@@ -191,8 +199,9 @@ class Emulation:
         return ProcessActions(stop, start, paused, clocks, restarts)
 
     def come_back(self, nodes: Sequence[str], time_ns: int) -> None:
-        """Nodes that were down are up again."""
-        for node in nodes:
+        """Nodes that were down are up again, but for those whose programs have ended by themselves."""
+        self._starting.difference_update(nodes)
+        for node in [node for node in nodes if node not in self._ended]:
             self.up[node] = True
             self.engine.set_up(self.number[node], True)
             self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
@@ -218,17 +227,17 @@ class Emulation:
         """
         at_s = max(fault.at_s, (now_ns + 1) / NS_PER_S)
         planned = self.faults.add(fault.model_copy(update={"at_s": at_s}))
-        self._change_plan(now_ns)
+        self._change_plan()
         return planned
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
         """End a fault right after `now_ns`, and write that down. Raises ScenarioError if none is called so."""
         planned = self.faults.heal(label, now_ns + 1)
-        self._change_plan(now_ns)
+        self._change_plan()
         return planned
 
-    def _change_plan(self, now_ns: int) -> None:
-        self._next_fault_ns = self.faults.next_change_ns(now_ns)
+    def _change_plan(self) -> None:
+        self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
         self.scenario = self.scenario.model_copy(update={"fault": self.faults.as_written()})
         text = dump_scenario(self.scenario)
         self.folder.put("scenario.toml", lambda path: write_text(path, text))

@@ -370,9 +370,10 @@ class LiveRun:
 
     async def _suffer(self, actions: ProcessActions) -> None:
         """Do to the processes what the faults of an instant do."""
-        for node, killed in actions.stop.items():
-            await self._end_process(node, killed)
-        started = [node for node in actions.start if self._members.lead_of(node) == node]
+        ended = {self._members.lead_of(node): killed for node, killed in actions.stop.items()}
+        for lead, killed in ended.items():
+            await self._end_process(lead, killed)
+        started = list(dict.fromkeys(map(self._members.lead_of, actions.start)))
         for lead in started:
             self._begin_process(lead)
         if isinstance(self._pacing, Lockstep) and started:
@@ -401,17 +402,18 @@ class LiveRun:
                 self._returning.difference_update(self._members.nodes_with(lead))
                 self._link.send(lead, realtime.returned(self._now_ns(), lead))
 
-    async def _end_process(self, node: str, killed: bool) -> None:
-        """End the process of a node; those started by hand are told to go, and whoever started them may again."""
-        if self._members.lead_of(node) != node:
-            return
-        self._returning.update(self._members.nodes_with(node))
+    async def _end_process(self, lead: str, killed: bool) -> None:
+        """End a process; those started by hand are told to go, and whoever started them may again."""
+        self._returning.update(self._members.nodes_with(lead))
+        self._expected.discard(lead)
         if killed and self._options.launch:
-            self._launcher.kill(node)
+            self._paused.discard(lead)
+            self._launcher.kill(lead)
             return
-        self._link.send(node, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
+        self._stand_still(self._paused - {lead})  # or it could not go
+        self._link.send(lead, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
         if self._options.launch:
-            await asyncio.to_thread(self._launcher.see_off, node, FAREWELL_S)
+            await asyncio.to_thread(self._launcher.see_off, lead, FAREWELL_S)
 
     def _begin_process(self, lead: str) -> None:
         nodes = self._members.nodes_with(lead)
@@ -424,9 +426,7 @@ class LiveRun:
         timeout_s = self._emulation.scenario.run.join_timeout_s
         deadline = time.monotonic() + timeout_s
         nodes = [node for lead in leads for node in self._members.nodes_with(lead)]
-        while late := [
-            n for n in nodes if n in self._members.missing and self._members.lead_of(n) not in self._dead
-        ]:
+        while late := self._late(nodes):
             if not await self._change(deadline - time.monotonic()):
                 error = f"has not come back within {timeout_s:g} s"
                 self._emulation.folder.event(self._time_ns(), "stalled", late[0], error=error)
@@ -455,7 +455,10 @@ class LiveRun:
             await asyncio.sleep(fault.down_s)
             assert self._options.router is not None
             await asyncio.to_thread(self._options.router.start, self._launcher)
-        await self._all_answer(sorted({self._members.lead_of(node) for node in living}), patience_s)
+        leads = {self._members.lead_of(node) for node in living}
+        if self._realtime:
+            leads -= self._paused  # they cannot answer, and have time until they go on
+        await self._all_answer(sorted(leads), patience_s)
         self._restarting = False
 
     async def _all_answer(self, leads: Sequence[str], patience_s: float) -> None:

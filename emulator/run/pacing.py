@@ -37,7 +37,7 @@ class _Process:
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.bent: set[str] = set()
-        self.clocks: dict[str, wire.ClockBend] = {}
+        self.clocks: list[wire.ClockBend] = []
 
     @property
     def running(self) -> list[str]:
@@ -51,7 +51,7 @@ class _Process:
         return due
 
     def take_clocks(self) -> list[wire.ClockBend]:
-        changed, self.clocks = list(self.clocks.values()), {}
+        changed, self.clocks = self.clocks, []
         return changed
 
 
@@ -80,7 +80,9 @@ class Lockstep:
         """The first grants, to all, at time 0."""
         if self._emulation.next_fault_ns() == 0:
             self._act(0)
-        return self._grant([lead for lead, p in self._processes.items() if p.running])
+        if first := [lead for lead, process in self._processes.items() if process.running]:
+            return self._grant(first)
+        return self._go_on()  # all are dead or stand still
 
     def take_actions(self) -> list[ProcessActions]:
         """What processes suffer at this instant, before the grants are given."""
@@ -116,6 +118,10 @@ class Lockstep:
         emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
         for process in self._processes.values():
             process.traffic = None
+        return self._go_on()
+
+    def _go_on(self) -> dict[str, wire.Grant]:
+        emulation = self._emulation
         while True:
             wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
@@ -151,7 +157,7 @@ class Lockstep:
 
     def _bend(self, process: _Process, clock: wire.ClockBend) -> None:
         if clock.bends or clock.node in process.bent:
-            process.clocks[clock.node] = clock
+            process.clocks.append(clock)
             process.bent.add(clock.node)
 
     def _stop(self, node: str) -> None:
@@ -173,10 +179,10 @@ class Lockstep:
 
     def _wake_ns(self, process: _Process) -> int | None:
         """When a process must run next: its next timer, or what its nodes' tasks wait for."""
-        if process.nodes[0] in self._woken:
-            return self.now_ns
         if not process.running:
             return None
+        if process.nodes[0] in self._woken:
+            return self.now_ns
         emulation = self._emulation
         candidates = [process.next_timer_ns]
         awaited = set(process.running)
@@ -241,7 +247,8 @@ class RealTime:
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._clocks: dict[str, dict[str, wire.ClockBend]] = {lead: {} for lead in self._nodes}
+        self._clocks: dict[str, list[wire.ClockBend]] = {lead: [] for lead in self._nodes}
+        self._bent: set[str] = set()
         self._next_period = 0
         self._origin_ns = 0
         self.gaps = 0
@@ -324,8 +331,9 @@ class RealTime:
         self._was_paused |= self._paused - paused
         self._paused = paused
         for clock in actions.clocks:
-            if clock.bends or clock.node in self._clocks[self._lead[clock.node]]:
-                self._clocks[self._lead[clock.node]][clock.node] = clock
+            if clock.bends or clock.node in self._bent:
+                self._clocks[self._lead[clock.node]].append(clock)
+                self._bent.add(clock.node)
 
     def returned(self, now_ns: int, lead: str) -> wire.Batch:
         """A process that was started anew is ready; returns the batch that starts it."""
@@ -357,7 +365,7 @@ class RealTime:
         self._unacknowledged[lead][seq] = deliveries
         node_ids = self._emulation.world.node_ids
         packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
-        clocks, self._clocks[lead] = list(self._clocks[lead].values()), {}
+        clocks, self._clocks[lead] = self._clocks[lead], []
         held = lead in self._was_paused
         self._was_paused.discard(lead)
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks)

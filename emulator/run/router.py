@@ -6,6 +6,7 @@ It is Zenoh's own router, run from Python with the configuration that `vnet acce
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import socket
 import sys
@@ -21,6 +22,7 @@ from vnet.link.access import Access
 
 ROUTER = "router"
 START_TIMEOUT_S = 15.0
+ORPHAN_POLL_S = 0.5
 
 
 class SeparateRouter:
@@ -46,12 +48,14 @@ class SeparateRouter:
 
 
 def main(config: str) -> None:
-    """Be the router until SIGTERM."""
+    """Be the router until SIGTERM, or until the emulator is gone."""
+    emulator = os.getppid()
     over = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
     with zenoh.open(zenoh.Config.from_file(config)):
-        over.wait()
+        while os.getppid() == emulator and not over.wait(ORPHAN_POLL_S):
+            pass
 
 
 if __name__ == "__main__":

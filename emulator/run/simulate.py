@@ -60,7 +60,7 @@ class _Simulation:
         asyncio.set_event_loop(self.loop)
         try:
             self._host.start(self.loop, self._programs)
-            self._take(self._lockstep.start())
+            self.loop.start_at(self._take(self._lockstep.start()))
             while True:
                 try:
                     self.loop.run_forever()
@@ -89,8 +89,8 @@ class _Simulation:
     def _suffer(self, actions: Sequence[ProcessActions]) -> None:
         """Do to the programs what faults do to processes."""
         for action in actions:
-            for node in action.stop:
-                self._host.stop(node)
+            for node, killed in action.stop.items():
+                self._host.stop(node, killed)
             for node in action.start:
                 self._host.restart(self._emulation.welcome(node, _NONCE))
             self._host.pause(action.paused)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import contextvars
 import importlib
+import inspect
 import os
 import sys
 import traceback
@@ -28,7 +29,8 @@ Program = Callable[[Node], Awaitable[None]]
 Programs = Mapping[str, Program]
 """What each node runs, by id."""
 
-_current_node: contextvars.ContextVar[str | None] = contextvars.ContextVar("vnet_node", default=None)
+_current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
+"""On whose behalf code runs: a node, in one of its incarnations."""
 
 
 def load_program(entry: str) -> Program:
@@ -79,11 +81,13 @@ class Host:
         self._frames: list[wire.Frame] = []
         self._reports: list[Report] = []
         self._endings: list[wire.Ending] = []
-        self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], str | None] = weakref.WeakKeyDictionary()
+        self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
-        self._active = dict.fromkeys(self.nodes, True)
+        self._active = {welcome.node: welcome.runs for welcome in welcomes}
         self._clocks: dict[str, wire.ClockBend] = {}
+        self._past_clocks: dict[str, list[wire.ClockBend]] = {}
         self._paused: set[str] = set()
+        self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -124,20 +128,32 @@ class Host:
         self._programs = programs
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
-            self._start(node)
+            if self._active[node.id]:
+                self._start(node)
 
     def _start(self, node: Node) -> None:
         context = contextvars.copy_context()
-        context.run(_current_node.set, node.id)
+        context.run(_current_node.set, node)
         program = self._run(node, self._programs[node.id])
         self._loop.create_task(program, name=f"{node.id} main", context=context)
 
-    def stop(self, node: str) -> None:
-        """A node's process is gone: what is left of its program is cancelled, unheard (simulated)."""
-        self.nodes[node].sever()
+    def stop(self, node: str, killed: bool) -> None:
+        """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
+        gone = self.nodes[node]
+        gone.sever()
         self._active[node] = False
-        for task in self._tasks_of(node):
-            task.cancel()
+        if killed:
+            self._killed[gone] = self._tasks_of(gone)
+            for task in self._killed[gone]:
+                task._log_destroy_pending = False  # type: ignore[attr-defined]
+                program = task.get_coro()
+                assert inspect.iscoroutine(program)
+                if inspect.getcoroutinestate(program) == inspect.CORO_CREATED:
+                    program.close()
+            self._hold()
+        else:
+            for task in self._tasks_of(gone):
+                task.cancel()
 
     def restart(self, welcome: wire.Welcome) -> None:
         """Run a node's program anew, as another incarnation (simulated)."""
@@ -147,13 +163,21 @@ class Host:
 
     def pause(self, nodes: Iterable[str]) -> None:
         """From now on these nodes stand still, and no others: their callbacks wait (simulated)."""
-        assert isinstance(self._loop, VirtualTimeLoop)
         self._paused = set(nodes)
-        self._loop.hold(lambda handle: _owner(handle) in self._paused)
+        self._hold()
+
+    def _hold(self) -> None:
+        assert isinstance(self._loop, VirtualTimeLoop)
+        self._loop.hold(self._stands_still)
+
+    def _stands_still(self, handle: asyncio.Handle) -> bool:
+        owner = _owner(handle)
+        return owner is not None and (owner.id in self._paused or owner in self._killed)
 
     def bend(self, clocks: Iterable[wire.ClockBend], loop: BendableLoop) -> None:
         """Take new clocks of nodes."""
         for clock in clocks:
+            self._past_clocks.setdefault(clock.node, []).append(clock)
             self._clocks.pop(clock.node, None)
             if clock.bends:
                 self._clocks[clock.node] = clock
@@ -161,14 +185,21 @@ class Host:
 
     def _bend_of_task(self) -> wire.ClockBend | None:
         node = _current_node.get()
-        return None if node is None else self._clocks.get(node)
+        return None if node is None else self._clocks.get(node.id)
+
+    def _shown_ns(self, node: str, time_ns: int) -> int:
+        """What the clock of `node` showed at `time_ns`, as it went then."""
+        for bend in reversed(self._past_clocks.get(node, ())):
+            if bend.since_ns <= time_ns:
+                return max(bend.shown_ns(time_ns), 0)
+        return time_ns
 
     def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
         """Put packets, then fixes, into the mailboxes."""
         for packet in packets:
             received = packet.packet()
-            if (bend := self._clocks.get(packet.node)) is not None:
-                received = replace(received, received_ns=bend.shown_ns(received.received_ns))
+            if packet.node in self._past_clocks:
+                received = replace(received, received_ns=self._shown_ns(packet.node, received.received_ns))
             self.nodes[packet.node].radio.inbox.deliver((received,))
         for fix in fixes:
             self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
@@ -198,13 +229,13 @@ class Host:
         self._active[node] = False
         self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
         running = asyncio.current_task(self._loop)
-        for task in self._tasks_of(node):
+        for task in self._tasks_of(self.nodes[node]):
             if task is not running:
                 task.cancel()
         self._on_traffic()
 
-    def _tasks_of(self, node: str) -> list[asyncio.Task[Any]]:
-        return [task for task, owner in list(self._tasks.items()) if owner == node and not task.done()]
+    def _tasks_of(self, node: Node) -> list[asyncio.Task[Any]]:
+        return [task for task, owner in list(self._tasks.items()) if owner is node and not task.done()]
 
     def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
         """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
@@ -213,24 +244,30 @@ class Host:
         """
         ready = loop._ready
         owners = dict.fromkeys(_owner(handle) for handle in ready)
-        spinning = [owner for owner in owners if owner is not None] or list(self.nodes)
-        if not any(self._active[node] for node in spinning):
+        spinning = [owner for owner in owners if owner is not None] or list(self.nodes.values())
+        if not any(self._runs(node) for node in spinning):
             kept = [handle for handle in ready if _owner(handle) not in spinning]
             ready.clear()
             ready.extend(kept)
         for node in spinning:
-            self.end(node, "spun", str(spin), self.stacks(node))
+            if self._runs(node):
+                self.end(node.id, "spun", str(spin), self.stacks(node.id))
+
+    def _runs(self, node: Node) -> bool:
+        """Whether its program goes on, and is not what is left of an earlier incarnation."""
+        return self.nodes[node.id] is node and self._active[node.id]
 
     def stacks(self, node: str) -> str:
         """Where the tasks of a node stand, as text."""
         lines = []
-        for task in self._tasks_of(node):
+        for task in self._tasks_of(self.nodes[node]):
             lines.append(f"task {task.get_name()}:")
             lines += [f"  {place}" for place in _standing(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
-        tasks = [task for task, owner in self._tasks.items() if owner is not None and not task.done()]
+        live = [(task, owner) for task, owner in self._tasks.items() if not task.done()]
+        tasks = [task for task, owner in live if owner is not None and owner not in self._killed]
         for task in tasks:
             task.cancel()
         return tasks
@@ -287,7 +324,7 @@ def _no_bend() -> wire.ClockBend | None:
     return None
 
 
-def _owner(handle: asyncio.Handle) -> str | None:
+def _owner(handle: asyncio.Handle) -> Node | None:
     """The node on whose behalf a callback is scheduled."""
     return handle._context.get(_current_node)  # type: ignore[attr-defined, no-any-return]
 

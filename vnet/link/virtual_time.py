@@ -13,17 +13,21 @@ virtual loop spins for ever (cpython#116342).
 from __future__ import annotations
 
 import asyncio
+import heapq
 import selectors
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextvars import Context
+from itertools import count
 from typing import Any, NoReturn
 
 from vnet.errors import VirtualTimeError
 from vnet.link.wire import ClockBend
 
 NS_PER_S = 1_000_000_000
+LATEST_S = 1e9
+"""Timers after this, more than thirty years, are for never."""
 
 Exchange = Callable[[int | None], int]
 """Yield: takes the next timer (ns, or None), blocks for the grant, returns the granted time (ns)."""
@@ -66,10 +70,29 @@ class BendableLoop(asyncio.SelectorEventLoop):
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """Call at `when` on the clock of the task that asks."""
+        return super().call_at(self._own_when(when), callback, *args, context=context)
+
+    def _own_when(self, when: float) -> float:
+        """When, on the loop's own clock, the clock of the task that asks shows `when`."""
         bend = self.bend_of()
-        if bend is not None:
-            when = self.own_time() + (when - self.time()) / (1 + bend.rate)
-        return super().call_at(when, callback, *args, context=context)
+        return when if bend is None else self.own_time() + (when - self.time()) / (1 + bend.rate)
+
+
+class _Timer(asyncio.TimerHandle):
+    """A timer with a number: those of one instant fire in the order in which they were set.
+
+    asyncio leaves that to the shape of its heap, and so to how many other nodes share the loop.
+    """
+
+    __slots__ = ("_number",)
+
+    def __init__(self, number: int, *rest: Any) -> None:
+        super().__init__(*rest)
+        self._number = number
+
+    def __lt__(self, other: asyncio.TimerHandle) -> bool:
+        assert isinstance(other, _Timer)
+        return (self._when, self._number) < (other._when, other._number)  # type: ignore[attr-defined]
 
 
 class VirtualTimeLoop(BendableLoop):
@@ -85,8 +108,11 @@ class VirtualTimeLoop(BendableLoop):
         self._now_ns = 0
         self._ending = False
         self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
+        self._timers = count()
+        self._scheduled: list[asyncio.TimerHandle]  # asyncio's heap
         self._ready: deque[asyncio.Handle]  # asyncio's
         super().__init__(_YieldingSelector(self._wait))
+        self._clock_resolution = 0.5 / NS_PER_S  # no timer fires before its nanosecond
 
     @property
     def now_ns(self) -> int:
@@ -98,14 +124,32 @@ class VirtualTimeLoop(BendableLoop):
         self._now_ns = time_ns
 
     def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
-        """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that."""
+        """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
+
+        Timers that became due meanwhile are due when they are let go: after what has come in by then, in order.
+        """
         if not isinstance(self._ready, _HoldingQueue):
             self._ready = _HoldingQueue(self._ready)
-        self._ready.release(held)
+        for timer in self._ready.release(held):
+            heapq.heappush(self._scheduled, timer)
+            timer._scheduled = True  # type: ignore[attr-defined]
 
     def own_time(self) -> float:
         """The granted time in seconds, as asyncio counts."""
         return self._now_ns / NS_PER_S
+
+    def call_at(  # type: ignore[override]
+        self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """Call at `when` on the clock of the task that asks, at the nearest nanosecond."""
+        self._check_closed()  # type: ignore[attr-defined]
+        when = self._own_when(when)
+        if when < LATEST_S:
+            when = round(when * NS_PER_S) / NS_PER_S
+        timer = _Timer(next(self._timers), when, callback, args, self, context)
+        heapq.heappush(self._scheduled, timer)
+        timer._scheduled = True  # type: ignore[attr-defined]
+        return timer
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
@@ -138,10 +182,9 @@ class VirtualTimeLoop(BendableLoop):
 
     def _next_timer_ns(self) -> int | None:
         # asyncio has just dropped cancelled timers from the head of its heap.
-        scheduled: list[asyncio.TimerHandle] = self._scheduled  # type: ignore[attr-defined]
-        if not scheduled:
+        if not self._scheduled or self._scheduled[0].when() > LATEST_S:
             return None
-        return max(round(scheduled[0].when() * NS_PER_S), self._now_ns)
+        return max(round(self._scheduled[0].when() * NS_PER_S), self._now_ns)
 
     # Executors: while a job is pending the loop does not yield (computing costs no virtual time), and results
     # appear in the order in which the jobs were submitted, when all are there: no race decides anything.
@@ -206,13 +249,20 @@ class _HoldingQueue(deque[asyncio.Handle]):
         else:
             super().append(handle)
 
-    def release(self, holds: Callable[[asyncio.Handle], bool]) -> None:
-        """Hold what `holds` says, and let go of what it no longer does, in the order in which it came."""
-        waiting = [*self, *self._held]
+    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[_Timer]:
+        """Hold what `holds` says, and let go of the rest in the order in which it came; returns timers let go."""
+        waiting, held = list(self), self._held
         self.clear()
         self._holds, self._held = holds, []
         for handle in waiting:
             self.append(handle)
+        timers = []
+        for handle in held:
+            if isinstance(handle, _Timer) and not holds(handle):
+                timers.append(handle)
+            else:
+                self.append(handle)
+        return timers
 
 
 class _YieldingSelector(selectors.DefaultSelector):

@@ -142,7 +142,10 @@ class Standing(Message, frozen=True):
 
 
 class Welcome(Message, frozen=True):
-    """A node is taken in: all it needs to run its program. The scenario itself never travels."""
+    """A node is taken in: all it needs to run its program. The scenario itself never travels.
+
+    Without `runs` the program has ended before its process was started anew, and stays so.
+    """
 
     node: str
     nonce: bytes
@@ -157,6 +160,7 @@ class Welcome(Message, frozen=True):
     orphan_timeout_s: float
     spin_limit: Count
     boot_id: str
+    runs: bool = True
 
 
 class ClockBend(msgspec.Struct, frozen=True, array_like=True):
@@ -165,7 +169,7 @@ class ClockBend(msgspec.Struct, frozen=True, array_like=True):
     node: str
     since_ns: TimeNs
     offset_ns: Annotated[int, msgspec.Meta(ge=-(2**53), le=2**53)] = 0
-    rate: Annotated[float, msgspec.Meta(gt=-1, lt=1)] = 0.0
+    rate: Annotated[float, msgspec.Meta(gt=-1, lt=2**20)] = 0.0
 
     @property
     def bends(self) -> bool:
