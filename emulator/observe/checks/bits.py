@@ -12,7 +12,7 @@ from emulator.observe.checks.evidence import Evidence, Mask
 from emulator.observe.checks.faults import CUTTING, LOSING, SENDING
 from emulator.observe.checks.latency import bounds
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from vnet.faults import ClockFault, GnssFault, Infrastructure
+from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault
 from vnet.roads.lanes import Array
 
 IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate", "corrupt")
@@ -20,6 +20,7 @@ DELAYING = ("delay", "jitter", "reorder", "throttle")
 CERTAIN = 1e-6
 """How unlikely what was seen must be without the fault."""
 PHASE_NS = 1_000_000
+STEADY_FRAMES = 5
 
 
 def check_bits(evidence: Evidence) -> Iterator[Finding]:
@@ -118,21 +119,29 @@ def _is_no_noise(error_m: Array, sigma_m: float) -> bool:
 
 
 def _clocks(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:
-    """A clock shows only in when its vehicle sends within the period."""
+    """A clock shows only in when within the period its vehicle sends, if that was always the same before."""
     phase_ns = evidence.sent_ns % evidence.scenario.period_ns
     originals = evidence.copy == 0
     acting = evidence.acting(planned, evidence.sent_ns, -evidence.guard_ns)
     tolerance_ns = max(PHASE_NS, evidence.guard_ns)
     moved = 0
-    for node in np.flatnonzero(planned.nodes).tolist():
+    for node in np.flatnonzero(planned.nodes & ~_disturbed(evidence)).tolist():
         mine = originals & (evidence.sender == node)
         before, during = phase_ns[mine & (evidence.sent_ns < planned.start_ns)], phase_ns[mine & acting]
-        if len(before) and len(during):
-            apart = np.maximum(before.min() - during, during - before.max())
-            moved += bool((apart > tolerance_ns).any())
+        if len(before) >= STEADY_FRAMES and np.ptp(before) <= tolerance_ns:
+            moved += bool((np.abs(during - np.median(before)) > 2 * tolerance_ns).any())
     if moved:
         return _found(name, moved, "vehicles send at other times of the period", "")
     return NotExercised(name, "these vehicles do not send by their own clocks, and nothing else would show them")
+
+
+def _disturbed(evidence: Evidence) -> Mask:
+    """(N,), vehicles that stand still or start anew at some time, and send at other times for that reason."""
+    disturbed = np.zeros(len(evidence.node_ids), dtype=bool)
+    for planned in evidence.plan:
+        if isinstance(planned.fault, ProcessFault):
+            disturbed |= planned.nodes
+    return disturbed
 
 
 def _restarts(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from emulator.observe.checks.channel import admitted_by_cap
 from emulator.observe.checks.evidence import Evidence, Mask
-from emulator.observe.checks.verdicts import Finding, NotExercised, result
+from emulator.observe.checks.verdicts import NO_FAULTS, Finding, NotExercised, result
 from vnet.faults import GnssFault
 from vnet.roads.lanes import Array
 from vnet.scenario import NS_PER_S
@@ -94,7 +94,7 @@ def check_convergence(evidence: Evidence) -> Finding:
     name = "convergence"
     common_m = evidence.vectors("common_error_estimate_m")
     if not evidence.plan:
-        return NotExercised(name, "the scenario has no faults")
+        return NotExercised(name, NO_FAULTS)
     if not np.isfinite(common_m).any():
         return NotExercised(name, "the program reports no common error")
     deviation_m = _deviation(evidence, common_m)

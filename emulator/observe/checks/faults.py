@@ -11,7 +11,7 @@ import numpy as np
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import binomial_band, received_twice
 from emulator.observe.checks.evidence import ARRIVED, NO_FAULT, UNHEARD_OF, Evidence, Mask
-from emulator.observe.checks.verdicts import MOST_ROWS, Finding, NotExercised, result, unknown
+from emulator.observe.checks.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import BurstLoss, Corrupt, Loss, StaleMessages
 from vnet.roads.lanes import Array
 
@@ -36,7 +36,7 @@ def check_causes(evidence: Evidence) -> Finding:
     if not evidence.plan:
         broken = evidence.outcome_is("fault") | (evidence.cause != NO_FAULT)
         if not broken.any():
-            return NotExercised(name, "the scenario has no faults")
+            return NotExercised(name, NO_FAULTS)
     else:
         explained = evidence.cause == NO_FAULT
         for planned in evidence.plan:
@@ -70,7 +70,7 @@ def check_partition_respected(evidence: Evidence) -> Finding:
     name = "partition_respected"
     cuts = of_kinds(evidence, CUTTING)
     if not cuts:
-        return NotExercised(name, "no fault cuts links")
+        return NotExercised(name, "no fault cuts links" if evidence.plan else NO_FAULTS)
     across = np.zeros(len(evidence.trace), dtype=bool)
     for planned in cuts:
         across |= evidence.reached(planned, -evidence.guard_ns)
@@ -87,7 +87,7 @@ def check_down_respected(evidence: Evidence) -> Finding:
     """A node that is down is silent and deaf: no frame, no report, and what arrives is `receiver_down`."""
     name = "down_respected"
     if not evidence.down:
-        return NotExercised(name, "no node was down")
+        return NotExercised(name, "no node was down" if evidence.plan else NO_FAULTS)
     sure = ~evidence.is_unsure(evidence.sent_ns)
     speaking = sure & evidence.is_down(evidence.sender, evidence.sent_ns)
     judged = evidence.arrived & ~evidence.is_unsure(evidence.arrival_ns)
@@ -117,7 +117,7 @@ def check_pause_respected(evidence: Evidence) -> Finding:
     name = "pause_respected"
     pauses = of_kinds(evidence, ["pause"])
     if not pauses:
-        return NotExercised(name, "no node was paused")
+        return NotExercised(name, "no node was paused" if evidence.plan else NO_FAULTS)
     speaking = np.zeros(len(evidence.trace), dtype=bool)
     spans = []
     for planned in pauses:
@@ -153,7 +153,7 @@ def check_outage_respected(evidence: Evidence) -> Finding:
     outages = of_kinds(evidence, ["gnss_outage"])
     without = np.isnan(evidence.vectors("fix_m")[..., 0])
     if not outages and not without.any():
-        return NotExercised(name, "no fault takes the fixes")
+        return NotExercised(name, "no fault takes the fixes" if evidence.plan else NO_FAULTS)
     due = np.zeros_like(without)
     for planned in outages:
         due |= evidence.acting(planned, evidence.period_starts_ns())[:, None] & planned.nodes[None, :]

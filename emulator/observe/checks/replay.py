@@ -52,7 +52,7 @@ def _difference(name: str, first: pa.Table, second: pa.Table, place: int) -> Fin
     differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
     how = ", ".join(differing) if ours and theirs else "one has no such row"
     shown = [
-        {"run": run, "row": place, **{key: row[key] for key in row if key in ABOUT or key in differing}}
+        {"run": run, "row": place, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
         for run, row in (("first", ours), ("again", theirs))
     ]
     text = f"two runs differ, first in row {place} of the {name}: {how}"
@@ -82,3 +82,7 @@ def _first(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
 
 def _row(table: pa.Table, place: int) -> dict[str, Any]:
     return dict(table.slice(place, 1).to_pylist()[0]) if place < len(table) else {}
+
+
+def _shown(value: Any) -> Any:
+    return value if isinstance(value, (str, int)) else str(value)

@@ -8,6 +8,7 @@ from typing import Any
 
 MOST_ROWS = 10
 """Offending rows that a failed check shows."""
+NO_FAULTS = "the scenario has no faults"
 
 
 class Verdict(StrEnum):
