@@ -59,15 +59,16 @@ def _queue(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array, 
     fast_ns, slow_ns = np.rint(bits / fast_mbps), np.rint(bits / slow_mbps)
     first = np.unique(evidence.emission[sent], return_index=True)[1]
     first = np.flatnonzero(sent)[first]
-    batch_key, batch = np.unique(np.column_stack([evidence.sender, evidence.sent_ns]), axis=0, return_inverse=True)
-    batch = batch.ravel()
+    longest_ns = int(evidence.sent_ns.max(initial=0)) + 1
+    batch_key, batch = np.unique(evidence.sender * longest_ns + evidence.sent_ns, return_inverse=True)
+    batch_sender, batch_sent_ns = np.divmod(batch_key, longest_ns)
     air_fast = np.bincount(batch[first], weights=fast_ns[first], minlength=len(batch_key))
     air_slow = np.bincount(batch[first], weights=slow_ns[first], minlength=len(batch_key))
     size = np.bincount(batch[first], minlength=len(batch_key))
     start, end, waits = np.zeros(len(batch_key)), np.zeros(len(batch_key)), np.zeros(len(batch_key), dtype=bool)
-    for sender in np.unique(batch_key[:, 0]):
-        mine = batch_key[:, 0] == sender
-        sent_ns = batch_key[mine, 1].astype(float)
+    for sender in np.unique(batch_sender):
+        mine = batch_sender == sender
+        sent_ns = batch_sent_ns[mine].astype(float)
         earliest_end = _busy_until(sent_ns, air_fast[mine])
         start[mine] = np.maximum(sent_ns, np.concatenate([[0.0], earliest_end[:-1]]))
         end[mine] = _busy_until(sent_ns + radio.access_jitter_ms * NS_PER_MS, air_slow[mine])
