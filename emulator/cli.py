@@ -246,6 +246,34 @@ def analyze(
 
 
 @app.command()
+def campaign(
+    scenario: ScenarioArgument,
+    runs: Annotated[int, typer.Option(min=1, help="How many runs.")] = 200,
+    faults: Annotated[str, typer.Option(help="random, or the kinds to draw from: kill,partition.")] = "random",
+    program: ProgramOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the campaign's files.")] = None,
+    overrides: SetOption = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at once; as many as there are cores.")] = None,
+    shrink_steps: Annotated[int, typer.Option(min=0, max=50, help="Runs to shrink a failure with.")] = 50,
+    time_limit: Annotated[float, typer.Option(min=1.0, help="Wall-clock seconds a run may take.")] = 300.0,
+) -> None:
+    """Run a scenario many times under random faults; shrink what fails; a matrix of faults and checks."""
+    fix_hash_seed("emulator.cli")
+    from emulator.testing.campaign import Plan, run_campaign
+
+    with one_line_errors():
+        sys.path.append(str(Path.cwd()))
+        loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        options = {"jobs": jobs} if jobs else {}
+        plan = Plan.of(
+            loaded, faults, runs, loaded.run.seed, limit_s=time_limit, shrink_steps=shrink_steps, **options
+        )
+        raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))
+
+
+@app.command()
 def record(
     connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint.")],
     run: Annotated[str, typer.Option(help="The name of the run.")],
