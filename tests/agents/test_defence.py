@@ -13,7 +13,6 @@ from agents.cooperative_options import Options
 from agents.liar import LIES, Liar, Lie
 from agents.sightings import CAPACITY, Sightings
 from vnet import Fix, Packet
-from vnet.cmm.robust import median, near_the_median
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
 
@@ -322,17 +321,3 @@ def test_after_a_partition_heals_the_halves_agree_within_ten_seconds() -> None:
     assert np.linalg.norm(town.means() - town.estimates().mean(axis=0), axis=1).max() < 0.2
     assert np.linalg.norm(town.estimates() - town.estimates().mean(axis=0), axis=1).max() < 0.3
     assert town.rejected(0) == set()
-
-
-def test_the_median_of_estimates_is_a_gate_that_neither_small_nor_large_covariances_open() -> None:
-    honest = np.array([[0.0, 0.1], [0.1, 0.0], [-0.1, 0.0], [0.0, -0.1]])
-    small, large = np.eye(2) * 1e-6, np.eye(2) * 1e4
-    assert median(honest).tolist() == [0.0, 0.0]
-    for lying in (small, large, np.eye(2) * 0.01):
-        estimates = np.vstack([honest, [50.0, 0.0]])
-        covariances = np.array([np.eye(2) * 0.01] * 4 + [lying])
-        assert near_the_median(estimates, covariances, 3.0).tolist() == [True] * 4 + [False]
-    # one who knows little, and says so
-    estimates = np.vstack([honest, [4.0, -3.0]])
-    covariances = np.array([np.eye(2) * 0.01] * 4 + [np.eye(2) * 9.0])
-    assert near_the_median(estimates, covariances, 3.0).all()

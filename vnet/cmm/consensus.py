@@ -47,9 +47,8 @@ class ConsensusConfig:
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
     last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
     `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
-    `blame`: so much may a peer be blamed at once, and one more in `blame_rounds` (a leaky bucket); beyond that it
-    is not heard for `exile_rounds`. To be the first to bring a new epoch counts 1, a leap of epochs up to `leap`,
-    and so much do false sums.
+    `blame`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
+    bucket). To be the first to bring a new epoch counts 1, a leap of epochs or false sums up to `worst`.
     """
 
     silence_rounds: int = 20
@@ -57,9 +56,8 @@ class ConsensusConfig:
     settle_rounds: int = 30
     gate_m: float = math.inf
     blame: int = 10
-    blame_rounds: int = 50
-    leap: int = 5
-    exile_rounds: int = 600
+    blame_rounds: int = 200
+    worst: int = 10
 
 
 LEAST_MASS = 0.1
@@ -124,7 +122,7 @@ class RatioConsensus:
         self._node = node
         self._config = config or ConsensusConfig()
         self._rejected = Counter() if rejected is None else rejected
-        self._blamed: dict[str, float] = {}
+        self._blamed: dict[str, tuple[float, int]] = {}  # and up to which epoch
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
@@ -169,35 +167,40 @@ class RatioConsensus:
         is left is the mean all the same.
         """
         leak = 1 / self._config.blame_rounds
-        self._blamed = {peer: blame - leak for peer, blame in self._blamed.items() if blame > leak}
+        self._blamed = {p: (blame - leak, epoch) for p, (blame, epoch) in self._blamed.items() if blame > leak}
         self._blame_for_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._blamed.get(peer, 0.0) > self._config.blame:
+            if self._blame_of(peer) > self._config.blame:
                 self._rejected["exile"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["sums"] += 1
-                self._blame(peer, self._config.leap)
+                self._blame(peer, self._config.worst, share.epoch)
             else:
                 believed[peer] = share
         return believed
 
     def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
-        newest = max((share.epoch for share in shares.values()), default=0)
-        if newest > self._highest:
-            for peer, share in shares.items():
-                if share.epoch == newest:
-                    self._blame(peer, min(newest - self._highest, self._config.leap))
+        """Blame those who are the first with a new epoch.
 
-    def _blame(self, peer: str, blame: int) -> None:
-        blamed = self._blamed.get(peer, 0.0)
-        if blamed <= self._config.blame:
-            exiled = blamed + blame > self._config.blame
-            rounds = self._config.exile_rounds if exiled else 0
-            self._blamed[peer] = blamed + blame + rounds / self._config.blame_rounds
-            if exiled:
-                self._peers.drop(peer)
+        They share the blame: who starts it brings it alone, and who hands it on does so together with others.
+        """
+        newest = max((share.epoch for share in shares.values()), default=0)
+        if newest > self._highest > 0:  # who joins finds the others further on, for which they are not to blame
+            first = [peer for peer, share in shares.items() if share.epoch == newest]
+            for peer in first:
+                if newest > self._blamed.get(peer, (0.0, 0))[1]:
+                    self._blame(peer, min(newest - self._highest, self._config.worst) / len(first), newest)
+
+    def _blame_of(self, peer: str) -> float:
+        return self._blamed[peer][0] if peer in self._blamed else 0.0
+
+    def _blame(self, peer: str, more: float, epoch: int) -> None:
+        blame = self._blame_of(peer) + more
+        self._blamed[peer] = blame, epoch
+        if blame > self._config.blame:
+            self._peers.drop(peer)
 
     def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
         """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
