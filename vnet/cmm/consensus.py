@@ -64,6 +64,10 @@ LEAST_MASS = 0.1
 """Tracking adds the change of the input to masses of any size: small ones need not have a sensible ratio."""
 
 
+MOST_BLAMED = 1024
+"""Names cost a liar nothing."""
+
+
 class Consensus(Protocol):
     """What a vehicle needs of a consensus."""
 
@@ -198,7 +202,8 @@ class RatioConsensus:
 
     def _blame(self, peer: str, more: float, epoch: int) -> None:
         blame = self._blame_of(peer) + more
-        self._blamed[peer] = blame, epoch
+        if peer in self._blamed or len(self._blamed) < MOST_BLAMED:
+            self._blamed[peer] = blame, epoch
         if blame > self._config.blame:
             self._peers.drop(peer)
 
