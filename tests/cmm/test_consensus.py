@@ -287,7 +287,7 @@ def test_a_peer_that_starts_epoch_after_epoch_is_left_out_and_not_those_who_took
     net, rejected = deceived(6, lie, lambda _, j, i: abs(i - j) <= 2)
     agreed_without_the_first(net)
     assert all(set(counts) == {"exile"} for counts in rejected[1:3])
-    assert max(net.epochs()) <= 15, "a burst, and then one in 200 rounds"
+    assert max(net.epochs()) <= 20, "a burst, and then one in 100 rounds"
 
 
 def test_an_average_is_not_drawn_to_a_state_beyond_the_gate() -> None:

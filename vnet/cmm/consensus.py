@@ -45,19 +45,21 @@ class ConsensusConfig:
     """Rounds, that is periods, of patience.
 
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
-    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
+    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start; if epoch follows
+    epoch, for `serve_rounds` at most.
     `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
     `blame`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
-    bucket). To be the first to bring a new epoch counts 1, a leap of epochs or false sums up to `worst`.
+    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to `worst`.
     """
 
     silence_rounds: int = 20
     steady_rounds: int = 5
     settle_rounds: int = 30
+    serve_rounds: int = 100
     gate_m: float = math.inf
     blame: int = 10
-    blame_rounds: int = 200
-    worst: int = 10
+    blame_rounds: int = 100
+    worst: int = 4
 
 
 LEAST_MASS = 0.1
@@ -138,13 +140,14 @@ class RatioConsensus:
         self._seen: dict[str, Array] = {}
         self._peers = Peers(node, self._config.silence_rounds)
         self._old_mean: Array | None = None
+        self._old_rounds = 0
 
     @property
     def mean_m(self) -> Array | None:
         """The mean (2,) as far as it is known; None before the first has settled."""
         if self.epoch and self._age >= self._config.settle_rounds:
             return np.asarray(self._mass[:2] / self._mass[2])
-        return self._old_mean
+        return self._old_mean if self._old_rounds <= self._config.serve_rounds else None
 
     @property
     def mass(self) -> Array:
@@ -180,7 +183,7 @@ class RatioConsensus:
                 self._rejected["exile"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["sums"] += 1
-                self._blame(peer, self._config.worst, share.epoch)
+                self._blame(peer, self._config.blame, share.epoch)
             else:
                 believed[peer] = share
         return believed
@@ -217,6 +220,7 @@ class RatioConsensus:
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
+        self._old_rounds += 1
         wanted = self._peers.mutual
         changed = wanted != self._takers or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
@@ -230,7 +234,8 @@ class RatioConsensus:
             self._age += 1
 
     def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
-        self._old_mean = self.mean_m
+        if self.epoch and self._age >= self._config.settle_rounds:
+            self._old_mean, self._old_rounds = self.mean_m, 0
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
         self._running_sum = np.zeros(3)
