@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,10 +13,14 @@ from agents.cooperative_frame import RELAYED, CooperativeFrame, decode, encode, 
 from agents.cooperative_options import Options
 from agents.liar import LIES, Liar, Lie
 from agents.sightings import CAPACITY, Sightings
+from emulator.observe.run_folder import RunFolder
+from emulator.run.emulation import Emulation
+from emulator.run.simulate import simulate
+from emulator.world.world import build_world
 from vnet import Fix, Packet
-from vnet.cmm.robust import median, near_the_median
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
+from vnet.scenario import Scenario
 
 PERIOD_NS = 100_000_000
 COMMON = np.array([3.0, -2.0])
@@ -324,15 +329,15 @@ def test_after_a_partition_heals_the_halves_agree_within_ten_seconds() -> None:
     assert town.rejected(0) == set()
 
 
-def test_the_median_of_estimates_is_a_gate_that_neither_small_nor_large_covariances_open() -> None:
-    honest = np.array([[0.0, 0.1], [0.1, 0.0], [-0.1, 0.0], [0.0, -0.1]])
-    small, large = np.eye(2) * 1e-6, np.eye(2) * 1e4
-    assert median(honest).tolist() == [0.0, 0.0]
-    for lying in (small, large, np.eye(2) * 0.01):
-        estimates = np.vstack([honest, [50.0, 0.0]])
-        covariances = np.array([np.eye(2) * 0.01] * 4 + [lying])
-        assert near_the_median(estimates, covariances, 3.0).tolist() == [True] * 4 + [False]
-    # one who knows little, and says so
-    estimates = np.vstack([honest, [4.0, -3.0]])
-    covariances = np.array([np.eye(2) * 0.01] * 4 + [np.eye(2) * 9.0])
-    assert near_the_median(estimates, covariances, 3.0).all()
+def test_a_scenario_may_have_a_liar_and_what_is_rejected_is_reported(tmp_path: Path) -> None:
+    liar = {"nodes": ["v01"], "entry": "agents.liar:main", "options": {"lie": "offset", "particles": 30}}
+    program = {"entry": "agents.cooperative:main", "options": {"particles": 30}, "exceptions": [liar]}
+    network = {"vehicles": 6, "layout": "dense"}
+    scenario = Scenario.model_validate({"run": {"duration_s": 2.5}, "network": network, "program": program})
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    states = emulation.metrics.states_table().to_pylist()
+    last = {row["node"]: dict(row["values"]) for row in states if row["period"] == 20}
+    assert all(values["rejected.outlier"][0] >= 15 for node, values in last.items() if node != "v01")
+    assert not any(name.startswith("rejected.") for name in last["v01"])
+    assert all(values["rejected"][0] >= 15 for node, values in last.items() if node != "v01")

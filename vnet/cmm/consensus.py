@@ -45,25 +45,29 @@ class ConsensusConfig:
     """Rounds, that is periods, of patience.
 
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
-    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
+    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start; if epoch follows
+    epoch, for `serve_rounds` at most.
     `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
-    `blame`: so much may a peer be blamed at once, and one more in `blame_rounds` (a leaky bucket); beyond that it
-    is not heard for `exile_rounds`. To be the first to bring a new epoch counts 1, a leap of epochs up to `leap`,
-    and so much do false sums.
+    `blame`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
+    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to `worst`.
     """
 
     silence_rounds: int = 20
     steady_rounds: int = 5
     settle_rounds: int = 30
+    serve_rounds: int = 100
     gate_m: float = math.inf
     blame: int = 10
-    blame_rounds: int = 50
-    leap: int = 5
-    exile_rounds: int = 600
+    blame_rounds: int = 100
+    worst: int = 4
 
 
 LEAST_MASS = 0.1
 """Tracking adds the change of the input to masses of any size: small ones need not have a sensible ratio."""
+
+
+MOST_BLAMED = 1024
+"""Names cost a liar nothing."""
 
 
 class Consensus(Protocol):
@@ -124,7 +128,7 @@ class RatioConsensus:
         self._node = node
         self._config = config or ConsensusConfig()
         self._rejected = Counter() if rejected is None else rejected
-        self._blamed: dict[str, float] = {}
+        self._blamed: dict[str, tuple[float, int]] = {}  # and up to which epoch
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
@@ -136,13 +140,14 @@ class RatioConsensus:
         self._seen: dict[str, Array] = {}
         self._peers = Peers(node, self._config.silence_rounds)
         self._old_mean: Array | None = None
+        self._old_rounds = 0
 
     @property
     def mean_m(self) -> Array | None:
         """The mean (2,) as far as it is known; None before the first has settled."""
         if self.epoch and self._age >= self._config.settle_rounds:
             return np.asarray(self._mass[:2] / self._mass[2])
-        return self._old_mean
+        return self._old_mean if self._old_rounds <= self._config.serve_rounds else None
 
     @property
     def mass(self) -> Array:
@@ -169,35 +174,41 @@ class RatioConsensus:
         is left is the mean all the same.
         """
         leak = 1 / self._config.blame_rounds
-        self._blamed = {peer: blame - leak for peer, blame in self._blamed.items() if blame > leak}
+        self._blamed = {p: (blame - leak, epoch) for p, (blame, epoch) in self._blamed.items() if blame > leak}
         self._blame_for_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._blamed.get(peer, 0.0) > self._config.blame:
+            if self._blame_of(peer) > self._config.blame:
                 self._rejected["exile"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["sums"] += 1
-                self._blame(peer, self._config.leap)
+                self._blame(peer, self._config.blame, share.epoch)
             else:
                 believed[peer] = share
         return believed
 
     def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
-        newest = max((share.epoch for share in shares.values()), default=0)
-        if newest > self._highest:
-            for peer, share in shares.items():
-                if share.epoch == newest:
-                    self._blame(peer, min(newest - self._highest, self._config.leap))
+        """Blame those who are the first with a new epoch.
 
-    def _blame(self, peer: str, blame: int) -> None:
-        blamed = self._blamed.get(peer, 0.0)
-        if blamed <= self._config.blame:
-            exiled = blamed + blame > self._config.blame
-            rounds = self._config.exile_rounds if exiled else 0
-            self._blamed[peer] = blamed + blame + rounds / self._config.blame_rounds
-            if exiled:
-                self._peers.drop(peer)
+        They share the blame: who starts it brings it alone, and who hands it on does so together with others.
+        """
+        newest = max((share.epoch for share in shares.values()), default=0)
+        if newest > self._highest > 0:  # who joins finds the others further on, for which they are not to blame
+            first = [peer for peer, share in shares.items() if share.epoch == newest]
+            for peer in first:
+                if newest > self._blamed.get(peer, (0.0, 0))[1]:
+                    self._blame(peer, min(newest - self._highest, self._config.worst) / len(first), newest)
+
+    def _blame_of(self, peer: str) -> float:
+        return self._blamed[peer][0] if peer in self._blamed else 0.0
+
+    def _blame(self, peer: str, more: float, epoch: int) -> None:
+        blame = self._blame_of(peer) + more
+        if peer in self._blamed or len(self._blamed) < MOST_BLAMED:
+            self._blamed[peer] = blame, epoch
+        if blame > self._config.blame:
+            self._peers.drop(peer)
 
     def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
         """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
@@ -209,6 +220,7 @@ class RatioConsensus:
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
+        self._old_rounds += 1
         wanted = self._peers.mutual
         changed = wanted != self._takers or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
@@ -222,7 +234,8 @@ class RatioConsensus:
             self._age += 1
 
     def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
-        self._old_mean = self.mean_m
+        if self.epoch and self._age >= self._config.settle_rounds:
+            self._old_mean, self._old_rounds = self.mean_m, 0
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
         self._running_sum = np.zeros(3)
