@@ -129,7 +129,9 @@ class Estimator:
 
     def agree(self) -> None:
         """A round of consensus, and of coming together, with those whose frames have come since the last."""
-        everybody, self._frames = self._plausible(dict(sorted(self._frames.items()))), {}
+        # After standing still there are frames of before that: of senders that have been forgotten since.
+        fresh = {sender: frame for sender, frame in sorted(self._frames.items()) if sender in self._admission.ids}
+        everybody, self._frames = self._plausible(fresh), {}
         frames = {sender: frame for sender, frame in everybody.items() if self._is_neighbour(sender)}
         shares = everybody if self._options.consensus == "exact" else frames
         self._share = self.consensus.round(self.rbpf.estimate_m, {s: _share(f) for s, f in shares.items()})

@@ -314,6 +314,20 @@ def test_a_restarted_vehicle_is_taken_in_at_once_and_the_mean_recovers() -> None
     assert np.linalg.norm(town.means() - town.estimates().mean(axis=0), axis=1).max() < 0.2
 
 
+def test_a_vehicle_that_stood_still_does_not_use_what_it_heard_before() -> None:
+    town = Town(count=3)
+    town.run(5)
+    vehicle, now_ns = town.vehicles[1], 5 * PERIOD_NS
+    fix = Fix(now_ns, town.place[0] + COMMON, np.eye(2), None)
+    vehicle.read([Packet("v0", now_ns, now_ns, town.vehicles[0].frame(fix, 1400))], now_ns)
+    later_ns = now_ns + 30 * PERIOD_NS
+    vehicle.read([], later_ns)
+    vehicle.filter(Fix(later_ns, town.place[1] + COMMON, np.eye(2), None))
+    estimate = vehicle.rbpf.estimate_m
+    vehicle.agree()
+    assert np.array_equal(vehicle.rbpf.estimate_m, estimate)
+
+
 def test_after_a_partition_heals_the_halves_agree_within_ten_seconds() -> None:
     town = Town(count=10)
     town.run(50)
