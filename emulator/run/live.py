@@ -499,6 +499,7 @@ class LiveRun:
             leads -= self._paused  # they cannot answer, and have time until they go on
         await self._all_answer(sorted(leads), patience_s)
         self._restarting = False
+        self._emulation.folder.event(self._time_ns(), f"{fault.kind}ed", None, down_s=fault.down_s)
 
     async def _all_answer(self, leads: Sequence[str], patience_s: float) -> None:
         """Wait until each process has answered: only then do messages pass in both directions again."""

@@ -145,7 +145,7 @@ def _disturbed(evidence: Evidence) -> Mask:
 
 
 def _restarts(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:
-    done = [e for e in evidence.event("restarted", f"{planned.fault.kind}ed") if e.time_ns >= planned.start_ns]
+    done = [e for e in evidence.event(f"{planned.fault.kind}ed") if e.time_ns >= planned.start_ns]
     if done:
         return _found(name, len(done), "restarts", "")
     started = evidence.event("started")
