@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shlex
 import subprocess
@@ -84,11 +83,8 @@ def run_again(emulation: Emulation, judgement: Judgement, verdict: dict[str, Any
     """
     path = emulation.folder.path
     arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN)]
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONHASHSEED"}
     # A process of its own: nothing that a program has left in this one may help it to agree with itself.
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "emulator.cli", *arguments], env=environment, stdout=subprocess.DEVNULL
-    )
+    done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
     finding: Finding = check_replay(path)
     if done.returncode not in {each.exit_status for each in Verdict}:
         finding = unknown("replay", f"the second run ended with status {done.returncode}")

@@ -262,6 +262,15 @@ def test_other_bytes_than_were_sent_are_found(kind: str) -> None:
     assert set(damaged(evidence, with_cells(evidence.trace, "payload_digest", row, 12345))) == {"isolation"}
 
 
+def test_a_stale_frame_of_another_age_is_found() -> None:
+    evidence = with_fault("StaleMessages")
+    label = "StaleMessages-0"
+    rows = np.concatenate([some(evidence, outcome, cause=label) for outcome in ("delivered", "lost")])
+    same = rows[evidence.frame[rows] == evidence.frame[rows[0]]]
+    assert len(same) > 1
+    assert set(damaged(evidence, with_cells(evidence.trace, "payload_digest", same, 12345))) == {"isolation"}
+
+
 def test_a_program_that_heard_more_than_arrived_is_found() -> None:
     evidence = with_fault("partition")
     rows = evidence.states.to_pylist()
@@ -276,7 +285,55 @@ def test_copies_without_a_cause_or_with_a_number_missing_break_conservation() ->
     assert set(damaged(evidence, with_cells(evidence.trace, "cause", row, ""))) == {"conservation"}
     kept = evidence.trace.filter(pa.array(evidence.emission != evidence.emission[row]))
     assert damaged(evidence, kept)["conservation"].figures["missing_frames"] == 1
-    assert set(damaged(evidence, kept)) == {"conservation"}
+    assert set(damaged(evidence, kept)) == {"conservation", "copies"}
+
+
+@pytest.mark.parametrize("kind", ["DoS", "Sybil"])
+def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) -> None:
+    evidence = with_fault(kind)
+    rows = some(evidence, "delivered", "lost", cause=f"{kind}-0", copies=True)
+    last = rows[evidence.copy[rows] == evidence.copy.max()][0]
+    kept = evidence.trace.filter(pa.array(evidence.emission != evidence.emission[last]))
+    found = damaged(evidence, kept)
+    assert set(found) == {"copies"}
+    assert found["copies"].figures["miscounted"] == 1
+
+
+def test_a_replay_of_another_age_is_found() -> None:
+    assert with_fault("DataReplay").scenario.fault[0].age_s == 1.0
+    scenario = with_fault("DataReplay").scenario
+    older = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update={"age_s": 0.9}),)})
+    assert not_valid(replace(with_fault("DataReplay"), scenario=older)) == {"copies": Verdict.INVALID}
+
+
+@pytest.mark.parametrize(("kind", "key"), [("gnss_jump", "offset_m"), ("gnss_ramp", "rate_m_s")])
+def test_fixes_that_stray_otherwise_than_they_should_are_found(kind: str, key: str) -> None:
+    evidence = with_fault(kind)
+    less = evidence.scenario.fault[0].model_copy(update={key: (4.0, 2.0)})
+    scenario = evidence.scenario.model_copy(update={"fault": (less,)})
+    assert not_valid(replace(evidence, scenario=scenario)) == {"gnss": Verdict.INVALID}
+    assert result(replace(evidence, scenario=scenario), "gnss").figures["rows"][0]["under"] == f"{kind}-0"
+
+
+def test_a_receiver_that_is_too_good_or_too_bad_is_found() -> None:
+    evidence = with_fault("partition")
+    for sigma_m in (0.8, 1.3):
+        gnss = evidence.scenario.world.gnss.model_copy(update={"sigma_m": sigma_m})
+        world = evidence.scenario.world.model_copy(update={"gnss": gnss})
+        forged = replace(evidence, scenario=evidence.scenario.model_copy(update={"world": world}))
+        assert not_valid(forged) == {"gnss": Verdict.INVALID}
+
+
+def test_bytes_that_a_corruption_left_alone_show_none() -> None:
+    evidence = with_fault("corrupt")
+    rows = some(evidence, "delivered", cause="corrupt-0")
+    said = {int(evidence.frame[row]): int(evidence.digest[row]) for row in some(evidence, "delivered", "lost")}
+    digests = evidence.trace["payload_digest"].to_pylist()
+    for row in rows.tolist():
+        digests[row] = said.get(int(evidence.frame[row]), digests[row])
+    index = evidence.trace.column_names.index("payload_digest")
+    spared = evidence.trace.set_column(index, "payload_digest", pa.array(digests, pa.uint64()))
+    assert not_valid(replace(evidence, trace=spared)) == {"bit:corrupt-0": Verdict.UNKNOWN}
 
 
 def test_a_copy_of_nothing_breaks_conservation() -> None:
@@ -332,6 +389,20 @@ def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
     assert not_valid(without_reports(evidence, "v03", 5.1)) == {}
     dead = replace(evidence, events=[*evidence.events, Event(4_500_000_000, "crashed", "v03", {"error": "tired"})])
     assert verdict(without_reports(dead, "v03", 4.5), "liveness") is Verdict.VALID
+
+
+async def starts_late_and_ends(node: Node) -> None:
+    """Report from the third second on; one vehicle ends right after a report."""
+    async for fix in node.gnss:
+        if fix.time_ns >= 3_000_000_000:
+            node.report(fix.position_m, fix.covariance_m2)
+        if node.id == "v03" and fix.time_ns >= 4_000_000_000:
+            return
+
+
+def test_a_program_may_start_late_and_end_with_a_report() -> None:
+    evidence = simulated(program=f"{__name__}:starts_late_and_ends")
+    assert verdict(evidence, "liveness") is verdict(evidence, "down_respected") is Verdict.VALID
 
 
 def test_where_the_machine_did_not_keep_up_silence_is_unknown() -> None:

@@ -93,7 +93,10 @@ def test_a_failed_check_prints_its_rows_and_the_command(evidence: Evidence) -> N
 def test_a_simulation_is_had_twice_and_judged_again(tmp_path: Path, program: str, status: int) -> None:
     command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", "scenarios/beacon.toml"]
     options = ["--duration", "1", "--program", program, "--out", str(tmp_path / "run"), "--check-determinism"]
-    done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    environment = {**os.environ, "PYTHONHASHSEED": "0"}  # it need not start itself anew for that
+    done = subprocess.run(
+        [*command, *options], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == status, done.stderr
     written = json.loads((tmp_path / "run" / "verdict.json").read_text())
     replay = next(check for check in written["checks"] if check["name"] == "replay")

@@ -45,6 +45,7 @@ from emulator.observe.checks.faults import (
 )
 from emulator.observe.checks.latency import check_latency
 from emulator.observe.checks.replay import ONCE, check_replay
+from emulator.observe.checks.senders import check_copies, check_gnss
 from emulator.observe.checks.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
 from emulator.observe.run_folder import read_events
 from emulator.observe.trace import read_trace, sha256_of_table
@@ -75,6 +76,8 @@ OF_FRAMES: tuple[Check, ...] = (
     check_down_respected,
     check_pause_respected,
     check_outage_respected,
+    check_copies,
+    check_gnss,
 )
 OF_BELIEFS: tuple[Check, ...] = (
     check_liveness,

@@ -5,20 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.stats import chi2
 
 from emulator.faults.plan import PlannedFault
+from emulator.observe.checks.channel import changed_bytes
 from emulator.observe.checks.evidence import Evidence, Mask
 from emulator.observe.checks.faults import CUTTING, LOSING, SENDING
 from emulator.observe.checks.latency import bounds
+from emulator.observe.checks.senders import is_noise
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
 from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault
-from vnet.roads.lanes import Array
 
-IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate", "corrupt")
+IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate")
 DELAYING = ("delay", "jitter", "reorder", "throttle")
-CERTAIN = 1e-6
-"""How unlikely what was seen must be without the fault."""
 PHASE_NS = 1_000_000
 STEADY_FRAMES = 5
 
@@ -35,6 +33,9 @@ def check_bits(evidence: Evidence) -> Iterator[Finding]:
 
 def _bit(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:
     kind = planned.fault.kind
+    if kind == "corrupt":
+        changed = changed_bytes(evidence) & (evidence.cause == planned.number)
+        return _found(name, int(changed.sum()), "pairs arrive with other bytes", "no pair arrives with other bytes")
     if kind in IN_ROWS:
         return _found(name, int((evidence.cause == planned.number).sum()), "pairs name it", "no pair names it")
     if kind in DELAYING:
@@ -104,18 +105,8 @@ def _bent(evidence: Evidence, planned: PlannedFault) -> int:
     truth_m = (evidence.vectors("position_m") + evidence.vectors("common_error_m"))[:, planned.nodes]
     error_m = (fix_m - truth_m)[acting]
     error_m = error_m[np.isfinite(error_m).all(axis=2)]
-    return len(error_m) if _is_no_noise(error_m, evidence.scenario.world.gnss.sigma_m) else 0
-
-
-def _is_no_noise(error_m: Array, sigma_m: float) -> bool:
-    if not len(error_m):
-        return False
-    if sigma_m == 0:
-        return bool(np.abs(error_m).max() > 1e-6)
-    squares, mean = float(np.sum(error_m**2)) / sigma_m**2, error_m.mean(axis=0) / sigma_m
-    in_all = chi2.sf(squares, error_m.size) < CERTAIN
-    on_average = chi2.sf(float(len(error_m) * mean @ mean), 2) < CERTAIN
-    return bool(in_all or on_average)
+    sound = not len(error_m) or is_noise(error_m, evidence.scenario.world.gnss.sigma_m)
+    return 0 if sound else len(error_m)
 
 
 def _clocks(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:

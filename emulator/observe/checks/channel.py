@@ -11,7 +11,9 @@ from scipy.stats import binom
 from emulator.channel.outcomes import Outcome
 from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, Evidence, Mask, Whole
 from emulator.observe.checks.verdicts import Finding, NotExercised, result, unknown
+from vnet.faults import StaleMessages
 from vnet.roads.lanes import Array
+from vnet.scenario import NS_PER_S
 
 LOSS_BAND = 0.999
 IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
@@ -234,17 +236,11 @@ def check_isolation(evidence: Evidence) -> Finding:
 
 def _foreign(evidence: Evidence) -> Mask:
     """Arrivals with other bytes than their frame's, though no fault says that it changed them."""
-    frame, place = np.unique(evidence.frame, return_inverse=True)
-    corrupt, stale = evidence.caused_by("corrupt"), evidence.caused_by("StaleMessages")
-    plain = np.flatnonzero((evidence.copy == 0) & ~corrupt)
-    said = np.zeros(len(frame), dtype=np.uint64)
-    known = np.zeros(len(frame), dtype=bool)
-    said[place[plain[::-1]]], known[place[plain]] = evidence.digest[plain[::-1]], True
-    differs = evidence.arrived & ~corrupt & known[place] & (evidence.digest != said[place])
-    replaced = np.zeros(len(frame), dtype=bool)
-    replaced[place[stale]] = True
+    stale = evidence.caused_by("StaleMessages")
+    differs = evidence.arrived & ~evidence.caused_by("corrupt") & changed_bytes(evidence)
+    differs |= evidence.arrived & _not_of_that_age(evidence, stale)
     # What a vehicle handed over and a stale frame took the place of is in no row of its own.
-    differs &= ~(evidence.caused_by("DataReplay") & replaced[place])
+    differs &= ~(evidence.caused_by("DataReplay") & np.isin(evidence.frame, evidence.frame[stale]))
     twice = np.flatnonzero(differs & received_twice(evidence))
     if len(twice):
         once = evidence.arrived & ~received_twice(evidence)
@@ -252,6 +248,35 @@ def _foreign(evidence: Evidence) -> Mask:
         described = zip(*(column[twice].tolist() for column in _what(evidence)), strict=True)
         differs[twice] = [what not in heard for what in described]
     return np.asarray(differs)
+
+
+def changed_bytes(evidence: Evidence) -> Mask:
+    """Rows with other bytes than their frame's, so far as an original that nothing corrupted tells them."""
+    frame, place = np.unique(evidence.frame, return_inverse=True)
+    plain = np.flatnonzero((evidence.copy == 0) & ~evidence.caused_by("corrupt"))[::-1]
+    said = np.zeros(len(frame), dtype=np.uint64)
+    known = np.zeros(len(frame), dtype=bool)
+    said[place[plain]], known[place[plain]] = evidence.digest[plain], True
+    return np.asarray(known[place] & (evidence.digest != said[place]))
+
+
+def _not_of_that_age(evidence: Evidence, stale: Mask) -> Mask:
+    """Stale frames that are not what their sender sent so long ago, where that was not stale itself."""
+    wrong = np.zeros(len(stale), dtype=bool)
+    sound = ~evidence.caused_by("corrupt")
+    for planned in evidence.plan:
+        mine = np.flatnonzero(stale & (evidence.cause == planned.number))
+        if not isinstance(planned.fault, StaleMessages) or not len(mine):
+            continue
+        for sender in np.unique(evidence.sender[mine]):
+            own = np.flatnonzero((evidence.sender == sender) & (evidence.copy == 0))
+            own = own[np.lexsort((sound[own], evidence.seq[own], evidence.sent_ns[own]))]
+            late = mine[evidence.sender[mine] == sender]
+            before_ns = evidence.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
+            place = np.searchsorted(evidence.sent_ns[own], before_ns, side="right") - 1
+            old = own[np.maximum(place, 0)]
+            wrong[late] = (place < 0) | (sound[old] & ~stale[old] & (evidence.digest[late] != evidence.digest[old]))
+    return wrong
 
 
 def _what(evidence: Evidence) -> tuple[Whole, ...]:

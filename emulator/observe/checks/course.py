@@ -115,7 +115,7 @@ def check_liveness(evidence: Evidence) -> Finding:
     name = "liveness"
     if not evidence.reported.any():
         return NotExercised(name, "the program reports nothing")
-    window = max(1, -(-LIVENESS_NS // evidence.scenario.period_ns))
+    window = max(2, -(-LIVENESS_NS // evidence.scenario.period_ns))
     judged = _expected_to_report(evidence, window)
     if not judged.any():
         return NotExercised(name, "no program reports once a second")
@@ -128,6 +128,8 @@ def check_liveness(evidence: Evidence) -> Finding:
         from_ns, until_ns = _up_from_to(evidence, node)
         mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
         reports = mine[evidence.reported[mine, node]]
+        if not evidence.plan:  # it may take its time at the start
+            mine = mine[mine >= reports.min(initial=evidence.periods)]
         edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
         gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
         if gaps:

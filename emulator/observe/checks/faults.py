@@ -96,7 +96,8 @@ def check_down_respected(evidence: Evidence) -> Finding:
     deaf = evidence.is_down(evidence.receiver, evidence.arrival_ns)
     hearing = judged & deaf & evidence.outcome_is("delivered")
     missing = judged & ~deaf & evidence.outcome_is("receiver_down")
-    spans = [(span.node, span.start_ns, span.end_ns) for span in evidence.down]
+    # A node may report and end by itself at one instant; a fault acts before anything else does.
+    spans = [(span.node, span.start_ns + (not span.planned), span.end_ns) for span in evidence.down]
     reports = _reports_within(evidence, spans)
     wrong = speaking | hearing | missing
     broken = int(wrong.sum()) + len(reports)
