@@ -60,7 +60,7 @@ def _inside(corner_m: Array, point_m: Array) -> Mask:
     x, y = point_m.T
     for (x1, y1), (x2, y2) in zip(corner_m, np.roll(corner_m, -1, axis=0), strict=True):
         spans = (y1 > y) != (y2 > y)
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             odd ^= spans & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
     return odd
 

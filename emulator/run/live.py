@@ -480,7 +480,9 @@ class LiveRun:
     async def _restart_link(self, fault: Infrastructure) -> None:
         """Take the emulator's connection (or the separate router) down and up again; the agents are told first."""
         patience_s = fault.down_s + self._emulation.scenario.run.join_timeout_s
-        living = [node for node in self._emulation.world.node_ids if self._emulation.up[node]]
+        # The emulation may be ahead: who is up there again need not have been started yet.
+        up = [node for node in self._emulation.world.node_ids if self._emulation.up[node]]
+        living = [node for node in up if node not in self._returning]
         for node in living:
             self._link.send(node, wire.Await(patience_s))
         await asyncio.sleep(AWAIT_WARNING_S)

@@ -1,0 +1,191 @@
+"""Faults in whole runs: the same trace live and simulated, and nothing left standing, whatever ends the run."""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
+
+PROGRAM = "tests.emulator.fault_programs:minds_the_order"
+
+EVERY_SORT = [
+    {"kind": "kill", "at_s": 0.53, "duration_s": 0.6, "nodes": {"ids": ["v01"]}},
+    {"kind": "restart", "at_s": 0.8, "duration_s": 0.4, "nodes": {"ids": ["v02", "v03"]}},
+    {"kind": "pause", "at_s": 0.9, "duration_s": 0.77, "nodes": {"ids": ["v03", "v04"]}},
+    {"kind": "skew", "at_s": 0.7, "duration_s": 1.1, "offset_ms": -130, "nodes": {"ids": ["v02", "v04"]}},
+    {"kind": "drift", "at_s": 1.0, "duration_s": 0.9, "rate_ppm": 200_000, "nodes": {"ids": ["v01"]}},
+    {"kind": "partition", "at_s": 1.2, "duration_s": 0.5},
+    {"kind": "corrupt", "at_s": 0.4, "duration_s": 1.5, "probability": 0.5},
+    {"kind": "kill", "at_s": 1.5, "duration_s": 0.2},
+]
+
+IN_PAIRS = [
+    {"kind": "kill", "at_s": 0.53, "duration_s": 0.4, "nodes": {"ids": ["v01", "v02"]}},
+    {"kind": "pause", "at_s": 0.8, "duration_s": 0.37, "nodes": {"ids": ["v04", "v03"]}},
+    {"kind": "partition", "at_s": 1.2, "duration_s": 0.5},
+    {"kind": "restart", "at_s": 1.4, "duration_s": 0.4, "nodes": {"ids": ["v03", "v04"]}},
+    {"kind": "skew", "at_s": 0.7, "duration_s": 1.1, "offset_ms": -130, "nodes": {"ids": ["v02", "v04"]}},
+]
+"""What shares a process shares its fate."""
+
+
+def write(folder: Path, faults: Sequence[dict[str, Any]], **sections: dict[str, Any]) -> str:
+    """A small scenario with these faults; returns its path."""
+    data: dict[str, Any] = {
+        "run": {"name": "faulty", "duration_s": 2.5, "settle_s": 0.5, "orphan_timeout_s": 0.5},
+        "network": {"vehicles": 4},
+        "radio": {"loss": 0.1, "range_m": 1e6},
+        "program": {"entry": PROGRAM},
+        "fault": list(faults),
+    }
+    for name, section in sections.items():
+        data[name] = {**data[name], **section}
+    path = folder / "faulty.toml"
+    path.write_text(tomli_w.dumps(data))
+    return str(path)
+
+
+def processes_of(folder: Path) -> dict[int, str]:
+    """The processes, by pid, whose log lies in a run's folder, with their state as /proc says it."""
+    found = {}
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            log = str((process / "fd" / "1").readlink())
+            state = (process / "stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            continue
+        if log.startswith(str(folder)) and state != "Z":
+            found[int(process.name)] = state
+    return found
+
+
+def wait_until_all_are_gone(folder: Path) -> None:
+    """Wait until the processes of a run, which are not our children, have ended."""
+    for pid in processes_of(folder):
+        try:
+            descriptor = os.pidfd_open(pid)
+        except ProcessLookupError:
+            continue
+        try:
+            ready, _, _ = select.select([descriptor], [], [], 20)
+        finally:
+            os.close(descriptor)
+        if not ready:
+            os.kill(pid, signal.SIGKILL)
+            pytest.fail(f"process {pid} is left behind")
+    assert processes_of(folder) == {}
+
+
+def events_of(folder: Path, kind: str) -> list[dict[str, Any]]:
+    try:
+        lines = (folder / "events.jsonl").read_text().splitlines()
+    except FileNotFoundError:
+        return []
+    return [event for line in lines if (event := json.loads(line))["kind"] == kind]
+
+
+@contextmanager
+def started(scenario: str, folder: Path, *options: str, after: str) -> Iterator[subprocess.Popen[str]]:
+    """`vnet run`, once the event `after` has happened."""
+    command = [*VNET, "run", scenario, "--out", str(folder), *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            deadline = time.monotonic() + TIMEOUT_S
+            while not events_of(folder, after):
+                assert process.poll() is None, process.communicate()
+                assert time.monotonic() < deadline
+                time.sleep(0.02)
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("together", "router", "faults"),
+    [
+        (1, "embedded", [*EVERY_SORT, {"kind": "emulator_restart", "at_s": 1.1, "down_s": 0.3}]),
+        (1, "separate", [*EVERY_SORT, {"kind": "router_restart", "at_s": 1.1, "down_s": 0.3}]),
+        (2, "embedded", IN_PAIRS),
+    ],
+)
+def test_a_run_with_faults_of_every_sort_replays_live_and_simulated(
+    vnet: Vnet, tmp_path: Path, together: int, router: str, faults: list[dict[str, Any]]
+) -> None:
+    scenario = write(tmp_path, faults, run={"nodes_per_process": together})
+    live = vnet("run", scenario, "--router", router)
+    simulated = vnet("simulate", scenario)
+    assert live.check("progress")["verdict"] == "valid", live.stdout + live.stderr
+    assert live.fingerprint == simulated.fingerprint
+    assert [e for e in live.events if e["kind"].startswith(("fault_", "restarted"))] == [
+        e for e in simulated.events if e["kind"].startswith(("fault_", "restarted"))
+    ]
+    assert len(live.events_of("fault_ended")) == len(faults)
+    assert live.verdict["verdict"] == simulated.verdict["verdict"] == "valid", live.stdout
+    assert live.outcomes["fault"] > 0
+    assert live.outcomes["receiver_down"] > 0
+    assert processes_of(live.folder) == {}
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_vehicles_that_stand_still_do_not_outlive_the_run(tmp_path: Path, number: signal.Signals) -> None:
+    pause = {"kind": "pause", "at_s": 0.3, "duration_s": 3600, "nodes": {"ids": ["v01", "v03"]}}
+    scenario = write(tmp_path, [pause], run={"pacing": "realtime", "duration_s": 7200})
+    folder = tmp_path / "run"
+    with started(scenario, folder, after="fault_started") as process:
+        while sorted(processes_of(folder).values()).count("T") < 2:
+            assert process.poll() is None
+        assert len(processes_of(folder)) == 4
+        process.send_signal(number)
+        process.communicate(timeout=TIMEOUT_S)
+        assert number == signal.SIGKILL or processes_of(folder) == {}
+        wait_until_all_are_gone(folder)
+
+
+def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -> None:
+    """After the emulator was away once, and said for how long at most, agents wait as they did before."""
+    faults = [
+        {"kind": "emulator_restart", "at_s": 0.1, "down_s": 0.1},
+        {"kind": "kill", "at_s": 0.3, "duration_s": 3000, "nodes": {"ids": ["v01"]}},
+        {"kind": "pause", "at_s": 0.2, "duration_s": 3000, "nodes": {"ids": ["v02"]}},
+    ]
+    scenario = write(tmp_path, faults, run={"duration_s": 7200})
+    folder = tmp_path / "run"
+    with started(scenario, folder, "--router", "separate", after="fault_ended") as process:
+        while len(processes_of(folder)) != 4:  # three agents and the router
+            assert process.poll() is None
+        process.kill()
+        wait_until_all_are_gone(folder)
+    for node in ("v02", "v03", "v04"):
+        last = (folder / "logs" / f"{node}.log").read_text().splitlines()[-1]
+        assert last == f"vnet-agent: {node}: the emulator has been gone for 0.5 s; ending"
+
+
+def test_in_real_time_processes_are_killed_restarted_and_paused_and_none_is_left(
+    vnet: Vnet, tmp_path: Path
+) -> None:
+    faults = [
+        {"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"ids": ["v01"]}},
+        {"kind": "restart", "at_s": 0.7, "duration_s": 0.5, "nodes": {"ids": ["v02"]}},
+        {"kind": "pause", "at_s": 0.6, "duration_s": 0.7, "nodes": {"ids": ["v03", "v02"]}},
+    ]
+    scenario = write(tmp_path, faults, run={"pacing": "realtime", "duration_s": 4.0})
+    done = vnet("run", scenario)
+    assert done.verdict["verdict"] != "invalid", done.stdout
+    assert sorted(event["node"] for event in done.events_of("restarted")) == ["v01", "v02"]
+    assert len(done.events_of("fault_ended")) == 3
+    assert done.events_of("died") == done.events_of("crashed") == []
+    last = {row["sender"]: row["sent_ns"] for row in done.trace()}
+    assert all(sent_ns > 3_000_000_000 for sent_ns in last.values()), "all are there at the end"
+    during = [r["sent_ns"] for r in done.trace() if r["sender"] == "v03" and 6.5e8 < r["sent_ns"] < 1.3e9]
+    assert during == [], "who stands still says nothing"
+    assert processes_of(done.folder) == {}
