@@ -19,7 +19,8 @@ from vnet.scenario import Scenario
 T = TypeVar("T")
 
 NOT_SIMULATED = ("emulator_restart", "router_restart")
-SIMULATED_KINDS = tuple(kind for kind in KINDS if kind not in NOT_SIMULATED)
+SIMULATED_KINDS = tuple(sorted(set(KINDS) - set(NOT_SIMULATED), key=lambda kind: (kind[0].isupper(), kind)))
+"""Misbehaviour, whose names are capital, last."""
 OF_PROCESSES = ("kill", "restart", "pause")
 WEIGHTS: Mapping[str, int] = {"partition": 4, "kill": 3, "pause": 3, "burst_loss": 2, "corrupt": 2, "block": 2}
 """How often a campaign draws a kind; 1 where nothing is said."""

@@ -16,7 +16,11 @@ T = TypeVar("T")
 
 
 class _Drawn:
-    """A Chooser whose choices hypothesis makes, and shrinks."""
+    """A Chooser whose choices hypothesis makes, and shrinks.
+
+    Whatever there are several of is drawn number first (and not with `st.lists`): hypothesis then learns to leave
+    out any of them, however large.
+    """
 
     def __init__(self, draw: st.DrawFn) -> None:
         self._draw = draw
@@ -28,7 +32,8 @@ class _Drawn:
         return self._draw(st.sampled_from(items))
 
     def some(self, items: Sequence[T], most: int) -> list[T]:
-        return self._draw(st.lists(st.sampled_from(items), min_size=1, max_size=most, unique=True))
+        chosen = {self.whole(0, len(items) - 1) for _ in range(self.whole(1, most))}
+        return [items[number] for number in sorted(chosen)]
 
 
 def faults(
@@ -49,4 +54,8 @@ def faults(
     def fault(draw: st.DrawFn) -> Fault:
         return draw_fault(_Drawn(draw), ground(), allowed)
 
-    return st.lists(fault(), max_size=most).map(tuple)
+    @st.composite
+    def schedule(draw: st.DrawFn) -> tuple[Fault, ...]:
+        return tuple(draw(fault()) for _ in range(draw(st.integers(0, most))))
+
+    return schedule()

@@ -35,3 +35,12 @@ async def stubborn(node: Node) -> None:
         pass
     async for _ in node.gnss:
         await node.radio.broadcast(b"here")
+
+
+async def growing(node: Node) -> None:
+    """A beacon whose estimate is four times as far off with every fix."""
+    estimate_m = 1.0
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        estimate_m *= 4
+        node.report((estimate_m, 0.0), fix.covariance_m2)
