@@ -297,3 +297,23 @@ def test_an_average_is_not_drawn_to_a_state_beyond_the_gate() -> None:
         node.round(np.zeros(2), {"b": Share(0, (50.0, 0.0, 2.0), frozenset("a"), frozenset("a"))})
     assert node.mean_m == pytest.approx([0.0, 0.0])
     assert rejected == {"sums": 20}
+
+
+def test_who_gives_to_the_dead_keeps_the_mean_of_before() -> None:
+    nodes = {name: RatioConsensus(name) for name in "abc"}
+    rng = np.random.default_rng(1)
+    shares: dict[str, Share] = {}
+
+    def all_round(living: str) -> None:
+        nonlocal shares
+        heard = {name: {peer: share for peer, share in shares.items() if peer != name} for name in living}
+        inputs = {name: np.array([5.0, -3.0]) + 0.05 * rng.normal(size=2) for name in living}
+        shares = {name: nodes[name].round(inputs[name], heard[name]) for name in living}
+
+    for _ in range(80):
+        all_round("abc")
+    for _ in range(200):  # b and c are gone; a finds out after 20 rounds, and begins anew by itself
+        all_round("a")
+        mean = nodes["a"].mean_m
+        assert mean is not None
+        assert np.linalg.norm(mean - (5.0, -3.0)) < 0.6, mean

@@ -118,6 +118,10 @@ class Peers:
             self._hears_us[peer] = self._node in share.heard
 
 
+LEAST_SHARE = 0.3
+"""A ratio of a smaller share of the usual mass is not taken for the mean; the one before serves."""
+
+
 class RatioConsensus:
     """The consensus state of one node. Epoch 0 means: not taking part yet."""
 
@@ -139,15 +143,14 @@ class RatioConsensus:
         self._age = 0
         self._seen: dict[str, Array] = {}
         self._peers = Peers(node, self._config.silence_rounds)
-        self._old_mean: Array | None = None
-        self._old_rounds = 0
+        self._mean: Array | None = None
+        self._mean_rounds = 0  # since it was the ratio
+        self._usual_weight = 1.0
 
     @property
     def mean_m(self) -> Array | None:
         """The mean (2,) as far as it is known; None before the first has settled."""
-        if self.epoch and self._age >= self._config.settle_rounds:
-            return np.asarray(self._mass[:2] / self._mass[2])
-        return self._old_mean if self._old_rounds <= self._config.serve_rounds else None
+        return self._mean if self._mean_rounds <= self._config.serve_rounds else None
 
     @property
     def mass(self) -> Array:
@@ -163,6 +166,7 @@ class RatioConsensus:
         for peer in sorted(shares):
             self._take(peer, shares[peer])
         self._split()
+        self._divide()
         self._input = np.array(value, dtype=float)
         s_x, s_y, w = self._running_sum.tolist()
         return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
@@ -220,7 +224,6 @@ class RatioConsensus:
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
-        self._old_rounds += 1
         wanted = self._peers.mutual
         changed = wanted != self._takers or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
@@ -234,8 +237,6 @@ class RatioConsensus:
             self._age += 1
 
     def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
-        if self.epoch and self._age >= self._config.settle_rounds:
-            self._old_mean, self._old_rounds = self.mean_m, 0
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
         self._running_sum = np.zeros(3)
@@ -250,6 +251,22 @@ class RatioConsensus:
         total = np.array(share.running_sum)
         self._mass += total - self._seen.get(peer, 0.0)
         self._seen[peer] = total
+
+    def _divide(self) -> None:
+        """Take the ratio for the mean, where it can be trusted.
+
+        Whoever gives to peers that have died keeps next to nothing of what is usual, and changes of its input are
+        then too much for it.
+        """
+        self._mean_rounds += 1
+        if not self.epoch or self._age < self._config.settle_rounds:
+            return
+        weight = float(self._mass[2])
+        if self._age == self._config.settle_rounds:
+            self._usual_weight = weight
+        self._usual_weight += (weight - self._usual_weight) / self._config.silence_rounds
+        if weight >= LEAST_SHARE * self._usual_weight:
+            self._mean, self._mean_rounds = self._mass[:2] / weight, 0
 
     def _split(self) -> None:
         if self.epoch:
