@@ -8,18 +8,19 @@ one round of mean consensus, come together with the neighbours, and report. The 
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
+from agents.admission import Admission
 from agents.cooperative_frame import (
+    POSITION_LIMIT_M,
     RELAY_LIMIT,
     RELAYED,
     CooperativeFrame,
-    FrameError,
-    decode,
+    centimetres,
     encode,
     name_of_code,
     room,
@@ -28,9 +29,17 @@ from agents.cooperative_frame import (
 from agents.cooperative_options import Options
 from agents.sightings import Sightings
 from vnet import Fix, Node, Packet
-from vnet.cmm.consensus import AveragingConsensus, Consensus, DirectMean, RatioConsensus, Share
+from vnet.cmm.consensus import (
+    AveragingConsensus,
+    Consensus,
+    ConsensusConfig,
+    DirectMean,
+    RatioConsensus,
+    Share,
+)
 from vnet.cmm.fusion import Cloud, fuse
 from vnet.cmm.rbpf import Observation, Rbpf
+from vnet.cmm.robust import near_the_median
 from vnet.cmm.weights import (
     OptimizedWeights,
     constant_weights,
@@ -42,10 +51,11 @@ from vnet.cmm.weights import (
 from vnet.roads.lanes import Array, LaneMap
 
 NS_PER_S = 1_000_000_000
-STALE_PERIODS = 3
-EPOCHS_PER_PERIOD = 100
-"""More than a whole network could ever start in a period: a frame that claims it is absurd, and would spread."""
+SUMS_GATE_SIGMAS = 5.0
+"""Sums of the consensus that are further from one's own estimate, in deviations of the common error, are false."""
 CLOUD_REPORT_PARTICLES = 50
+CLOCK_FIXES = 10
+"""So many fixes a clock is judged by: after it has jumped ahead it is wrong for so long."""
 SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.85, 0.97
 """Shares of the period: within the first every vehicle sends, at the end of the second it computes."""
 
@@ -57,9 +67,9 @@ class Estimator:
         self, node_id: str, options: Options, lanes: LaneMap, rng: np.random.Generator, period_ns: int
     ) -> None:
         self.name = short_name(node_id)
-        self.rejected: Counter[str] = Counter()
+        self._admission = Admission(self.name, period_ns, options.two_frames)
         self.rbpf = Rbpf(options.filter_config(), lanes, rng)
-        self.consensus = _consensus(options, self.name)
+        self.consensus = _consensus(options, self.name, self.rejected)
         self.stacked_m = self.rbpf.estimate_m
         self.weights: dict[str, float] = {}
         """The latest fusion weights by node id, its own included."""
@@ -70,10 +80,8 @@ class Estimator:
         self._period_ns = period_ns
         self._since_fusion_s = 0.0
         self._now_ns = -period_ns
+        self._covariance_m2 = np.eye(2)
         self._frames: dict[str, CooperativeFrame] = {}
-        self._newest_ns: dict[str, int] = {}
-        self._early: list[tuple[str, CooperativeFrame]] = []
-        self._ids: dict[str, str] = {}
         self._sightings = Sightings(int(self.name, 16), period_ns)
         self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
@@ -81,54 +89,49 @@ class Estimator:
         self._said = self._estimate()
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
+    @property
+    def rejected(self) -> Counter[str]:
+        """What was not used of what others said, by reason."""
+        return self._admission.rejected
+
     def read(self, packets: Iterable[Packet], now_ns: int) -> None:
-        """Take in what the radio brought; what is not usable is counted by reason.
-
-        In real time a vehicle that is late with its work finds frames of the next period: they wait for it.
-        """
-        waiting, self._early = self._early, []
-        heard = []
-        for sender, frame in [*waiting, *self._decoded(packets)]:
-            if abs(now_ns - frame.fix_time_ns) > STALE_PERIODS * self._period_ns:
-                self.rejected["stale"] += 1
-            elif frame.epoch > EPOCHS_PER_PERIOD * (1 + now_ns // self._period_ns):
-                self.rejected["absurd"] += 1
-            elif frame.fix_time_ns <= self._newest_ns.get(sender, -1) and not self._options.two_frames:
-                self.rejected["old"] += 1
-            elif frame.fix_time_ns > now_ns - now_ns % self._period_ns:
-                self._early.append((sender, frame))
-            else:
-                self._newest_ns[sender] = frame.fix_time_ns
-                self._frames[sender] = frame
-                if self._is_neighbour(sender):
-                    heard.append((int(sender, 16), frame))
-        self._sightings.learn(heard)
-
-    def _decoded(self, packets: Iterable[Packet]) -> Iterator[tuple[str, CooperativeFrame]]:
-        for packet in packets:
-            sender = short_name(packet.sender)
-            self._ids[sender] = packet.sender
-            try:
-                yield sender, decode(packet.payload)
-            except FrameError as error:
-                self.rejected[str(error)] += 1
+        """Take in what the radio brought; what is not usable is counted by reason."""
+        admitted = dict(self._admission.admit(packets, now_ns))
+        heard = [(int(sender, 16), frame) for sender, frame in admitted.items() if self._is_neighbour(sender)]
+        forged = self._sightings.learn(heard)
+        for code in forged:
+            self.rejected["forged"] += 1
+            del admitted[name_of_code(code)]
+        self._frames |= admitted
 
     def _is_neighbour(self, sender: str) -> bool:
         return self._neighbours is None or sender in self._neighbours
 
     def filter(self, own: Fix) -> None:
         """Take all fixes that have come, up to the time of the vehicle's `own`."""
-        dt_s = (own.time_ns - self._now_ns) / NS_PER_S
+        dt_s = max(0, own.time_ns - self._now_ns) / NS_PER_S
         self._since_fusion_s += dt_s
-        self._now_ns = own.time_ns
+        self._now_ns = max(self._now_ns, own.time_ns)
         self._sightings.forget(own.time_ns - round(self.rbpf.config.memory_s * NS_PER_S))
-        observations = dict(self._sightings.observations(own.time_ns, own.covariance_m2))
-        observations[self.name] = Observation(own.position_m, own.covariance_m2, own.heading_rad)
+        if np.isfinite(own.covariance_m2).all():
+            self._covariance_m2 = own.covariance_m2
+        observations = dict(self._sightings.observations(own.time_ns, self._covariance_m2))
+        if usable(own):
+            observations[self.name] = Observation(own.position_m, own.covariance_m2, own.heading_rad)
         self.rbpf.step(dt_s, observations)
+
+    def position(self, own: Fix) -> tuple[Array, Array]:
+        """The vehicle's position (2,) and its covariance (2, 2); NaN as long as there is no fix to tell it from."""
+        if self.name in self.rbpf.vehicles:
+            return self.rbpf.position_m(self.name)
+        # The filter has forgotten a vehicle whose own fixes have been outliers for seconds.
+        return own.position_m - self.rbpf.estimate_m, own.covariance_m2 + self.rbpf.estimate_covariance_m2
 
     def agree(self) -> None:
         """A round of consensus, and of coming together, with those whose frames have come since the last."""
-        everybody, self._frames = dict(sorted(self._frames.items())), {}
+        # After standing still there are frames of before that: of senders that have been forgotten since.
+        fresh = {sender: frame for sender, frame in sorted(self._frames.items()) if sender in self._admission.ids}
+        everybody, self._frames = self._plausible(fresh), {}
         frames = {sender: frame for sender, frame in everybody.items() if self._is_neighbour(sender)}
         shares = everybody if self._options.consensus == "exact" else frames
         self._share = self.consensus.round(self.rbpf.estimate_m, {s: _share(f) for s, f in shares.items()})
@@ -144,13 +147,30 @@ class Estimator:
         if self._options.roads_apart:
             self.rbpf.weigh_roads()
 
+    def _plausible(self, frames: dict[str, CooperativeFrame]) -> dict[str, CooperativeFrame]:
+        """Without those whose estimate is not where most are; who they are is decided anew each period."""
+        if not frames or not self._options.defence:
+            return frames
+        inside = near_the_median(*self._said_by_all(frames), self._options.common_sigma_m)[1:].tolist()
+        if all(inside):
+            return frames
+        self.rejected["outlier"] += inside.count(False)
+        return {sender: frame for (sender, frame), good in zip(frames.items(), inside, strict=True) if good}
+
+    def _said_by_all(self, frames: Mapping[str, CooperativeFrame]) -> tuple[Array, Array]:
+        """Estimates (1 + n, 2) and covariances (1 + n, 2, 2) as they were said, the vehicle's own first."""
+        estimates = np.array([self._said[0], *(frame.estimate_m for frame in frames.values())])
+        return estimates, np.array([self._said[1], *(frame.covariance_m2 for frame in frames.values())])
+
     def _come_together(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         """Fuse with the neighbours; returns the estimate (2,) right afterwards.
 
         What they say is a period old, and is held against what this vehicle said then.
         """
         weights = self._weigh(frames)
-        self.weights = dict(zip([self._node_id, *(self._ids[s] for s in frames)], weights.tolist(), strict=True))
+        self.weights = dict(
+            zip([self._node_id, *(self._admission.ids[s] for s in frames)], weights.tolist(), strict=True)
+        )
         if self._options.exchange == "particles":
             known = [
                 frame.names_heard | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
@@ -181,8 +201,7 @@ class Estimator:
                 return self._optimize(frames)
 
     def _optimize(self, frames: Mapping[str, CooperativeFrame]) -> Array:
-        estimates = np.array([self._said[0], *(frame.estimate_m for frame in frames.values())])
-        covariances = np.array([self._said[1], *(frame.covariance_m2 for frame in frames.values())])
+        estimates, covariances = self._said_by_all(frames)
         mean = self.consensus.mean_m
         return self._optimized.solve(estimates, covariances, estimates.mean(axis=0) if mean is None else mean)
 
@@ -192,6 +211,12 @@ class Estimator:
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
+        frame = self.compose(fix, max_payload)
+        self._admission.said(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
+        return encode(frame)
+
+    def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
+        """The frame with the newest fix, as long as `max_payload` bytes allow."""
         share = self._share
         self._said = self._estimate()
         heard = {name: name in share.takers for name in sorted(share.heard)[:255]}
@@ -199,7 +224,7 @@ class Estimator:
         mixes = self._options.exchange == "particles" and self._options.fusion != "none"
         count = min(self._options.particles, left // 4) if mixes else 0
         most = min(RELAY_LIMIT, (left - 4 * count) // RELAYED.itemsize) if self._options.relay else 0
-        frame = CooperativeFrame(
+        return CooperativeFrame(
             fix.time_ns,
             fix.position_m,
             fix.heading_rad,
@@ -210,18 +235,26 @@ class Estimator:
             self.rbpf.sample(count),
             self._sightings.freshest(fix.time_ns, most),
             min(self._largest_degree, 255),
+            self.name,
         )
-        return encode(frame)
 
 
-def _consensus(options: Options, name: str) -> Consensus:
+def _consensus(options: Options, name: str, rejected: Counter[str]) -> Consensus:
+    gate_m = SUMS_GATE_SIGMAS * max(1.0, options.common_sigma_m) if options.defence else np.inf
+    config = ConsensusConfig(gate_m=gate_m)
     match options.consensus:
         case "ratio":
-            return RatioConsensus(name)
+            return RatioConsensus(name, config, rejected)
         case "exact":
             return DirectMean(current=options.two_frames)
         case rule:
-            return AveragingConsensus(name, rule)
+            return AveragingConsensus(name, rule, config, rejected)
+
+
+def usable(fix: Fix) -> bool:
+    """Whether a fix can be filtered, and said in a frame: receivers fail, too."""
+    numbers = [*fix.position_m, *fix.covariance_m2.ravel(), fix.heading_rad or 0.0]
+    return bool(np.isfinite(numbers).all() and np.abs(fix.position_m).max() <= POSITION_LIMIT_M)
 
 
 def _share(frame: CooperativeFrame) -> Share:
@@ -231,37 +264,70 @@ def _share(frame: CooperativeFrame) -> Share:
 async def main(node: Node) -> None:
     """Cooperate until the run ends."""
     options = Options.parse(node.options)
-    estimator = Estimator(node.id, options, node.map, node.rng, node.period_ns)
+    await cooperate(node, options, Estimator(node.id, options, node.map, node.rng, node.period_ns))
+
+
+async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
+    """The vehicle's loop around its `estimator`, until the run ends."""
     periods_a_second = max(1, NS_PER_S // node.period_ns)
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
+    clock = _GnssClock(node)
     async for fix in node.gnss:
-        await _sleep_until(node, fix.time_ns + slot_ns)
-        estimator.read(node.radio.drain(), node.now_ns)
-        payload = estimator.frame(fix, node.radio.max_payload)
-        await node.radio.broadcast(payload)
-        await _sleep_until(node, fix.time_ns + round(LISTENING_SHARE * node.period_ns))
+        # After standing still a vehicle goes on from the newest fix: nobody wants what it saw meanwhile.
+        fix = (node.gnss.drain() or [fix])[-1]
+        clock.set_by(fix)
+        await clock.sleep_until(fix.time_ns + slot_ns)
+        estimator.read(node.radio.drain(), clock.now_ns)
+        payload = b""
+        if usable(fix):
+            payload = estimator.frame(fix, node.radio.max_payload)
+            await node.radio.broadcast(payload)
+        await clock.sleep_until(fix.time_ns + round(LISTENING_SHARE * node.period_ns))
         packets = node.radio.drain()
-        estimator.read(packets, node.now_ns)
+        estimator.read(packets, clock.now_ns)
         estimator.filter(fix)
-        if options.two_frames:
+        if options.two_frames and usable(fix):
             await node.radio.broadcast(estimator.frame(fix, node.radio.max_payload))
-            await _sleep_until(node, fix.time_ns + round(REPORTING_SHARE * node.period_ns))
-            estimator.read(node.radio.drain(), node.now_ns)
+            await clock.sleep_until(fix.time_ns + round(REPORTING_SHARE * node.period_ns))
+            estimator.read(node.radio.drain(), clock.now_ns)
         estimator.agree()
         in_full = (fix.time_ns // node.period_ns) % periods_a_second == 0
-        _report(node, estimator, len(packets), len(payload), in_full)
+        _report(node, estimator, fix, len(packets), len(payload), in_full)
 
 
-async def _sleep_until(node: Node, time_ns: int) -> None:
-    if time_ns > node.now_ns:
-        await asyncio.sleep((time_ns - node.now_ns) / NS_PER_S)
+class _GnssClock:
+    """GNSS time, kept by the vehicle's own clock, which may be wrong.
+
+    A fix is met at its time or later: the least that the clock was ahead of the last fixes is its error.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._ahead_ns: deque[int] = deque(maxlen=CLOCK_FIXES)
+
+    def set_by(self, fix: Fix) -> None:
+        """Take note of a fix that has just come."""
+        self._ahead_ns.append(self._node.now_ns - fix.time_ns)
+
+    @property
+    def now_ns(self) -> int:
+        """GNSS time in nanoseconds."""
+        return self._node.now_ns - min(self._ahead_ns)
+
+    async def sleep_until(self, time_ns: int) -> None:
+        """Sleep until this GNSS time."""
+        if time_ns > self.now_ns:
+            await asyncio.sleep((time_ns - self.now_ns) / NS_PER_S)
 
 
-def _report(node: Node, estimator: Estimator, heard: int, size: int, in_full: bool) -> None:
-    """Report the position, and what the metrics know of the common error; once a second cloud and weights too."""
+def _report(node: Node, estimator: Estimator, fix: Fix, heard: int, size: int, in_full: bool) -> None:
+    """Report the position, and what the metrics know of the common error.
+
+    Once a second also the cloud, the weights, and what has been rejected so far by reason.
+    """
     rbpf = estimator.rbpf
-    position_m, covariance_m2 = rbpf.position_m(estimator.name)
+    position_m, covariance_m2 = estimator.position(fix)
     values: dict[str, Any] = {
         "common_error_m": rbpf.estimate_m,
         "common_error_covariance_m2": rbpf.estimate_covariance_m2,
@@ -277,4 +343,8 @@ def _report(node: Node, estimator: Estimator, heard: int, size: int, in_full: bo
     if in_full:
         values["cloud_m"] = rbpf.sample(min(CLOUD_REPORT_PARTICLES, rbpf.config.particles))
         values |= {f"weight.{other}": weight for other, weight in estimator.weights.items()}
-    node.report(position_m, covariance_m2, **values)
+        values |= {f"rejected.{reason}": count for reason, count in estimator.rejected.items()}
+    if np.isfinite(position_m).all():
+        node.report(position_m, covariance_m2, **values)
+    else:
+        node.report(**values)

@@ -15,6 +15,8 @@ from vnet.errors import ProgramError
 FUSIONS = ("optimized", "random", "metropolis", "max-degree", "constant", "none")
 EXCHANGES = ("estimates", "particles")
 CONSENSUSES = ("ratio", *AVERAGING_RULES, "exact")
+LEAST_LOG_ROAD = -6.0
+"""What a road says at worst against a hypothesis, so that one vehicle cannot outvote all others."""
 PROFILES: dict[str, dict[str, Any]] = {
     "default": {},
     # The paper's, from its published runs (MODEL 7): a loose random walk, its 0.5 m a step of 0.1 s read as uniform
@@ -32,6 +34,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "fusion_interval_s": 0.1,
         "ridge_m2": 1e-4,
         "start_sigma_m": 0.1,
+        "defence": False,
     },
 }
 
@@ -48,7 +51,8 @@ class Options:
     all in place of each estimate's variance. `common_walk_m` > 0 is a random walk of so much a √s in place of the
     Gauss-Markov process. `start_m` and `start_sigma_m` (if positive) say where the cloud starts. The paper's are
     `one_sided`, `roads_apart` (roads weigh the particles after stacking, all and each time anew) and `two_frames`
-    (estimates follow in a frame of their own, once the fixes have been filtered).
+    (estimates follow in a frame of their own, once the fixes have been filtered). `defence`: what contradicts the
+    majority is left out (docs/estimator.md).
     """
 
     profile: str = "default"
@@ -72,6 +76,7 @@ class Options:
     two_frames: bool = False
     hears: dict[str, list[str]] = field(default_factory=dict)
     slots: int = 2
+    defence: bool = True
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
@@ -140,6 +145,7 @@ class Options:
             start_sigma_m=self.start_sigma_m or None,
             one_sided=self.one_sided,
             roads_apart=self.roads_apart,
+            least_log_road=LEAST_LOG_ROAD if self.defence else -math.inf,
         )
 
 

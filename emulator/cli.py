@@ -22,12 +22,12 @@ from rich.console import Console
 from emulator.experiments.cli import app as experiment_app
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
-from emulator.observe.checks import check_run
+from emulator.observe.checks import check_run, recorded_verdict
 from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
 from emulator.observe.summary import print_checks, print_summary
 from emulator.run.attachment import LiveOptions
-from emulator.run.conclude import conclude
+from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
 from emulator.run.live import run_live
@@ -93,6 +93,9 @@ TlsNameOption = Annotated[
     ),
 ]
 RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
+DeterminismOption = Annotated[
+    bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
+]
 
 
 @app.command()
@@ -105,6 +108,7 @@ def run(
     out: OutOption = None,
     overrides: SetOption = None,
     rerun: RerunOption = Rerun.OFF,
+    check_determinism: DeterminismOption = False,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
@@ -112,6 +116,8 @@ def run(
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
     with one_line_errors():
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
+        if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
+            raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
         world = build_world(loaded)
         access = _create_access(loaded, world)
@@ -120,7 +126,8 @@ def run(
             if router is RouterKind.SEPARATE:
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
-            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, LiveOptions(access, router=separate))
+            options = LiveOptions(access, router=separate)
+            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, check_determinism)
 
 
 @app.command()
@@ -132,6 +139,7 @@ def simulate(
     out: OutOption = None,
     overrides: SetOption = None,
     rerun: RerunOption = Rerun.OFF,
+    check_determinism: DeterminismOption = False,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
@@ -144,7 +152,7 @@ def simulate(
                 _record_here(emulation, stack)
             stack.enter_context(ProgressLine(emulation))
             wall_s, interrupted = run_simulation(emulation)
-        _finish(emulation, wall_s, interrupted, "simulate")
+        _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
 
 
 def _record_here(emulation: Emulation, stack: ExitStack) -> None:
@@ -219,7 +227,7 @@ def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's fo
     """Judge a run again, from its files alone."""
     with one_line_errors():
         judgement = check_run(folder)
-        print_checks(judgement, Console())
+        print_checks(judgement, Console(), recorded_verdict(folder)["reproduce"])
         raise typer.Exit(judgement.exit_status)
 
 
@@ -235,6 +243,34 @@ def analyze(
 
     with one_line_errors():
         Console().print(analysis_table(analyze_scenario(_load(scenario, overrides), run)))
+
+
+@app.command()
+def campaign(
+    scenario: ScenarioArgument,
+    runs: Annotated[int, typer.Option(min=1, help="How many runs.")] = 200,
+    faults: Annotated[str, typer.Option(help="random, or the kinds to draw from: kill,partition.")] = "random",
+    program: ProgramOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the campaign's files.")] = None,
+    overrides: SetOption = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at once; as many as there are cores.")] = None,
+    shrink_steps: Annotated[int, typer.Option(min=0, max=50, help="Runs to shrink a failure with.")] = 50,
+    time_limit: Annotated[float, typer.Option(min=1.0, help="Wall-clock seconds a run may take.")] = 300.0,
+) -> None:
+    """Run a scenario many times under random faults; shrink what fails; a matrix of faults and checks."""
+    fix_hash_seed("emulator.cli")
+    from emulator.testing.campaign import Plan, run_campaign
+
+    with one_line_errors():
+        sys.path.append(str(Path.cwd()))
+        loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        options = {"jobs": jobs} if jobs else {}
+        plan = Plan.of(
+            loaded, faults, runs, loaded.run.seed, limit_s=time_limit, shrink_steps=shrink_steps, **options
+        )
+        raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))
 
 
 @app.command()
@@ -292,7 +328,14 @@ def _load_or_create_access(scenario: Scenario, world: World, folder: Path, liste
     return access
 
 
-def _run_live(scenario: Scenario, world: World, folder: RunFolder, rerun: Rerun, options: LiveOptions) -> None:
+def _run_live(
+    scenario: Scenario,
+    world: World,
+    folder: RunFolder,
+    rerun: Rerun,
+    options: LiveOptions,
+    check_determinism: bool = False,
+) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
@@ -300,7 +343,7 @@ def _run_live(scenario: Scenario, world: World, folder: RunFolder, rerun: Rerun,
         options = replace(options, record=folder.path / "recording.rrd")
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
-    _finish(emulation, wall_s, interrupted, "run")
+    _finish(emulation, wall_s, interrupted, "run", check_determinism)
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:
@@ -310,8 +353,10 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
-def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str) -> None:
+def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str, check_determinism: bool) -> None:
     judgement, verdict = conclude(emulation, wall_s, command)
+    if check_determinism and not interrupted:
+        verdict = run_again(emulation, judgement, verdict, command)
     print_summary(judgement, verdict, emulation.folder.path, Console())
     raise typer.Exit(130 if interrupted else judgement.exit_status)
 

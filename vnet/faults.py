@@ -183,14 +183,14 @@ class Throttle(_NodeFault):
     """The nodes send at `bitrate_mbps` only; their queues fill."""
 
     kind: Literal["throttle"]
-    bitrate_mbps: float = Field(gt=0)
+    bitrate_mbps: float = Field(ge=1e-4, le=1e6)
 
 
 class Range(_NodeFault):
     """The nodes hear and are heard up to `range_m` only."""
 
     kind: Literal["range"]
-    range_m: float = Field(gt=0)
+    range_m: float = Field(gt=0, le=1e9)
 
 
 class Swizzle(_NodeFault):

@@ -100,6 +100,11 @@ class FaultPlan:
         known = ", ".join(planned.label for planned in self.faults) or "none"
         raise ScenarioError(f"no fault {label!r}; there are: {known}")
 
+    @property
+    def last_end_ns(self) -> int:
+        """By when all faults of the plan, as they are written, have healed."""
+        return max((max(planned.end_ns, planned.start_ns + 1) for planned in self.faults), default=0)
+
     def next_change_ns(self, after_ns: int) -> int | None:
         """When next, after this instant, a fault starts or ends (a swizzle: or a node of it comes or goes)."""
         changes = (t for planned in self.faults for t in _changes(planned, self._seed))

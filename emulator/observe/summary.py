@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ _FIGURES = {
 
 def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console) -> None:
     """The whole summary of a run that has just ended."""
-    print_checks(judgement, console)
+    print_checks(judgement, console, verdict["reproduce"])
     console.print(_figures(verdict))
     console.print(_frames(verdict["frames_by_outcome"]))
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
@@ -47,8 +48,8 @@ def as_typed(command: str) -> str:
     return f"{program} {rest}"
 
 
-def print_checks(judgement: Judgement, console: Console) -> None:
-    """The verdict and its checks."""
+def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None:
+    """The verdict and its checks; of those that failed the offending rows, and how to have them again."""
     table = Table(
         title=Text(f"verdict: {judgement.verdict}", style=_STYLE[judgement.verdict]), title_justify="left"
     )
@@ -57,12 +58,42 @@ def print_checks(judgement: Judgement, console: Console) -> None:
     table.add_column("what was seen", overflow="fold")
     for check in judgement.checks:
         table.add_row(check.name, Text(check.verdict.value, style=_STYLE[check.verdict]), Text(check.text))
-    for skipped in judgement.not_exercised:
-        table.add_row(skipped.name, Text("left out", style="dim"), Text(skipped.reason, style="dim"))
     console.print(table)
+    for reason, names in _left_out(judgement).items():
+        console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
+        if rows := check.figures.get("rows"):
+            console.print(_offending(check.name, rows))
+    if judgement.verdict is Verdict.INVALID:
+        console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
+
+
+def _left_out(judgement: Judgement) -> dict[str, list[str]]:
+    """What could not be exercised, by reason."""
+    names: dict[str, list[str]] = {}
+    for left in judgement.not_exercised:
+        names.setdefault(left.reason, []).append(left.name)
+    return names
+
+
+def _offending(name: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """The rows that a failed check holds against the run."""
+    title = Text(f"{name}: the first offending rows", style="bold red")
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
+    columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(_cell(row.get(column))) for column in columns))
+    return table
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "" if value is None else str(value)
 
 
 def _print_details(figures: dict[str, Any], console: Console) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import platform
 import shlex
+import subprocess
+import sys
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
@@ -12,7 +14,9 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from emulator.channel.outcomes import Outcome
-from emulator.observe.checks import Evidence, Judgement, judge
+from emulator.observe.checks import Evidence, Judgement, Verdict, judge
+from emulator.observe.checks.replay import AGAIN, check_replay
+from emulator.observe.checks.verdicts import Finding, unknown
 from emulator.observe.metrics import summarize
 from emulator.run.emulation import Emulation
 
@@ -42,9 +46,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events))
     verdict = {
         "format": FORMAT,
-        "verdict": judgement.verdict.value,
-        "checks": [asdict(check) for check in judgement.checks],
-        "not_exercised": [asdict(check) for check in judgement.not_exercised],
+        **_judged(judgement),
         "trace_sha256": judgement.trace_sha256,
         "metrics_sha256": emulation.metrics.sha256(),
         "emulated_s": emulated_s,
@@ -64,3 +66,29 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     }
     folder.put_json("verdict.json", verdict)
     return judgement, verdict
+
+
+def _judged(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "verdict": judgement.verdict.value,
+        "checks": [asdict(check) for check in judgement.checks],
+        "not_exercised": [asdict(check) for check in judgement.not_exercised],
+    }
+
+
+def run_again(emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str) -> dict[str, Any]:
+    """Have a concluded run once more, in processes of its own, and add to its verdict how the two compare.
+
+    Returns the new contents of verdict.json.
+    """
+    path = emulation.folder.path
+    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN)]
+    # A process of its own: nothing that a program has left in this one may help it to agree with itself.
+    done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
+    finding: Finding = check_replay(path)
+    if done.returncode not in {each.exit_status for each in Verdict}:
+        finding = unknown("replay", f"the second run ended with status {done.returncode}")
+    judgement.put(finding)
+    verdict = {**verdict, **_judged(judgement), "reproduce": f"{verdict['reproduce']} --check-determinism"}
+    emulation.folder.put_json("verdict.json", verdict)
+    return verdict

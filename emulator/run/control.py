@@ -1,7 +1,8 @@
 """Control of a running emulator: queries on `control/{verb}`, answered by the run itself.
 
 `status`, `inject` (a fault as JSON) and `heal` (a fault's name, or `all`). What is wrong with a query comes back as
-one line of error. A run leaves the operator's way in, `control.json` (0600), in its folder for as long as it lasts.
+one line of error. A run leaves the operator's way in, `control.json` and the credentials in `operator.json` (both
+0600), in its folder for as long as it lasts.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from vnet.link.access import OPERATOR, Access, Credentials, write_private
 from vnet.link.session import open_client
 
 CONTROL_FILE = "control.json"
+OPERATOR_FILE = "operator.json"
 LARGEST_QUERY_BYTES = 1 << 20
 LEASE_MS = 10_000
 ANSWER_TIMEOUT_S = 10.0
@@ -43,7 +45,7 @@ def answer(emulation: Emulation, verb: str, payload: bytes, now_ns: int, own_rou
                 raise ScenarioError(f"heal: {label!r} is no name of a fault")
             return {"healed": _heal(emulation, label, now_ns)}
         case _:
-            raise VnetError(f"control/{verb}: unknown; there are status, inject, heal")
+            raise VnetError(f"control/{verb[:40]}: unknown; there are status, inject, heal")
 
 
 def _heal(emulation: Emulation, label: str, now_ns: int) -> list[str]:
@@ -90,18 +92,18 @@ def _described(planned: PlannedFault, emulation: Emulation, now_ns: int) -> dict
 @contextmanager
 def way_in(folder: Path, endpoint: str, access: Access) -> Iterator[None]:
     """Keep `control.json` in the run's folder for as long as the block lasts."""
-    login = access.credentials(OPERATOR)
     path = folder / CONTROL_FILE
-    data = {"endpoint": endpoint, "run": access.run, "user": login.user, "password": login.password}
     try:
-        write_private(path, json.dumps(data) + "\n")
+        write_private(folder / OPERATOR_FILE, access.credentials(OPERATOR).dumps())
+        write_private(path, json.dumps({"endpoint": endpoint, "run": access.run}) + "\n")
     except OSError as error:
         raise VnetError(f"{path}: cannot write: {error.strerror}") from None
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):
-            path.unlink()
+        for left in (path, folder / OPERATOR_FILE):
+            with contextlib.suppress(OSError):
+                left.unlink()
 
 
 def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
@@ -109,11 +111,12 @@ def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
     path = folder / CONTROL_FILE
     try:
         data = json.loads(path.read_text())
-        endpoint, run, login = data["endpoint"], data["run"], Credentials(data["user"], data["password"])
+        endpoint, run = str(data["endpoint"]), str(data["run"])
     except OSError:
         raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)") from None
     except (ValueError, KeyError, TypeError):
         raise VnetError(f"{path}: not what a run writes") from None
+    login = Credentials.load(folder / OPERATOR_FILE)
     with open_client(endpoint, login, LEASE_MS) as session:
         replies = session.get(
             keys.control(run, verb), payload=json.dumps(payload).encode(), timeout=ANSWER_TIMEOUT_S

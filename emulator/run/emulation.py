@@ -236,15 +236,27 @@ class Emulation:
         self._change_plan()
         return planned
 
+    def end_at(self, time_ns: int) -> None:
+        """Let the run end at `time_ns`, by when all faults have healed, and write that down so that it replays."""
+        healed_ns = self.faults.last_end_ns
+        assert healed_ns <= time_ns <= self.duration_ns, (healed_ns, time_ns, self.duration_ns)
+        run = self.scenario.run
+        settle_s = min(run.settle_s, (time_ns - healed_ns) / NS_PER_S)
+        shorter = run.model_copy(update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s})
+        self._rewrite(self.scenario.model_copy(update={"run": shorter}))
+
     def _change_plan(self) -> None:
         self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
-        self.scenario = self.scenario.model_copy(update={"fault": self.faults.as_written()})
-        text = dump_scenario(self.scenario)
+        self._rewrite(self.scenario.model_copy(update={"fault": self.faults.as_written()}))
+
+    def _rewrite(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        text = dump_scenario(scenario)
         self.folder.put("scenario.toml", lambda path: write_text(path, text))
 
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
-        self._close_periods(time_ns)
+        self.close_periods(time_ns)
         deliveries = self.engine.advance(time_ns)
         self._delivered.extend(deliveries)
         return deliveries
@@ -258,10 +270,11 @@ class Emulation:
         """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once."""
         if not self._finished:
             self._finished = True
-            self._close_periods(time_ns)
+            self.close_periods(time_ns)
             self.engine.drain()
 
-    def _close_periods(self, time_ns: int) -> None:
+    def close_periods(self, time_ns: int) -> None:
+        """Record the periods that end by then; nobody has anything more to report of them."""
         while (self._period + 1) * self.world.period_ns <= time_ns:
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))

@@ -11,9 +11,10 @@ import gc
 import json
 import os
 import signal
+import threading
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import ExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -52,13 +53,32 @@ REALTIME_AGENT_NICE = 5
 SCENE_EVERY_PERIODS = 50
 
 
+CHILDREN_POLL_S = 0.05
+"""How often ended processes are looked for where no signal tells of them."""
+
+Gate = Callable[[Lockstep], Awaitable[None]]
+"""Sets the barrier's horizon: called before time 0, and whenever the run is held there."""
+
+
 class Stalled(Exception):
     """The run cannot go on: it ends with verdict unknown."""
+
+
+async def _open(lockstep: Lockstep) -> None:
+    """A gate that holds nothing."""
+
+
+def _gets_signals() -> bool:
+    """Whether this thread is the one that Python gives signals to."""
+    return threading.current_thread() is threading.main_thread()
 
 
 @asynccontextmanager
 async def _interruptible() -> AsyncIterator[None]:
     """Ctrl-C and SIGTERM cancel the block, once; asyncio's own handling would do so less cleanly."""
+    if not _gets_signals():
+        yield
+        return
     loop = asyncio.get_running_loop()
     task = asyncio.current_task()
     assert task is not None
@@ -76,10 +96,12 @@ async def run_live(
     emulation: Emulation,
     options: LiveOptions,
     on_state: Callable[[str], None] = lambda text: None,
+    gate: Gate = _open,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end over Zenoh; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C and SIGTERM end the run early, with the event `interrupted`. Raises VnetError if it cannot start.
+    `gate` holds a run in lockstep.
     """
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
@@ -87,7 +109,7 @@ async def run_live(
         async with _interruptible():
             if options.router is not None:
                 options.router.start(launcher)
-            run = LiveRun(emulation, options, launcher)
+            run = LiveRun(emulation, options, launcher, gate)
             stack.callback(run.close)
             stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access))
             return await run.run(on_state)
@@ -104,10 +126,11 @@ def _lease_ms(scenario: Scenario) -> int:
 class LiveRun:
     """One live run: its attachment, its processes and its pacing."""
 
-    def __init__(self, emulation: Emulation, options: LiveOptions, launcher: Launcher) -> None:
+    def __init__(self, emulation: Emulation, options: LiveOptions, launcher: Launcher, gate: Gate = _open) -> None:
         self._emulation = emulation
         self._options = options
         self._launcher = launcher
+        self._gate = gate
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
         self._realtime = emulation.scenario.run.pacing == "realtime"
@@ -228,6 +251,18 @@ class LiveRun:
 
     # Processes that end, or whose connection does.
 
+    def _watch_children(self) -> Callable[[], object]:
+        """Have `_children_ended` called from now on; returns what ends that."""
+        if _gets_signals():
+            self._loop.add_signal_handler(signal.SIGCHLD, self._children_ended)
+            return lambda: self._loop.remove_signal_handler(signal.SIGCHLD)
+        return self._loop.create_task(self._poll_children()).cancel
+
+    async def _poll_children(self) -> None:
+        while True:
+            self._children_ended()
+            await asyncio.sleep(CHILDREN_POLL_S)
+
     def _children_ended(self) -> None:
         for name, how in self._launcher.ended().items():
             self._loop.call_later(DEATH_GRACE_S, self._process_ended, name, how)
@@ -262,7 +297,7 @@ class LiveRun:
 
     async def run(self, on_state: Callable[[str], None]) -> tuple[float, bool]:
         """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
-        self._loop.add_signal_handler(signal.SIGCHLD, self._children_ended)
+        watching = self._watch_children()
         folder = self._emulation.folder
         started = time.monotonic()
         patience_s = 0.5
@@ -289,7 +324,7 @@ class LiveRun:
             self._memory.write(folder, self._time_ns())
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
-            self._loop.remove_signal_handler(signal.SIGCHLD)
+            watching()
             self._over = True
         return wall_s, interrupted
 
@@ -355,6 +390,7 @@ class LiveRun:
             await self._run_realtime(realtime)
 
     async def _run_lockstep(self, lockstep: Lockstep) -> None:
+        await self._gate(lockstep)
         grants = lockstep.start()
         while grants:
             for actions in lockstep.take_actions():
@@ -363,6 +399,9 @@ class LiveRun:
                 self._link.send(lead, grant)
             await self._all_yielded(lockstep)
             grants = lockstep.step()
+            while lockstep.held:
+                await self._gate(lockstep)
+                grants = lockstep.step()
         for lead in sorted(self._dead):
             lockstep.died(lead, **self._dead[lead])
 
@@ -462,6 +501,7 @@ class LiveRun:
             leads -= self._paused  # they cannot answer, and have time until they go on
         await self._all_answer(sorted(leads), patience_s)
         self._restarting = False
+        self._emulation.folder.event(self._time_ns(), f"{fault.kind}ed", None, down_s=fault.down_s)
 
     async def _all_answer(self, leads: Sequence[str], patience_s: float) -> None:
         """Wait until each process has answered: only then do messages pass in both directions again."""

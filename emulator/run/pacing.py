@@ -63,6 +63,9 @@ class Lockstep:
 
     Processes come and go with faults: `hosts_all` says that one process outlives them (a simulation), and that its
     driver stops and starts programs within it.
+
+    With a `horizon_ns` the run is `held` before anything happens at or after that instant: `step` returns none, and
+    goes on when it is called with a later horizon.
     """
 
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], hosts_all: bool = False) -> None:
@@ -75,6 +78,8 @@ class Lockstep:
         self._woken: set[str] = set()
         self.owed: dict[str, int] = {}
         self.now_ns = 0
+        self.horizon_ns: int | None = None
+        self.held = False
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
@@ -112,7 +117,7 @@ class Lockstep:
             self._emulation.died(self.now_ns, node, **details)
 
     def step(self) -> dict[str, wire.Grant]:
-        """Do what was yielded, go to the next instant, and say who is granted it; none at the end."""
+        """Do what was yielded, go to the next instant, and say who is granted it; none at the end, or if held."""
         assert not self.owed, self.owed
         emulation = self._emulation
         emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
@@ -126,6 +131,8 @@ class Lockstep:
             wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
             fault_ns = emulation.next_fault_ns()
+            if self._hold(next_ns if fault_ns is None else min(next_ns, fault_ns)):
+                return {}
             if fault_ns is None or fault_ns > next_ns or fault_ns >= emulation.duration_ns:
                 break
             self._act(fault_ns)
@@ -135,6 +142,14 @@ class Lockstep:
         self.now_ns = next_ns
         self._collect_packets(next_ns)
         return self._grant([lead for lead, wake in wakes.items() if wake == next_ns])
+
+    def _hold(self, next_ns: int) -> bool:
+        """Whether what comes next lies beyond the horizon; all that lies before it is then done and recorded."""
+        self.held = self.horizon_ns is not None and next_ns >= self.horizon_ns
+        if self.horizon_ns is not None and self.held:
+            self._collect_packets(self.horizon_ns - 1)
+            self._emulation.close_periods(self.horizon_ns)
+        return self.held
 
     def _act(self, time_ns: int) -> None:
         """Let faults act: after all that came before this instant, and before anything that happens at it."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from emulator.run.emulation import Emulation, ProcessActions
 from emulator.run.pacing import Lockstep
@@ -23,12 +23,13 @@ class _RunOverError(Exception):
     """The barrier has granted nothing more."""
 
 
-def simulate(emulation: Emulation) -> tuple[float, bool]:
+def simulate(emulation: Emulation, gate: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C ends the run early, with the event `interrupted`. Raises ProgramError if the program cannot be loaded.
+    `gate` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     """
-    simulation = _Simulation(emulation)
+    simulation = _Simulation(emulation, gate)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
@@ -44,11 +45,12 @@ def simulate(emulation: Emulation) -> tuple[float, bool]:
 class _Simulation:
     """All nodes on one loop, and the barrier that this loop yields to."""
 
-    def __init__(self, emulation: Emulation) -> None:
+    def __init__(self, emulation: Emulation, gate: Callable[[Lockstep], None] | None) -> None:
         node_ids = emulation.world.node_ids
         self._lead = node_ids[0]
         self._emulation = emulation
         self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
+        self._gate = gate or (lambda lockstep: None)
         self._seq = 0
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
@@ -60,6 +62,7 @@ class _Simulation:
         asyncio.set_event_loop(self.loop)
         try:
             self._host.start(self.loop, self._programs)
+            self._gate(self._lockstep)
             self.loop.start_at(self._take(self._lockstep.start()))
             while True:
                 try:
@@ -74,7 +77,11 @@ class _Simulation:
 
     def _exchange(self, next_timer_ns: int | None) -> int:
         self._lockstep.receive(self._lead, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
-        return self._take(self._lockstep.step())
+        grants = self._lockstep.step()
+        while self._lockstep.held:
+            self._gate(self._lockstep)
+            grants = self._lockstep.step()
+        return self._take(grants)
 
     def _take(self, grants: dict[str, wire.Grant]) -> int:
         if not grants:

@@ -1,6 +1,8 @@
 """Running-sum consensus: mass is neither made nor lost, whatever the radio and the vehicles do."""
 
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -245,3 +247,53 @@ def test_loss_moves_the_mean_of_averaging_which_is_why_running_sums_are_the_defa
 def test_averaging_refuses_another_rule() -> None:
     with pytest.raises(VnetError, match="averaging rule 'exact': allowed: metropolis, max-degree"):
         AveragingConsensus("a", "exact")
+
+
+Lie = Callable[[int, Share], Share]
+
+
+def deceived(count: int, lie: Lie, hears: Hears = lambda *_: True) -> tuple[Net, list[Counter[str]]]:
+    """A net of `count` after 400 rounds in which what node 0 says has been changed by `lie` of the round."""
+    rejected = [Counter[str]() for _ in range(count)]
+    inputs = np.random.default_rng(2).normal(size=(count, 2))
+    net = Net(inputs, hears, ConsensusConfig(gate_m=15.0))
+    net.nodes = {i: RatioConsensus(f"n{i:02d}", net.config, rejected[i]) for i in range(count)}
+    for turn in range(400):
+        net.run(1)
+        net.said[0] = lie(turn, net.said[0])
+    return net, rejected
+
+
+def agreed_without_the_first(net: Net) -> None:
+    expected = net.inputs[1:].mean(axis=0)
+    for node in list(net.nodes.values())[1:]:
+        assert node.mean_m == pytest.approx(expected, abs=1e-3)
+
+
+def test_false_sums_are_not_taken_and_who_says_them_is_left_out() -> None:
+    def lie(turn: int, share: Share) -> Share:
+        s_x, s_y, w = share.running_sum
+        return replace(share, running_sum=(s_x + 50 * w, s_y, w))
+
+    net, rejected = deceived(8, lie)
+    agreed_without_the_first(net)
+    assert all(set(counts) == {"sums", "exile"} and counts["sums"] <= 4 for counts in rejected[1:])
+
+
+def test_a_peer_that_starts_epoch_after_epoch_is_left_out_and_not_those_who_took_them_over() -> None:
+    def lie(turn: int, share: Share) -> Share:
+        return replace(share, epoch=share.epoch + 1) if turn > 50 else share
+
+    net, rejected = deceived(6, lie, lambda _, j, i: abs(i - j) <= 2)
+    agreed_without_the_first(net)
+    assert all(set(counts) == {"exile"} for counts in rejected[1:3])
+    assert max(net.epochs()) <= 20, "a burst, and then one in 100 rounds"
+
+
+def test_an_average_is_not_drawn_to_a_state_beyond_the_gate() -> None:
+    rejected = Counter[str]()
+    node = AveragingConsensus("a", "metropolis", ConsensusConfig(gate_m=15.0), rejected)
+    for _ in range(20):
+        node.round(np.zeros(2), {"b": Share(0, (50.0, 0.0, 2.0), frozenset("a"), frozenset("a"))})
+    assert node.mean_m == pytest.approx([0.0, 0.0])
+    assert rejected == {"sums": 20}

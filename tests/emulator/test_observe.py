@@ -57,7 +57,11 @@ def outcome_set(table: pa.Table, mask: np.ndarray, outcome: str) -> pa.Table:
     names = np.array(table["outcome"].cast(pa.string()).to_pylist(), dtype=object)
     names[mask] = outcome
     column = pa.array(names.tolist(), pa.string()).dictionary_encode()
-    return table.set_column(table.column_names.index("outcome"), "outcome", column)
+    table = table.set_column(table.column_names.index("outcome"), "outcome", column)
+    arrived = pc.is_in(column.cast(pa.string()), pa.array(["delivered", "receiver_down", "transport"]))
+    usual_ns = pc.add(table["sent_ns"], 3_020_000)
+    arrival_ns = pc.if_else(arrived, pc.coalesce(table["arrival_ns"], usual_ns), pa.scalar(None, pa.int64()))
+    return table.set_column(table.column_names.index("arrival_ns"), "arrival_ns", arrival_ns)
 
 
 def is_outcome(table: pa.Table, outcome: str) -> np.ndarray:
@@ -136,6 +140,8 @@ def test_a_program_that_sends_nothing_leaves_checks_unknown(evidence: Evidence) 
         "range",
         "peer_cap",
         "loss_rate",
+        "latency",
+        "isolation",
     }
 
 

@@ -16,14 +16,18 @@ from typing import Any
 import numpy as np
 
 from agents import cooperative_frame
+from emulator.observe.run_folder import RunFolder
+from emulator.run.control import answer
+from emulator.run.emulation import Emulation
 from emulator.world.links import load_links
 from emulator.world.networks import load_network
-from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, WireError
+from emulator.world.world import build_world
+from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, VnetError, WireError
 from vnet.faults import KINDS, parse_fault
 from vnet.link import wire
 from vnet.link.access import Access, Credentials
 from vnet.link.node import Report
-from vnet.scenario import Radio, dump_scenario, load_scenario
+from vnet.scenario import Radio, Scenario, dump_scenario, load_scenario
 
 OVERRIDE = b"\n--set "
 """Stands between a scenario file and each override in one input of the scenario target."""
@@ -307,6 +311,30 @@ _JSON_WORDS = (
     b"\\u000a",
 )
 
+
+@functools.cache
+def _small_emulation() -> Emulation:
+    scenario = Scenario.model_validate({"network": {"vehicles": 3}})
+    folder = RunFolder.create(Path(tempfile.mkdtemp(prefix="vnet-fuzz-")) / "run", scenario)
+    return Emulation(scenario, build_world(scenario), folder)
+
+
+def _read_query(data: bytes) -> None:
+    """A query of an operator: its verb, a line, and its payload."""
+    verb, _, payload = data.partition(b"\n")
+    emulation = _small_emulation()
+    try:
+        json.dumps(answer(emulation, verb.decode(errors="replace"), payload, 1_000_000_000, own_router=False))
+    finally:
+        emulation.faults.faults.clear()
+
+
+_QUERIES = (
+    b"status\n",
+    *(b"inject\n" + seed for seed in _FAULT_SEEDS),
+    b'heal\n"all"',
+)
+
 TARGETS = (  # the slowest first
     Target(
         "scenario",
@@ -317,6 +345,7 @@ TARGETS = (  # the slowest first
     ),
     Target("network CSV", _read_network, ScenarioError, (_NETWORK,), _CSV_WORDS),
     Target("fault", _read_fault, ScenarioError, _FAULT_SEEDS, _FAULT_WORDS),
+    Target("control query", _read_query, VnetError, _QUERIES, _FAULT_WORDS),
     Target("links CSV", _read_links, ScenarioError, (b"0,1\n1,0\n", b"0,1.0\n\n0,0\n"), _CSV_WORDS),
     Target("access.json", _read_access, LinkError, (_ACCESS,), _JSON_WORDS),
     Target("credentials", _read_credentials, LinkError, (b'{"user": "node-v01", "password": "p"}',), _JSON_WORDS),

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from emulator.run.control import CONTROL_FILE, ask
+from emulator.run.control import CONTROL_FILE, OPERATOR_FILE, ask
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
@@ -34,7 +34,7 @@ def command(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Path, vnet: Vnet) -> None:
     folder = tmp_path / "run"
     with long_run(folder) as process:
-        assert (folder / CONTROL_FILE).stat().st_mode & 0o077 == 0
+        assert [(folder / name).stat().st_mode & 0o077 for name in (CONTROL_FILE, OPERATOR_FILE)] == [0, 0]
         told = command("fault", "inject", "kill", "--for", "2", "--set", "nodes.random=1", "--run", str(folder))
         assert told.returncode == 0, told.stderr
         assert "kill-0" in told.stdout
@@ -49,6 +49,7 @@ def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Pat
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)
     assert not (folder / CONTROL_FILE).exists()
+    assert not (folder / OPERATOR_FILE).exists()
     done = Finished(process.returncode, "", "", folder)
     ends = {event["fault"]: event["time_ns"] / 1e9 for event in done.events_of("fault_ended")}
     # The whole schedule is in the run's scenario: up to the last end, simulating it gives the same trace.
@@ -80,7 +81,7 @@ def test_a_bad_query_gets_one_line_of_error_and_changes_nothing(
     running: tuple[Path, dict[str, str]], verb: str, payload: bytes, said: str
 ) -> None:
     folder, way_in = running
-    login = Credentials(way_in["user"], way_in["password"])
+    login = Credentials.load(folder / OPERATOR_FILE)
     with open_client(way_in["endpoint"], login, 10_000) as session:
         replies = list(session.get(keys.control(way_in["run"], verb), payload=payload, timeout=TIMEOUT_S))
     assert len(replies) == 1

@@ -15,6 +15,8 @@ starts again under a new epoch: the highest spreads, and the old mean serves unt
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -43,12 +45,29 @@ class ConsensusConfig:
     """Rounds, that is periods, of patience.
 
     `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
-    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start.
+    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start; if epoch follows
+    epoch, for `serve_rounds` at most.
+    `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
+    `blame`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
+    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to `worst`.
     """
 
     silence_rounds: int = 20
     steady_rounds: int = 5
     settle_rounds: int = 30
+    serve_rounds: int = 100
+    gate_m: float = math.inf
+    blame: int = 10
+    blame_rounds: int = 100
+    worst: int = 4
+
+
+LEAST_MASS = 0.1
+"""Tracking adds the change of the input to masses of any size: small ones need not have a sensible ratio."""
+
+
+MOST_BLAMED = 1024
+"""Names cost a liar nothing."""
 
 
 class Consensus(Protocol):
@@ -83,6 +102,11 @@ class Peers:
         """Peers heard lately that hear this node as well."""
         return frozenset(peer for peer, hears in self._hears_us.items() if hears)
 
+    def drop(self, peer: str) -> None:
+        """Forget a peer at once."""
+        self._silent.pop(peer, None)
+        self._hears_us.pop(peer, None)
+
     def listen(self, shares: Mapping[str, Share]) -> None:
         """Take note of one round's shares."""
         for peer in list(self._silent):
@@ -97,9 +121,14 @@ class Peers:
 class RatioConsensus:
     """The consensus state of one node. Epoch 0 means: not taking part yet."""
 
-    def __init__(self, node: str, config: ConsensusConfig | None = None) -> None:
+    def __init__(
+        self, node: str, config: ConsensusConfig | None = None, rejected: Counter[str] | None = None
+    ) -> None:
+        """`rejected` counts shares that are not believed, by reason: `sums`, `exile`."""
         self._node = node
         self._config = config or ConsensusConfig()
+        self._rejected = Counter() if rejected is None else rejected
+        self._blamed: dict[str, tuple[float, int]] = {}  # and up to which epoch
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
@@ -111,13 +140,14 @@ class RatioConsensus:
         self._seen: dict[str, Array] = {}
         self._peers = Peers(node, self._config.silence_rounds)
         self._old_mean: Array | None = None
+        self._old_rounds = 0
 
     @property
     def mean_m(self) -> Array | None:
         """The mean (2,) as far as it is known; None before the first has settled."""
         if self.epoch and self._age >= self._config.settle_rounds:
             return np.asarray(self._mass[:2] / self._mass[2])
-        return self._old_mean
+        return self._old_mean if self._old_rounds <= self._config.serve_rounds else None
 
     @property
     def mass(self) -> Array:
@@ -126,6 +156,7 @@ class RatioConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        shares = self._believed(value, shares)
         self._peers.listen(shares)
         self._highest = max([self._highest, *(share.epoch for share in shares.values())])
         self._follow(value)
@@ -136,8 +167,60 @@ class RatioConsensus:
         s_x, s_y, w = self._running_sum.tolist()
         return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
 
+    def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
+        """Without the shares of those who bring false sums, or epoch after epoch: as if these were not heard.
+
+        What they have been given is given to them in vain, until a new epoch starts without them; the ratio of what
+        is left is the mean all the same.
+        """
+        leak = 1 / self._config.blame_rounds
+        self._blamed = {p: (blame - leak, epoch) for p, (blame, epoch) in self._blamed.items() if blame > leak}
+        self._blame_for_epochs(shares)
+        x, y = value.tolist()
+        believed = {}
+        for peer, share in shares.items():
+            if self._blame_of(peer) > self._config.blame:
+                self._rejected["exile"] += 1
+            elif not self._is_plausible(peer, share, x, y):
+                self._rejected["sums"] += 1
+                self._blame(peer, self._config.blame, share.epoch)
+            else:
+                believed[peer] = share
+        return believed
+
+    def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
+        """Blame those who are the first with a new epoch.
+
+        They share the blame: who starts it brings it alone, and who hands it on does so together with others.
+        """
+        newest = max((share.epoch for share in shares.values()), default=0)
+        if newest > self._highest > 0:  # who joins finds the others further on, for which they are not to blame
+            first = [peer for peer, share in shares.items() if share.epoch == newest]
+            for peer in first:
+                if newest > self._blamed.get(peer, (0.0, 0))[1]:
+                    self._blame(peer, min(newest - self._highest, self._config.worst) / len(first), newest)
+
+    def _blame_of(self, peer: str) -> float:
+        return self._blamed[peer][0] if peer in self._blamed else 0.0
+
+    def _blame(self, peer: str, more: float, epoch: int) -> None:
+        blame = self._blame_of(peer) + more
+        if peer in self._blamed or len(self._blamed) < MOST_BLAMED:
+            self._blamed[peer] = blame, epoch
+        if blame > self._config.blame:
+            self._peers.drop(peer)
+
+    def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
+        """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
+        if share.epoch != self.epoch or self._node not in share.takers:
+            return True
+        seen = self._seen.get(peer)
+        s_x, s_y, w = share.running_sum if seen is None else (np.array(share.running_sum) - seen).tolist()
+        return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + LEAST_MASS)
+
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
+        self._old_rounds += 1
         wanted = self._peers.mutual
         changed = wanted != self._takers or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
@@ -151,7 +234,8 @@ class RatioConsensus:
             self._age += 1
 
     def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
-        self._old_mean = self.mean_m
+        if self.epoch and self._age >= self._config.settle_rounds:
+            self._old_mean, self._old_rounds = self.mean_m, 0
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
         self._running_sum = np.zeros(3)
@@ -212,11 +296,20 @@ class AveragingConsensus:
     Raises VnetError for another rule.
     """
 
-    def __init__(self, node: str, rule: str, config: ConsensusConfig | None = None) -> None:
+    def __init__(
+        self,
+        node: str,
+        rule: str,
+        config: ConsensusConfig | None = None,
+        rejected: Counter[str] | None = None,
+    ) -> None:
+        """`rejected` counts states that are not believed as `sums`."""
         if rule not in AVERAGING_RULES:
             raise VnetError(f"averaging rule {rule!r}: allowed: {', '.join(AVERAGING_RULES)}")
         self._rule = rule
-        self._peers = Peers(node, (config or ConsensusConfig()).silence_rounds)
+        self._config = config or ConsensusConfig()
+        self._rejected = Counter() if rejected is None else rejected
+        self._peers = Peers(node, self._config.silence_rounds)
         self._input: Array | None = None
         self._state: Array | None = None
         self._degree = 1.0
@@ -228,6 +321,7 @@ class AveragingConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
+        shares = self._believed(value, shares)
         self._peers.listen(shares)
         mutual = self._peers.mutual
         said = {peer: shares[peer].running_sum for peer in sorted(shares) if peer in mutual}
@@ -245,6 +339,17 @@ class AveragingConsensus:
         self._state, self._input = state, np.array(value, dtype=float)
         x, y = state.tolist()
         return Share(0, (x, y, self._degree), mutual, self._peers.heard)
+
+    def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
+        x, y = value.tolist()
+        believed = {
+            peer: share
+            for peer, share in shares.items()
+            if math.hypot(share.running_sum[0] - x, share.running_sum[1] - y) <= self._config.gate_m
+        }
+        if len(believed) < len(shares):
+            self._rejected["sums"] += len(shares) - len(believed)
+        return believed
 
 
 def _towards(state: Array, degree: float, other: tuple[float, float, float]) -> Array:

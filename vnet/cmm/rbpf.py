@@ -38,7 +38,8 @@ class RbpfConfig:
     offset in the lane (see the module's text). `gate_sigmas`: fixes further off are outliers. `forget_s`: vehicles
     not heard for that long are dropped. `memory_s`: how old a fix may be. `start_m`, `start_sigma_m`: where the
     cloud starts, else around 0 with `common_sigma_m`. The paper's: `one_sided` lanes are bounded on the right only;
-    with `roads_apart` a step does not look at roads, `weigh_roads` does.
+    with `roads_apart` a step does not look at roads, `weigh_roads` does. `least_log_road`: no road says
+    less of a vehicle, so that one whose fixes are false moves the cloud by no more (a truncated likelihood).
     """
 
     particles: int = 200
@@ -54,6 +55,7 @@ class RbpfConfig:
     start_sigma_m: float | None = None
     one_sided: bool = False
     roads_apart: bool = False
+    least_log_road: float = -np.inf
 
     def __post_init__(self) -> None:
         if self.particles < 1:
@@ -292,6 +294,8 @@ class Rbpf:
             score = log_left_of_edge(offset, sigma_m, self._lanes.half_width_m)
         else:
             score = log_on_lane(offset, sigma_m, self._lanes.half_width_m)
+        if self.config.least_log_road > -np.inf:
+            np.maximum(score, self.config.least_log_road, out=score)
         if np.array_equal(row, rows):
             return score
         result = np.zeros((len(rows), score.shape[1]))

@@ -17,6 +17,8 @@ from vnet.errors import VnetError
 from vnet.roads.lanes import Array
 
 RIDGE_FLOOR_M2 = 0.01
+MOST_SOLVERS = 64
+"""A flood of senders would have one set up for every number of neighbours, and kept."""
 
 
 class OptimizedWeights:
@@ -59,6 +61,8 @@ class OptimizedWeights:
 
     def _solver(self, count: int) -> osqp.OSQP:
         if count not in self._solvers:
+            if len(self._solvers) >= MOST_SOLVERS:
+                self._solvers.clear()
             rows, columns = _upper_triangle(count)
             hessian = sp.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
             constraints = sp.vstack([np.ones((1, count)), sp.eye(count)], format="csc")

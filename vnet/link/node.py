@@ -162,6 +162,10 @@ class GnssReceiver:
     def __init__(self) -> None:
         self.inbox: Mailbox[Fix] = Mailbox()
 
+    def drain(self) -> list[Fix]:
+        """All fixes since the last look, oldest first, without waiting."""
+        return self.inbox.drain()
+
     async def receive(self) -> Fix:
         """The next fix; waits for one if there is none."""
         return await self.inbox.get()

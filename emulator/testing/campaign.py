@@ -1,0 +1,313 @@
+"""A campaign: many runs of one scenario under random faults; whatever fails is shrunk and kept.
+
+Run number i has the seed of the campaign plus i: it draws the network (of a generated one), the run and the
+schedule, so that a failure is had again by its seed alone. No failure stops a campaign; Ctrl-C keeps what is there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from emulator.observe.run_folder import RUNS
+from emulator.testing.matrix import column_of, count_verdicts, page
+from emulator.testing.scenarios import make_scenario
+from emulator.testing.schedules import WEIGHTS, Ground, draw_fault, known_kinds
+from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
+from emulator.testing.trial import Trial, Workshop
+from vnet.errors import ScenarioError, VnetError
+from vnet.link.hosting import load_program
+from vnet.scenario import Scenario, dump_scenario
+
+FORMAT = 1
+LONGEST_S = 20.0
+MOST_FAULTS = 4
+WRITE_EVERY = 20
+SEEDS = 2**63
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be run. `shrink_steps` bounds the runs that shrink a failure, `limit_s` each one's wall clock."""
+
+    scenario: Scenario
+    runs: int
+    seed: int
+    kinds: tuple[str, ...]
+    limit_s: float = 300.0
+    shrink_steps: int = MOST_STEPS
+    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+
+    @classmethod
+    def of(cls, scenario: Scenario, faults: str, runs: int, seed: int, **options: Any) -> Plan:
+        """A plan; `faults` is "random", or the kinds to draw from with commas between. Raises VnetError."""
+        run = scenario.run
+        if run.duration_s > LONGEST_S:
+            raise ScenarioError(
+                f"run.duration_s = {run.duration_s:g}: a campaign's runs take {LONGEST_S:g} s at most"
+            )
+        kinds = known_kinds(None if faults == "random" else faults.split(","))
+        plain = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()})
+        Ground.of(plain)
+        load_program(plain.program.entry)
+        return cls(plain, runs, seed, kinds, **options)
+
+    def draw(self, number: int) -> Scenario:
+        """Run `number`: a network, a seed and one to four faults."""
+        seed = (self.seed + number) % SEEDS
+        changes: dict[str, Any] = {"seed": seed}
+        if self.scenario.network.kind == "generated":
+            changes["network.seed"] = seed
+        scenario = make_scenario(self.scenario, changes)
+        choose, ground = _Random(seed), Ground.of(scenario)
+        weighted = [kind for kind in self.kinds for _ in range(WEIGHTS.get(kind, 1))]
+        faults = [draw_fault(choose, ground, weighted) for _ in range(choose.whole(1, MOST_FAULTS))]
+        return make_scenario(scenario, {"faults": faults})
+
+
+class _Random:
+    """A Chooser with a random generator."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def whole(self, low: int, high: int) -> int:
+        return int(self._rng.integers(low, high, endpoint=True))
+
+    def one(self, items: Sequence[T]) -> T:
+        return items[self.whole(0, len(items) - 1)]
+
+    def some(self, items: Sequence[T], most: int) -> list[T]:
+        chosen = self._rng.permutation(len(items))[: self.whole(1, most)]
+        return [items[number] for number in sorted(chosen.tolist())]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run that is over; of one that failed also the shrunk one, and the folder where it is kept."""
+
+    seed: int
+    scenario: Scenario
+    trial: Trial
+    shrunk: Scenario | None = None
+    again: Trial | None = None
+    steps: int = 0
+    folder: Path | None = None
+
+    @property
+    def kinds(self) -> list[str]:
+        """The kinds of its faults."""
+        return [fault.kind for fault in self.scenario.fault]
+
+    def schedule(self) -> str:
+        """The smallest schedule found that still fails, as TOML."""
+        return schedule_toml((self.shrunk or self.scenario).fault)
+
+    def texts(self) -> dict[str, str]:
+        """What the failed checks say, of the shrunk run if there is one."""
+        trial = self.again if self.again is not None and self.again.failed else self.trial
+        texts = {name: trial.texts[name] for name in trial.failed}
+        if self.again is not None and not self.again.failed:
+            texts["replay"] = "the shrunk run failed, and did not when it was run again"
+        return texts
+
+    def as_json(self) -> dict[str, Any]:
+        """The run's part of campaign.json."""
+        row: dict[str, Any] = {
+            "seed": self.seed,
+            "faults": [fault.model_dump(mode="json", exclude_none=True) for fault in self.scenario.fault],
+            "checks": {name: verdict.value for name, verdict in self.trial.verdicts.items()},
+            "trace_sha256": self.trial.trace_sha256,
+            "wall_s": round(self.trial.wall_s, 2),
+        }
+        if self.folder is not None:
+            row |= {
+                "failed": self.texts(),
+                "shrunk": self.schedule(),
+                "steps": self.steps,
+                "folder": str(self.folder),
+            }
+        return row
+
+
+def schedule_toml(schedule: Schedule) -> str:
+    """A schedule as it stands in a scenario."""
+    tables = []
+    for fault in schedule:
+        data = {"kind": fault.kind} | fault.model_dump(mode="json", exclude_none=True)
+        tables.append("\n".join(["[[fault]]", *_lines(data)]))
+    return "\n\n".join(tables)
+
+
+def _lines(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """TOML with dotted keys, which is shorter than what tomli_w writes."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _lines(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key} = {json.dumps(value)}"
+
+
+class Campaign:
+    """The course of a campaign. `folder` is its own, and new."""
+
+    def __init__(self, plan: Plan, folder: Path, progress: Progress) -> None:
+        self._plan = plan
+        self._folder = folder
+        self._progress = progress
+        self._lock = threading.Lock()
+        self._numbers = count(1)
+        self._workshop = Workshop(plan.limit_s, [plan.scenario.program.entry.partition(":")[0]])
+        self.outcomes: list[Outcome] = []
+        self.interrupted = False
+
+    @property
+    def failures(self) -> list[Outcome]:
+        """The runs that have failed, by seed."""
+        return sorted((o for o in self.outcomes if o.trial.failed), key=lambda o: o.seed)
+
+    def run(self) -> None:
+        """All runs, on all cores; returns early, with what is there, after Ctrl-C."""
+        self._task = self._progress.add_task("campaign", total=self._plan.runs)
+        with ThreadPoolExecutor(self._plan.jobs) as pool:
+            futures = [pool.submit(self._one, number) for number in range(self._plan.runs)]
+            try:
+                for future in as_completed(futures):
+                    self._take(future.result())
+            except KeyboardInterrupt:
+                self.interrupted = True
+                self._workshop.close()
+                pool.shutdown(cancel_futures=True)
+        self._take_left(futures)
+        self.write()
+
+    def _take(self, outcome: Outcome) -> None:
+        self.outcomes.append(outcome)
+        self._progress.update(self._task, advance=1, description=f"campaign: {len(self.failures)} failures")
+        if outcome.trial.failed or len(self.outcomes) % WRITE_EVERY == 0:
+            self.write()
+
+    def _take_left(self, futures: Sequence[Future[Outcome]]) -> None:
+        """What was over, or given up half shrunk, when the campaign was interrupted."""
+        taken = {outcome.seed for outcome in self.outcomes}
+        for future in futures:
+            done = not future.cancelled() and future.exception() is None
+            if done and future.result().seed not in taken:
+                self._take(future.result())
+
+    def _one(self, number: int) -> Outcome:
+        scenario = self._plan.draw(number)
+        trial = self._try(scenario)
+        outcome = Outcome(scenario.run.seed, scenario, trial)
+        return self._shrink(outcome) if trial.failed else outcome
+
+    def _try(self, scenario: Scenario) -> Trial:
+        with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
+            return self._workshop.run(scenario, Path(name) / "run")
+
+    def _shrink(self, outcome: Outcome) -> Outcome:
+        """Shrink a failure, and run the smallest once more where it is kept."""
+        wanted = {column_of(name) for name in outcome.trial.failed}
+
+        def still_fails(schedule: Schedule) -> bool:
+            if self._workshop.closed:
+                return False
+            smaller = make_scenario(outcome.scenario, {"faults": schedule})
+            return bool(wanted & {column_of(name) for name in self._try(smaller).failed})
+
+        smallest, steps = shrink(outcome.scenario.fault, still_fails, self._plan.shrink_steps)
+        shrunk = make_scenario(outcome.scenario, {"faults": smallest})
+        with self._lock:
+            folder = self._folder / "failures" / f"{next(self._numbers):03d}"
+        again = self._workshop.run(shrunk, folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "scenario.toml").write_text(dump_scenario(shrunk))
+        (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
+        return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
+
+    def write(self) -> None:
+        """campaign.json and campaign.html, of what is there."""
+        rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.seed)]
+        head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
+        _replace(self._folder / "campaign.json", json.dumps(head | {"results": rows}, indent=1) + "\n")
+        _replace(self._folder / "campaign.html", self._page())
+
+    def _page(self) -> str:
+        run = self._plan.scenario.run
+        facts = [
+            f"{len(self.outcomes)} of {self._plan.runs} runs of {run.duration_s:g} emulated seconds, "
+            f"seeds from {self._plan.seed} on; {len(self.failures)} failed."
+        ]
+        matrix = count_verdicts((outcome.kinds, outcome.trial.verdicts) for outcome in self.outcomes)
+        return page(f"Campaign {run.name}", facts, matrix, [self._described(o) for o in self.failures])
+
+    def _described(self, outcome: Outcome) -> dict[str, Any]:
+        assert outcome.folder is not None
+        return {
+            "number": outcome.folder.name,
+            "seed": outcome.seed,
+            "checks": outcome.texts(),
+            "schedule": outcome.schedule(),
+            "command": f"vnet simulate {shlex.quote(str(outcome.folder / 'scenario.toml'))}",
+            "folder": f"failures/{outcome.folder.name}",
+        }
+
+    def summary(self) -> Table:
+        """The failures, for a terminal."""
+        table = Table(title=f"failures: {len(self.failures)} of {len(self.outcomes)} runs", title_justify="left")
+        for name in ("", "seed", "failed", "smallest schedule"):
+            table.add_column(name, overflow="fold")
+        for outcome in self.failures:
+            told = self._described(outcome)
+            texts = "\n".join(f"{name}: {text}" for name, text in told["checks"].items())
+            table.add_row(told["number"], str(outcome.seed), Text(texts), Text(told["schedule"] or "none"))
+        return table
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    part.replace(path)
+
+
+def _folders(name: str) -> Iterator[Path]:
+    for number in count(1):
+        yield RUNS / (name if number == 1 else f"{name}-{number}")
+
+
+def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
+    """Run a campaign, and say what came of it; returns the exit status. Raises VnetError.
+
+    0 if no run failed, 1 if one did, 130 if it was interrupted.
+    """
+    name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
+    folder = out or next(path for path in _folders(name) if not path.exists())
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise VnetError(f"--out {folder}: exists and is not an empty folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        campaign = Campaign(plan, folder, progress)
+        campaign.run()
+    if campaign.failures:
+        console.print(campaign.summary())
+    console.print(f"{len(campaign.outcomes)} runs, {len(campaign.failures)} failed: {folder / 'campaign.html'}")
+    if campaign.interrupted:
+        return 130
+    return 1 if campaign.failures else 0

@@ -1,0 +1,278 @@
+"""A run in the hands of a test: it goes on when the test says so, breaks when the test says so, and is judged.
+
+Emulated time passes only in `run_until` and `run_for`. Everything that the test does to the run is written into the
+run's scenario, so that `vnet simulate FOLDER/scenario.toml` gives the same trace.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from emulator.faults.plan import PlannedFault
+from emulator.observe.checks import CheckResult, Judgement, Verdict
+from emulator.observe.metrics import PeriodFigures
+from emulator.observe.run_folder import Event, RunFolder
+from emulator.run.attachment import LiveOptions
+from emulator.run.conclude import conclude
+from emulator.run.emulation import Emulation
+from emulator.run.join import split_into_processes
+from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
+from emulator.world.world import build_world
+from vnet.errors import ScenarioError, VnetError
+from vnet.faults import LONGEST_S, Selector, parse_fault
+from vnet.link.access import Access
+from vnet.link.session import quiet_zenoh
+from vnet.scenario import NS_PER_S, Scenario
+
+SELECTORS = ("nodes", "senders", "receivers")
+
+
+class RunHarness:
+    """See the module's text. An async context manager: the run starts when it is entered and ends when it is left.
+
+    Raises ScenarioError if the scenario cannot be used, in a test or at all.
+    """
+
+    def __init__(self, scenario: Scenario, folder: Path, live: bool = False) -> None:
+        if scenario.run.pacing != "lockstep":
+            raise ScenarioError("run.pacing = 'realtime': a test steps a run in lockstep; for real time: vnet run")
+        if any(fault.kind == "router_restart" for fault in scenario.fault):
+            raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+        self.folder = folder
+        self.live = live
+        self._emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+        self._run: SteppedRun = self._live_run() if live else SimulatedRun(self._emulation)
+        self._now_ns = 0
+        self._wall_s = 0.0
+        self._open: list[str] = []
+        self._judgement: Judgement | None = None
+
+    def _live_run(self) -> SteppedRun:
+        quiet_zenoh()
+        run = self._emulation.scenario.run
+        groups = split_into_processes(self._emulation.world.node_ids, run.nodes_per_process)
+        return SteppedLiveRun(self._emulation, LiveOptions(Access.create(run.name, groups)))
+
+    # What there is to see.
+
+    @property
+    def now_s(self) -> float:
+        """Emulated seconds: all that happens before this instant has happened."""
+        return self._now_ns / NS_PER_S
+
+    @property
+    def nodes(self) -> list[str]:
+        """The ids of all vehicles."""
+        return list(self._emulation.world.node_ids)
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario as it stands, with the faults that the test has injected."""
+        return self._emulation.scenario
+
+    @property
+    def figures(self) -> PeriodFigures | None:
+        """The figures of the last period that is complete, or None."""
+        rows = self._emulation.metrics.rows
+        return rows[-1] if rows else None
+
+    @property
+    def events(self) -> list[Event]:
+        """What has happened: joins, deaths, crashes, faults."""
+        return list(self._emulation.folder.events)
+
+    def states(self) -> pa.Table:
+        """What each vehicle believed and what was true, a row for each vehicle and period so far."""
+        return self._emulation.metrics.states_table()
+
+    def trace(self) -> pa.Table:
+        """What became of each frame at each receiver so far."""
+        return self._emulation.engine.trace.to_table()
+
+    def halves(self) -> list[list[str]]:
+        """The vehicles in two halves, drawn from the run's seed."""
+        order = np.random.default_rng(self.scenario.run.seed).permutation(len(self.nodes))
+        first = set(order[: len(order) // 2].tolist())
+        return [[n for i, n in enumerate(self.nodes) if (i in first) is half] for half in (True, False)]
+
+    @property
+    def reproduce(self) -> str:
+        """The command that runs the same again."""
+        return f"vnet {self._run.command} {shlex.quote(str(self.folder / 'scenario.toml'))}"
+
+    # Its course.
+
+    async def __aenter__(self) -> RunHarness:
+        await self._wait(self._run.start())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            await asyncio.to_thread(self.end)
+        else:
+            await asyncio.to_thread(self.close)
+
+    async def run_until(self, time_s: float) -> None:
+        """Let emulated time pass up to `time_s`. Raises VnetError if the run ends before it."""
+        self._must_be_on("run_until")
+        time_ns = round(time_s * NS_PER_S)
+        if time_ns < self._now_ns:
+            raise VnetError(f"run_until({time_s:g}): it is {self.now_s:g} s already")
+        if time_ns > self._emulation.duration_ns:
+            limit_s = self._emulation.duration_ns / NS_PER_S
+            raise VnetError(f"run_until({time_s:g}): the run takes {limit_s:g} s; give it a longer duration=")
+        self._must_not_outlast(time_s)
+        if time_ns == self._now_ns:
+            return
+        started = time.monotonic()
+        await self._wait(self._run.go(time_ns))
+        self._wall_s += time.monotonic() - started
+        if self._run.over:
+            self._now_ns = self._emulation.emulated_ns
+            last = self.events[-1]
+            why = " ".join(filter(None, (last.node, last.kind, str(last.details.get("error", "")))))
+            raise VnetError(f"run_until({time_s:g}): the run has ended at {self.now_s:g} s: {why}")
+        self._now_ns = time_ns
+
+    async def run_for(self, duration_s: float) -> None:
+        """Let so many emulated seconds pass."""
+        await self.run_until(self.now_s + duration_s)
+
+    def _must_not_outlast(self, time_s: float) -> None:
+        healed_s = self.scenario.healed_s
+        if self._open and time_s > healed_s + 1e-9:
+            raise VnetError(
+                f"run_until({time_s:g}): {', '.join(self._open)} would be healed at {healed_s:g} s, run.settle_s "
+                "before the end: leave its block before, or give a longer duration= or a shorter settle="
+            )
+
+    def _must_be_on(self, what: str) -> None:
+        if self._judgement is not None or self._run.over:
+            raise VnetError(f"{what}: the run is over")
+
+    async def _wait(self, stands: Future[None]) -> None:
+        # Shielded: a test that is cancelled must not take away what the run's thread will answer.
+        await asyncio.shield(asyncio.wrap_future(stands))
+
+    @contextmanager
+    def fault(self, kind: str, **parameters: Any) -> Iterator[PlannedFault]:
+        """A fault from now until the block is left, or so long as its `duration_s`, if that is given.
+
+        `parameters` are the kind's, as in a scenario; lists of ids do for selectors. Raises ScenarioError.
+        """
+        self._must_be_on(f"fault {kind!r}")
+        for name in SELECTORS:
+            if isinstance(parameters.get(name), (list, tuple)):
+                parameters[name] = Selector(ids=tuple(parameters[name]))
+        fault = parse_fault({"kind": kind, "duration_s": LONGEST_S, **parameters})
+        if fault.kind == "router_restart" or (fault.kind == "emulator_restart" and not self.live):
+            raise ScenarioError(f"fault {kind!r}: there is nothing here to restart")
+        if self.now_s >= (healed_s := self.scenario.healed_s):
+            raise ScenarioError(
+                f"fault {kind!r} at {self.now_s:g} s: all have healed by {healed_s:g} s, run.settle_s before the "
+                "end: give the run a longer duration= or a shorter settle="
+            )
+        planned = self._emulation.inject(fault, self._now_ns - 1)
+        self._open.append(planned.label)
+        try:
+            yield planned
+        finally:
+            self._heal(planned)
+
+    def _heal(self, planned: PlannedFault) -> None:
+        if planned.label in self._open:
+            self._open.remove(planned.label)
+            # A fault lasts a nanosecond at least: what never acted would act in the replay.
+            self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns))
+
+    # Its end.
+
+    def end(self) -> Judgement:
+        """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same."""
+        if self._judgement is None:
+            self._finish()
+            command = self._run.command
+            self._judgement, _ = conclude(self._emulation, self._wall_s, command)
+        return self._judgement
+
+    def close(self) -> None:
+        """End the run, if it is on, whatever state it is in, and keep what can be kept of it."""
+        broken = self._run.stands.done() and self._run.stands.exception() is not None
+        if self._run.started and not broken:
+            self.end()
+
+    def _finish(self) -> None:
+        self._run.stands.result()  # a test that was cancelled left it on its way
+        if self._run.over:
+            return
+        for planned in list(self._emulation.faults.faults):
+            self._heal(planned)
+        last_ns = max(self._now_ns, self._emulation.faults.last_end_ns, self._emulation.world.period_ns)
+        self._emulation.end_at(min(last_ns, self._emulation.duration_ns))
+        started = time.monotonic()
+        self._run.go(None).result()
+        self._wall_s += time.monotonic() - started
+        self._now_ns = self._emulation.duration_ns
+
+    def check(self, *names: str, within_s: float | None = None, allow_unknown: bool = False) -> Judgement:
+        """End the run and judge it by these checks, or by all. Raises AssertionError if one of them fails.
+
+        A check that has seen nothing is unknown, and fails unless `allow_unknown`; so does one that is named but
+        was not exercised. `within_s` is how long the network may take to recover after a fault, by the checks that
+        measure it. Raises VnetError for a name that no check has, or if nothing measured the recovery.
+        """
+        __tracebackhide__ = True
+        judgement = self.end()
+        left_out = {skipped.name: skipped.reason for skipped in judgement.not_exercised}
+        known = {check.name: check for check in judgement.checks}
+        for name in names:
+            if name not in known and name not in left_out:
+                raise VnetError(f"no check is called {name!r}; there are: {', '.join([*known, *left_out])}")
+        chosen = [check for check in judgement.checks if check.name in names or not names]
+        failed = [check for check in chosen if _fails(check, allow_unknown)]
+        failed += [
+            CheckResult(name, Verdict.UNKNOWN, f"not exercised: {left_out[name]}")
+            for name in names
+            if name in left_out and not allow_unknown
+        ]
+        measured = [check for check in chosen if "recovered_s" in check.figures]
+        if within_s is not None:
+            failed += _too_slow(measured, within_s)
+        if failed:
+            raise AssertionError(self._complaint(failed))
+        if within_s is not None and not measured:
+            raise VnetError(f"within_s = {within_s:g}: none of these checks measured a recovery")
+        return judgement
+
+    def _complaint(self, failed: Sequence[CheckResult]) -> str:
+        lines = [f"{check.name} is {check.verdict}: {check.text}" for check in failed]
+        where = f"{len(self.nodes)} vehicles, {self.now_s:g} s, seed {self.scenario.run.seed}"
+        return "\n  ".join([f"failed after {where}:", *lines, f"files: {self.folder}", f"again: {self.reproduce}"])
+
+
+def _fails(check: CheckResult, allow_unknown: bool) -> bool:
+    return check.verdict is Verdict.INVALID or (check.verdict is Verdict.UNKNOWN and not allow_unknown)
+
+
+def _too_slow(checks: Sequence[CheckResult], within_s: float) -> list[CheckResult]:
+    """Of those that measured how long the network took to recover (`recovered_s`), the ones that are too long."""
+    slow = []
+    for check in checks:
+        longest_s = float(np.max(check.figures["recovered_s"], initial=0.0))
+        if longest_s > within_s:
+            text = f"recovered only {longest_s:.1f} s after a fault; within_s = {within_s:g}"
+            slow.append(CheckResult(check.name, Verdict.INVALID, text, check.figures))
+    return slow

@@ -1,0 +1,72 @@
+"""The scenario of a test: a file, plain data or a Scenario, and what the test changes about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from vnet.errors import ScenarioError
+from vnet.scenario import Scenario, load_scenario
+from vnet.sections import first_problem
+
+Source = str | Path | Mapping[str, Any] | Scenario
+
+NAMES = {
+    "vehicles": "network.vehicles",
+    "program": "program.entry",
+    "options": "program.options",
+    "seed": "run.seed",
+    "duration": "run.duration_s",
+    "settle": "run.settle_s",
+    "faults": "fault",
+}
+"""Short names of what tests change most."""
+
+
+def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[Path] = ()) -> Scenario:
+    """A scenario with `changes`, by short name or as "section.key". None changes nothing.
+
+    A file is looked for here, and then in `folders`. Raises ScenarioError.
+    """
+    scenario = _loaded(source, folders)
+    given = {name: value for name, value in changes.items() if value is not None}
+    if "vehicles" in given and scenario.network.kind == "file":
+        raise ScenarioError(f"vehicles = {given['vehicles']}: the network's file says how many there are")
+    data = scenario.model_dump(mode="json", exclude_none=True)
+    for name, value in given.items():
+        *sections, key = NAMES.get(name, name).split(".")
+        if not sections and name != "faults":
+            raise ScenarioError(f"{name}: unknown; write section.key, or one of {', '.join(NAMES)}")
+        table = data
+        for section in sections:
+            table = table.setdefault(section, {})
+        table[key] = _plain(value)
+    return _validated(data)
+
+
+def _loaded(source: Source, folders: Iterable[Path]) -> Scenario:
+    if isinstance(source, Scenario):
+        return source
+    if isinstance(source, Mapping):
+        return _validated(source)
+    found = [path for path in (Path(source), *(folder / source for folder in folders)) if path.is_file()]
+    return load_scenario(found[0] if found else Path(source))
+
+
+def _validated(data: Mapping[str, Any]) -> Scenario:
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(first_problem(error, Scenario)) from None
+
+
+def _plain(value: Any) -> Any:
+    """Faults and other sections as the data that a file would hold."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json", exclude_none=True)
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value

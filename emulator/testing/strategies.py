@@ -1,0 +1,61 @@
+"""A hypothesis strategy for schedules of faults. Needs hypothesis: `pip install vnet-emulator[testing]`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, TypeVar
+
+from hypothesis import strategies as st
+
+from emulator.testing.scenarios import Source, make_scenario
+from emulator.testing.schedules import Ground, draw_fault, known_kinds
+from vnet.faults import Fault
+
+T = TypeVar("T")
+
+
+class _Drawn:
+    """A Chooser whose choices hypothesis makes, and shrinks.
+
+    Whatever there are several of is drawn number first (and not with `st.lists`): hypothesis then learns to leave
+    out any of them, however large.
+    """
+
+    def __init__(self, draw: st.DrawFn) -> None:
+        self._draw = draw
+
+    def whole(self, low: int, high: int) -> int:
+        return self._draw(st.integers(low, high))
+
+    def one(self, items: Sequence[T]) -> T:
+        return self._draw(st.sampled_from(items))
+
+    def some(self, items: Sequence[T], most: int) -> list[T]:
+        chosen = {self.whole(0, len(items) - 1) for _ in range(self.whole(1, most))}
+        return [items[number] for number in sorted(chosen)]
+
+
+def faults(
+    scenario: Source, *, kinds: Sequence[str] | None = None, most: int = 4, **changes: Any
+) -> st.SearchStrategy[tuple[Fault, ...]]:
+    """Schedules of at most `most` faults for a scenario, changed as by `vnet_emulation`: give both the same.
+
+    A failing schedule shrinks to the fewest faults, then the earliest and shortest, of the fewest vehicles and
+    with the smallest parameters, that still fail; to none if it fails without.
+    """
+    allowed = known_kinds(kinds)
+
+    @cache
+    def ground() -> Ground:
+        return Ground.of(make_scenario(scenario, changes))
+
+    @st.composite
+    def fault(draw: st.DrawFn) -> Fault:
+        return draw_fault(_Drawn(draw), ground(), allowed)
+
+    @st.composite
+    def schedule(draw: st.DrawFn) -> tuple[Fault, ...]:
+        return tuple(draw(fault()) for _ in range(draw(st.integers(0, most))))
+
+    return schedule()

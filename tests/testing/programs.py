@@ -1,0 +1,46 @@
+"""Programs with planted mistakes, for campaigns and tests to find."""
+
+import asyncio
+
+from vnet import Node
+
+PERIOD_NS = 100_000_000
+
+
+async def impatient(node: Node) -> None:
+    """A beacon that crashes when it finds that it stood still."""
+    last_ns = node.now_ns
+    while True:
+        await asyncio.sleep(0.1)
+        await node.radio.broadcast(b"here")
+        if node.now_ns - last_ns > 2 * PERIOD_NS:
+            raise RuntimeError("where has the time gone?")
+        last_ns = node.now_ns
+
+
+async def proud(node: Node) -> None:
+    """A beacon that reports a number that is none when it hears nobody for half a second."""
+    heard_ns = 0
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        if node.radio.drain():
+            heard_ns = node.now_ns
+        alone = node.now_ns - heard_ns > 5 * PERIOD_NS
+        node.report((float("nan"), 0.0) if alone else fix.position_m, fix.covariance_m2)
+
+
+async def stubborn(node: Node) -> None:
+    """A beacon that hangs for good when it is started anew."""
+    while node.incarnation:
+        pass
+    async for _ in node.gnss:
+        await node.radio.broadcast(b"here")
+
+
+async def growing(node: Node) -> None:
+    """A beacon whose estimate is four times as far off with every fix."""
+    estimate_m = 1.0
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        estimate_m *= 4
+        node.report((estimate_m, 0.0), fix.covariance_m2)
