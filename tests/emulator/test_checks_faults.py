@@ -146,6 +146,27 @@ def test_many_faults_at_once_are_told_apart() -> None:
     assert invalid == set()
 
 
+@pytest.mark.parametrize("queue_frames", [2, 64])
+def test_what_a_throttle_left_waiting_does_not_make_later_frames_too_early(queue_frames: int) -> None:
+    slow = [fault("throttle", bitrate_mbps=0.0005), fault("throttle", bitrate_mbps=0.002, at_s=4.0, duration_s=1.0)]
+    evidence = simulated(*slow, run={"duration_s": 8.0, "settle_s": 2.0}, radio={"queue_frames": queue_frames})
+    assert not_valid(evidence) == {}
+
+
+def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
+    faults = [fault("StaleMessages", at_s=1.0, duration_s=3.0), fault("DataReplay", at_s=2.0), fault("block")]
+    everybody = [{**described, "nodes": {}, "senders": {}} for described in faults[2:]]
+    for described in faults[:2]:
+        described["nodes"] = {}
+    assert Verdict.INVALID not in not_valid(simulated(*faults[:2], *everybody)).values()
+
+
+def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None:
+    evidence = simulated(fault("kill", duration_s=1e-10))
+    assert not_valid(evidence) == {}
+    assert result(evidence, "bit:kill-0") == NotExercised("bit:kill-0", "it was healed before it began")
+
+
 @pytest.mark.parametrize("kind", ["partition", "block", "range", "swizzle"])
 def test_a_pair_that_passed_a_cut_is_found(kind: str) -> None:
     evidence = with_fault(kind)

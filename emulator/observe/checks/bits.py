@@ -25,7 +25,9 @@ def check_bits(evidence: Evidence) -> Iterator[Finding]:
     """One finding for each fault of the plan: it bit, or nothing shows that it did."""
     for planned in evidence.plan:
         name = f"bit:{planned.label}"
-        if planned.start_ns >= evidence.closed_ns:
+        if planned.start_ns == planned.end_ns:
+            yield NotExercised(name, "it was healed before it began")
+        elif planned.start_ns >= evidence.closed_ns:
             yield unknown(name, "the run ended before it began")
         else:
             yield _bit(evidence, planned, name)

@@ -11,7 +11,7 @@ from scipy.stats import binom
 from emulator.channel.outcomes import Outcome
 from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, Evidence, Mask, Whole
 from emulator.observe.checks.verdicts import Finding, NotExercised, result, unknown
-from vnet.faults import StaleMessages
+from vnet.faults import SenderFault, StaleMessages
 from vnet.roads.lanes import Array
 from vnet.scenario import NS_PER_S
 
@@ -236,11 +236,11 @@ def check_isolation(evidence: Evidence) -> Finding:
 
 def _foreign(evidence: Evidence) -> Mask:
     """Arrivals with other bytes than their frame's, though no fault says that it changed them."""
-    stale = evidence.caused_by("StaleMessages")
     differs = evidence.arrived & ~evidence.caused_by("corrupt") & changed_bytes(evidence)
-    differs |= evidence.arrived & _not_of_that_age(evidence, stale)
+    replaced = _replaced(evidence)
+    differs |= evidence.arrived & _not_of_that_age(evidence, replaced)
     # What a vehicle handed over and a stale frame took the place of is in no row of its own.
-    differs &= ~(evidence.caused_by("DataReplay") & np.isin(evidence.frame, evidence.frame[stale]))
+    differs &= ~(evidence.caused_by("DataReplay") & np.isin(evidence.frame, evidence.frame[replaced]))
     twice = np.flatnonzero(differs & received_twice(evidence))
     if len(twice):
         once = evidence.arrived & ~received_twice(evidence)
@@ -260,12 +260,30 @@ def changed_bytes(evidence: Evidence) -> Mask:
     return np.asarray(known[place] & (evidence.digest != said[place]))
 
 
-def _not_of_that_age(evidence: Evidence, stale: Mask) -> Mask:
+def _replaced(evidence: Evidence) -> Mask:
+    """Originals that a stale frame may have taken the place of. (Where they were cut, they name the cut.)
+
+    A sender's frames are remembered from when a fault first makes it misbehave.
+    """
+    replaced = np.zeros(len(evidence.trace), dtype=bool)
+    remembered_ns = np.full(len(evidence.node_ids), NEVER_NS)
+    for planned in evidence.plan:
+        if isinstance(planned.fault, SenderFault):
+            remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
+    for planned in evidence.plan:
+        if isinstance(planned.fault, StaleMessages):
+            old_ns = evidence.sent_ns - round(planned.fault.age_s * NS_PER_S) + evidence.guard_ns
+            acts = evidence.reached(planned, evidence.guard_ns) & (evidence.copy == 0)
+            replaced |= acts & (old_ns >= remembered_ns[evidence.sender])
+    return replaced
+
+
+def _not_of_that_age(evidence: Evidence, replaced: Mask) -> Mask:
     """Stale frames that are not what their sender sent so long ago, where that was not stale itself."""
-    wrong = np.zeros(len(stale), dtype=bool)
+    wrong = np.zeros(len(replaced), dtype=bool)
     sound = ~evidence.caused_by("corrupt")
     for planned in evidence.plan:
-        mine = np.flatnonzero(stale & (evidence.cause == planned.number))
+        mine = np.flatnonzero(evidence.cause == planned.number)
         if not isinstance(planned.fault, StaleMessages) or not len(mine):
             continue
         for sender in np.unique(evidence.sender[mine]):
@@ -275,7 +293,9 @@ def _not_of_that_age(evidence: Evidence, stale: Mask) -> Mask:
             before_ns = evidence.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
             place = np.searchsorted(evidence.sent_ns[own], before_ns, side="right") - 1
             old = own[np.maximum(place, 0)]
-            wrong[late] = (place < 0) | (sound[old] & ~stale[old] & (evidence.digest[late] != evidence.digest[old]))
+            wrong[late] = (place < 0) | (
+                sound[old] & ~replaced[old] & (evidence.digest[late] != evidence.digest[old])
+            )
     return wrong
 
 

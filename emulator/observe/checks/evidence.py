@@ -268,12 +268,18 @@ class Evidence:
         """When nodes were down: taken by a fault until it ended, or for good."""
         spans = []
         for planned in self.plan:
-            if planned.fault.kind in ("kill", "restart") and planned.start_ns < self.closed_ns:
-                end_ns = planned.end_ns if planned.end_ns < self.closed_ns else NEVER_NS
+            if planned.fault.kind in ("kill", "restart") and planned.start_ns < min(self.closed_ns, planned.end_ns):
                 for node in np.flatnonzero(planned.nodes).tolist():
                     if self.deaths_ns.get(node, NEVER_NS) > planned.start_ns:
-                        spans.append(Span(node, planned.start_ns, end_ns, True))
+                        spans.append(Span(node, planned.start_ns, self._back_ns(node, planned.end_ns), True))
         return spans + [Span(node, time_ns, NEVER_NS, False) for node, time_ns in self.deaths_ns.items()]
+
+    def _back_ns(self, node: int, end_ns: int) -> int:
+        """When a node was up again after a fault: at its end, or in real time as soon as its process was there."""
+        if self.scenario.run.pacing == "realtime":
+            there = (e.time_ns for e in self.event("restarted") if e.node == self.node_ids[node])
+            return min((time_ns for time_ns in there if time_ns >= end_ns), default=NEVER_NS)
+        return end_ns if end_ns < self.closed_ns else NEVER_NS
 
     def is_down(self, node: NDArray[np.intp], time_ns: Whole) -> Mask:
         """Which of these nodes are down at these instants."""

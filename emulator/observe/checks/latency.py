@@ -19,6 +19,7 @@ NS_PER_MS = 1_000_000
 BAND_SIGMAS = 4.9
 """One mean in a million is further off."""
 ROUNDING_NS = 2
+NO_EPISODE = -1
 
 
 @dataclass(frozen=True)
@@ -52,35 +53,70 @@ def _queue(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array, 
     The sender's queue is monotonic in its access delays: with none of them everything is at its earliest, with the
     longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter.
     """
-    radio = evidence.scenario.radio
-    sent = ~received_twice(evidence) & ~evidence.outcome_is("queue_full", "oversize")
-    bits = evidence.column("size_bytes") * 8_000
     fast_mbps, slow_mbps = _bitrates(evidence, plan)
-    fast_ns, slow_ns = np.rint(bits / fast_mbps), np.rint(bits / slow_mbps)
-    first = np.unique(evidence.emission[sent], return_index=True)[1]
-    first = np.flatnonzero(sent)[first]
+    bits = evidence.column("size_bytes") * 8_000
+    airtimes_ns = [np.rint(bits / mbps) for mbps in (evidence.scenario.radio.bitrate_mbps, fast_mbps, slow_mbps)]
     longest_ns = int(evidence.sent_ns.max(initial=0)) + 1
-    batch_key, batch = np.unique(evidence.sender * longest_ns + evidence.sent_ns, return_inverse=True)
-    batch_sender, batch_sent_ns = np.divmod(batch_key, longest_ns)
-    air_fast = np.bincount(batch[first], weights=fast_ns[first], minlength=len(batch_key))
-    air_slow = np.bincount(batch[first], weights=slow_ns[first], minlength=len(batch_key))
-    size = np.bincount(batch[first], minlength=len(batch_key))
-    start, end, waits = np.zeros(len(batch_key)), np.zeros(len(batch_key)), np.zeros(len(batch_key), dtype=bool)
-    for sender in np.unique(batch_sender):
-        mine = batch_sender == sender
-        sent_ns = batch_sent_ns[mine].astype(float)
-        earliest_end = _busy_until(sent_ns, air_fast[mine])
-        start[mine] = np.maximum(sent_ns, np.concatenate([[0.0], earliest_end[:-1]]))
-        end[mine] = _busy_until(sent_ns + radio.access_jitter_ms * NS_PER_MS, air_slow[mine])
-        waits[mine] = np.concatenate([[0.0], end[mine][:-1]]) > sent_ns
-    alone = ~waits & (size == 1)
-    return start[batch], end[batch], fast_ns, alone[batch]
+    key, batch = np.unique(evidence.sender * longest_ns + evidence.sent_ns, return_inverse=True)
+    offered = np.flatnonzero(~received_twice(evidence) & ~evidence.outcome_is("oversize"))
+    first = offered[np.unique(evidence.emission[offered], return_index=True)[1]]
+    taken = first[~evidence.outcome_is("queue_full")[first]]
+    sums = [np.bincount(batch[taken], weights=air[taken], minlength=len(key)) for air in airtimes_ns]
+    sums.append(np.bincount(batch[first], weights=airtimes_ns[0][first], minlength=len(key)))
+    sender, sent_ns = np.divmod(key, longest_ns)
+    start, end, waits = _courses(evidence, plan, sender, sent_ns, np.column_stack(sums))
+    alone = ~waits & (np.bincount(batch[first], minlength=len(key)) == 1)
+    return start[batch], end[batch], airtimes_ns[1], alone[batch]
 
 
-def _busy_until(ready_ns: Array, airtime_ns: Array) -> Array:
-    """When each transmission of one sender ends, if it starts when it is ready and the one before has ended."""
-    before_ns = np.concatenate([[0.0], np.cumsum(airtime_ns)[:-1]])
-    return np.asarray(np.maximum.accumulate(ready_ns - before_ns) + before_ns + airtime_ns)
+def _courses(
+    evidence: Evidence, plan: list[PlannedFault], sender: Whole, sent_ns: Whole, airtime_ns: Array
+) -> tuple[Array, Array, Mask]:
+    """Earliest start, latest end and whether it may have waited, of each batch (B,), in order of sender and time.
+
+    `airtime_ns` (B, 4) is of what was sent, at the bitrate of the radio, and at the fastest and the slowest that
+    faults leave; and of all that was offered, at that of the radio. A throttled sender has a queue of its own,
+    which begins as the plain one stands; afterwards the plain one goes on, as if it had never been slowed.
+    """
+    delay_ns = evidence.scenario.radio.access_jitter_ms * NS_PER_MS
+    start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
+    episode = _episodes(evidence, plan, sender, sent_ns)
+    who, plain, slow, within = -1, (0.0, 0.0), (0.0, 0.0), NO_EPISODE
+    for place, (node, time_ns, number) in enumerate(
+        zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), strict=True)
+    ):
+        usual, fast, slowest, offered = airtime_ns[place].tolist()
+        if node != who:
+            who, plain, within = node, (0.0, 0.0), NO_EPISODE
+        waits[place] = number != NO_EPISODE or plain[1] > time_ns
+        if number == NO_EPISODE:
+            start[place], end[place] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + usual
+            plain = start[place] + usual, end[place]
+        else:
+            slow = slow if number == within else plain
+            start[place], end[place] = max(time_ns, slow[0]), max(time_ns + delay_ns, slow[1]) + slowest
+            slow = start[place] + fast, end[place]
+            plain = plain[0], max(time_ns + delay_ns, plain[1]) + offered
+            if fast == usual < slowest:  # in real time: perhaps not throttled yet, or no longer
+                start[place], end[place] = max(time_ns, plain[0]), max(end[place], plain[1])
+        within = number
+    return start, end, waits
+
+
+def _episodes(evidence: Evidence, plan: list[PlannedFault], sender: Whole, sent_ns: Whole) -> Whole:
+    """For each batch the number of the time without a break in which its sender was throttled, or NO_EPISODE."""
+    episode = np.full(len(sender), NO_EPISODE, dtype=np.int64)
+    throttles = sorted((p for p in plan if isinstance(p.fault, Throttle)), key=lambda p: p.start_ns)
+    guard_ns = evidence.guard_ns
+    number = 0
+    for node in np.flatnonzero(np.any([p.nodes for p in throttles], axis=0)).tolist() if throttles else ():
+        until_ns = -1
+        for planned in (p for p in throttles if p.nodes[node] and p.start_ns < p.end_ns):
+            number += planned.start_ns > until_ns
+            until_ns = max(until_ns, planned.end_ns)
+            episode[(sender == node) & evidence.acting(planned, sent_ns, guard_ns)] = number
+        number += 1
+    return episode
 
 
 def _bitrates(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array]:
