@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-import agents.cooperative  # noqa: F401  (pytester forgets what a session imported, and numpy cannot come twice)
-import emulator.testing.harness  # noqa: F401
-
 pytest_plugins = "pytester"
 
 ROOT = Path(__file__).parents[2]
