@@ -123,7 +123,7 @@ class Outcome:
         """What the failed checks say, of the shrunk run if there is one."""
         trial = self.again if self.again is not None and self.again.failed else self.trial
         texts = {name: trial.texts[name] for name in trial.failed}
-        if self.again is not None and not self.again.failed:
+        if self.again is not None and self.again.verdicts and not self.again.failed:
             texts["replay"] = "the shrunk run failed, and did not when it was run again"
         return texts
 

@@ -127,6 +127,8 @@ class RunHarness:
 
     async def run_until(self, time_s: float) -> None:
         """Let emulated time pass up to `time_s`. Raises VnetError if the run ends before it."""
+        while self._run.started and not self._run.stands.done():  # another step, which was cancelled, goes on
+            await self._wait(self._run.stands)
         self._must_be_on("run_until")
         time_ns = round(time_s * NS_PER_S)
         if time_ns < self._now_ns:
@@ -137,6 +139,7 @@ class RunHarness:
         self._must_not_outlast(time_s)
         if time_ns == self._now_ns:
             return
+        self._now_ns = time_ns
         started = time.monotonic()
         await self._wait(self._run.go(time_ns))
         self._wall_s += time.monotonic() - started
@@ -145,7 +148,6 @@ class RunHarness:
             last = self.events[-1]
             why = " ".join(filter(None, (last.node, last.kind, str(last.details.get("error", "")))))
             raise VnetError(f"run_until({time_s:g}): the run has ended at {self.now_s:g} s: {why}")
-        self._now_ns = time_ns
 
     async def run_for(self, duration_s: float) -> None:
         """Let so many emulated seconds pass."""
@@ -160,8 +162,12 @@ class RunHarness:
             )
 
     def _must_be_on(self, what: str) -> None:
+        if not self._run.started:
+            raise VnetError(f"{what}: the run has not started: async with vnet_emulation(…) as emu:")
         if self._judgement is not None or self._run.over:
             raise VnetError(f"{what}: the run is over")
+        if not self._run.stands.done():
+            raise VnetError(f"{what}: the run is on its way to {self.now_s:g} s; wait for run_until")
 
     async def _wait(self, stands: Future[None]) -> None:
         # Shielded: a test that is cancelled must not take away what the run's thread will answer.
@@ -215,6 +221,8 @@ class RunHarness:
             self.end()
 
     def _finish(self) -> None:
+        if not self._run.started:
+            raise VnetError("end: the run has not started: async with vnet_emulation(…) as emu:")
         self._run.stands.result()  # a test that was cancelled left it on its way
         if self._run.over:
             return

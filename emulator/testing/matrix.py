@@ -31,7 +31,7 @@ Matrix = Mapping[str, Mapping[str, Counter[Verdict]]]
 def column_of(check: str) -> tuple[str, str | None]:
     """The column of a check, and the kind whose row alone it belongs to, if it is the check of one fault."""
     match = re.fullmatch(r"(\w+):(\w+)-\d+", check)
-    return (match[1], match[2]) if match else (check, None)
+    return (f"{match[1]} (its own)", match[2]) if match else (check, None)
 
 
 def count_verdicts(runs: Iterable[tuple[Sequence[str], Mapping[str, Verdict]]]) -> Matrix:

@@ -165,12 +165,12 @@ def test_the_matrix_counts_by_kind_and_check() -> None:
         (["kill", "loss"], {"range": valid, "bit:kill-0": valid, "bit:loss-1": unknown}),
         (["kill", "kill"], {"range": invalid, "bit:kill-0": valid, "bit:kill-1": invalid}),
     ]
-    assert column_of("bit:kill-0") == ("bit", "kill")
+    assert column_of("bit:kill-0") == ("bit (its own)", "kill")
     assert column_of("loss_rate") == ("loss_rate", None)
     matrix = count_verdicts(runs)
     assert matrix == {
-        "kill": {"range": Counter({valid: 1, invalid: 1}), "bit": Counter({valid: 2, invalid: 1})},
-        "loss": {"range": Counter({valid: 1}), "bit": Counter({unknown: 1})},
+        "kill": {"range": Counter({valid: 1, invalid: 1}), "bit (its own)": Counter({valid: 2, invalid: 1})},
+        "loss": {"range": Counter({valid: 1}), "bit (its own)": Counter({unknown: 1})},
     }
 
 

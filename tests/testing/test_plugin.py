@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-import agents.cooperative  # noqa: F401  (pytester forgets what a session imported, and numpy cannot come twice)
-import emulator.testing.harness  # noqa: F401
-
 pytest_plugins = "pytester"
 
 ROOT = Path(__file__).parents[2]
@@ -152,7 +149,10 @@ def test_plain(vnet_emulation):
     asyncio.run(steps())
 
 def test_never_started(vnet_emulation):
-    vnet_emulation(BEACON, vehicles=2)
+    emu = vnet_emulation(BEACON, vehicles=2)
+    for use in (emu.end, emu.check, lambda: asyncio.run(emu.run_until(1)), emu.fault("kill").__enter__):
+        with pytest.raises(Exception, match="the run has not started"):
+            use()
 
 async def test_of_nobody():
     pass
@@ -190,6 +190,34 @@ async def test_taken(vnet_emulation):
     )
     result.assert_outcomes(passed=1)
     result.stdout.fnmatch_lines(["*taken by the other*"])
+
+
+def test_a_step_that_was_cancelled_goes_on_and_the_next_waits_for_it(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+import asyncio
+
+async def test_cancelled(vnet_emulation):
+    async with vnet_emulation(TWELVE, vehicles=3, duration=2, settle=0.2) as emu:
+        step = asyncio.ensure_future(emu.run_until(0.5))
+        await asyncio.sleep(0)
+        step.cancel()
+        with pytest.raises(Exception, match="the run is on its way to 0.5 s"), emu.fault("kill"):
+            pass
+        await emu.run_until(1.0)
+        assert emu.figures.period == 9
+
+async def test_left_on_its_way(vnet_emulation):
+    async with vnet_emulation(TWELVE, vehicles=3, duration=2) as emu:
+        step = asyncio.ensure_future(emu.run_until(0.5))
+        await asyncio.sleep(0)
+        step.cancel()
+    assert emu.end().trace_sha256
+    assert emu.now_s == 0.5
+""",
+    )
+    result.assert_outcomes(passed=2)
 
 
 def test_hypothesis_calls_a_coroutine_test_again_and_again(pytester: pytest.Pytester) -> None:
