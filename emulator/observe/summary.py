@@ -65,7 +65,8 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
         if rows := check.figures.get("rows"):
-            console.print(_offending(check.name, rows))
+            console.print(Text(f"{check.name}: the first offending rows", style="bold red"))
+            console.print(_offending(rows))
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
 
@@ -78,10 +79,9 @@ def _left_out(judgement: Judgement) -> dict[str, list[str]]:
     return names
 
 
-def _offending(name: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+def _offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows that a failed check holds against the run."""
-    title = Text(f"{name}: the first offending rows", style="bold red")
-    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0))
+    table = Table(box=None, padding=(0, 1, 0, 0))
     columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
     for column in columns:
         table.add_column(column, overflow="fold")

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from emulator.observe.checks.channel import admitted_by_cap
 from emulator.observe.checks.evidence import Evidence, Mask
-from emulator.observe.checks.verdicts import NO_FAULTS, Finding, NotExercised, result
+from emulator.observe.checks.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import GnssFault
 from vnet.roads.lanes import Array
 from vnet.scenario import NS_PER_S
@@ -49,14 +49,6 @@ def _components(evidence: Evidence, among: Mask) -> list[Mask]:
     return [part for part in parts if part.sum() > 1]
 
 
-def _too_far(evidence: Evidence, values: Array, centre: Array, limit: Array | float) -> list[dict[str, Any]]:
-    apart = np.hypot(*(values - centre).T)
-    return [
-        {"node": evidence.node_ids[node], "off_m": float(apart[node])}
-        for node in np.flatnonzero(apart > limit).tolist()
-    ]
-
-
 def check_consensus_mean(evidence: Evidence) -> Finding:
     """At the end, every vehicle's mean is near the mean of what the vehicles of its component believe."""
     name = "consensus_mean"
@@ -66,27 +58,34 @@ def check_consensus_mean(evidence: Evidence) -> Finding:
     rested_s = (evidence.closed_ns - evidence.last_heal_ns) / NS_PER_S
     if rested_s < AT_REST_S:
         return NotExercised(name, f"{rested_s:.1f} s at rest; {AT_REST_S:g} s are needed")
-    second = max(1, NS_PER_S // evidence.scenario.period_ns)
-    up: Mask = np.asarray(ups(evidence)[-second:].all(axis=0))
-    off: list[dict[str, Any]] = []
-    judged, worst = 0, 0.0
-    for part in _components(evidence, up):
-        known = (
-            part & np.isfinite(common_m[-second:]).all(axis=(0, 2)) & np.isfinite(mean_m[-second:]).all(axis=(0, 2))
-        )
-        if not (part & ~honest(evidence)).any() and (known == part).all():
-            centre = common_m[-second:, part].mean(axis=1)[:, None]
-            error_m = np.full((len(up), 2), np.nan)
-            error_m[part] = np.median(mean_m[-second:, part] - centre, axis=0)
-            judged += int(part.sum())
-            worst = max(worst, float(np.nanmax(np.hypot(*error_m.T))))
-            off += _too_far(evidence, error_m, np.zeros(2), MEAN_TOLERANCE_M)
+    off_m = _off_the_mean(evidence, mean_m, common_m)
+    judged = int(np.isfinite(off_m).sum())
     if not judged:
         return NotExercised(name, "no component of which all are honest, up and sure of a mean")
-    text = f"{judged} vehicles' means within {worst:.2f} m of their component's"
-    figures = {"vehicles": judged, "worst_m": worst, "tolerance_m": MEAN_TOLERANCE_M}
+    worst_m = float(np.nanmax(off_m))
+    off = [
+        {"node": evidence.node_ids[node], "off_m": float(off_m[node])}
+        for node in np.flatnonzero(off_m > MEAN_TOLERANCE_M).tolist()
+    ]
+    figures = {"vehicles": judged, "worst_m": worst_m, "tolerance_m": MEAN_TOLERANCE_M}
+    text = f"{judged} vehicles' means within {worst_m:.2f} m of their component's"
     broken_text = f"{len(off)} of {judged} vehicles' means are over {MEAN_TOLERANCE_M:g} m off their component's"
+    if off and rested_s < WITHIN_S:
+        return unknown(name, f"{broken_text}, {rested_s:.1f} s at rest; {WITHIN_S:g} s are allowed", **figures)
     return result(name, len(off), text, broken_text, off, **figures)
+
+
+def _off_the_mean(evidence: Evidence, mean_m: Array, common_m: Array) -> Array:
+    """(N,), how far each vehicle's mean was off its component's over the last second; NaN where nobody can say."""
+    last = slice(-max(1, NS_PER_S // evidence.scenario.period_ns), None)
+    up: Mask = np.asarray(ups(evidence)[last].all(axis=0))
+    known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
+    off_m = np.full(len(up), np.nan)
+    for part in _components(evidence, up):
+        if (honest(evidence) & known)[part].all():
+            centre = common_m[last, part].mean(axis=1)[:, None]
+            off_m[part] = np.hypot(*np.median(mean_m[last, part] - centre, axis=0).T)
+    return off_m
 
 
 def check_convergence(evidence: Evidence) -> Finding:
@@ -103,7 +102,7 @@ def check_convergence(evidence: Evidence) -> Finding:
     before = deviation_m[start_ns + evidence.scenario.period_ns <= first_ns][-LEVEL_PERIODS:]
     level_m = float(np.nanmedian(before)) if np.isfinite(before).any() else np.nan
     limit_m = max(BACK_FACTOR * level_m, BACK_LEAST_M) if np.isfinite(level_m) else BACK_LEAST_M
-    late, recoveries = [], []
+    late, recoveries, cut = [], [], 0
     for heal_ns, until_ns in _rests(evidence):
         window = (start_ns >= heal_ns) & (start_ns < until_ns) & np.isfinite(deviation_m)
         back = np.flatnonzero(window & (deviation_m <= limit_m))
@@ -112,11 +111,14 @@ def check_convergence(evidence: Evidence) -> Finding:
         elif window.any():
             best_m = float(deviation_m[window].min())
             late.append({"heal_s": heal_ns / NS_PER_S, "until_s": until_ns / NS_PER_S, "deviation_m": best_m})
+            cut += until_ns - heal_ns < round(WITHIN_S * NS_PER_S)
     if not late and not recoveries:
         return NotExercised(name, "no fault was left to heal in peace")
     figures = {"level_m": level_m if np.isfinite(level_m) else None, "limit_m": limit_m, "recovered_s": recoveries}
     text = f"agreement within {limit_m:.2f} m again, {max(recoveries, default=0):.1f} s after a fault at most"
     broken_text = f"no agreement within {limit_m:.2f} m after {len(late)} heals"
+    if late and cut == len(late):
+        return unknown(name, f"{broken_text}, but the run was over before {WITHIN_S:g} s had passed", **figures)
     return result(name, len(late), text, broken_text, late, **figures)
 
 
