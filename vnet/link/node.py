@@ -233,7 +233,8 @@ class Node:
 
         Any further keyword is a number or an array of numbers; the emulator's metrics know
         `common_error_m` (2,), `common_error_covariance_m2` (2, 2), `mean_m` (2,) (the consensus),
-        `stacked_common_error_m` (2,) and `cloud_m` (n, 2). Raises ValueError on a wrong shape or on something
+        `stacked_common_error_m` (2,) and `cloud_m` (n, 2); `heard` is how many packets came since the last report,
+        which is held against the trace. Raises ValueError on a wrong shape or on something
         that is not a number.
         """
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
