@@ -102,7 +102,7 @@ WRONG = [
     ("delay", {"delay_ms": 0}, ["delay.delay_ms = 0", "greater than 0"]),
     ("duplicate", {"copies": 21}, ["duplicate.copies = 21", "less than or equal to 20"]),
     ("corrupt", {"flips": 1.5}, ["corrupt.flips = 1.5", "integer"]),
-    ("throttle", {"bitrate_mbps": 0}, ["throttle.bitrate_mbps = 0", "greater than 0"]),
+    ("throttle", {"bitrate_mbps": 0}, ["throttle.bitrate_mbps = 0", "greater than or equal to 0.0001"]),
     ("gnss_jump", {"offset_m": [1]}, ["gnss_jump.offset_m.1", "required"]),
     ("gnss_jump", {"offset_m": [1, "east"]}, ["gnss_jump.offset_m.1 = 'east'", "number"]),
     ("skew", {"offset_ms": 1e9}, ["skew.offset_ms", "less than or equal to 3600000"]),

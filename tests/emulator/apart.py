@@ -5,11 +5,13 @@ pass through the wire's encoding, a kill leaves a loop where it stands, and an e
 """
 
 import asyncio
+import atexit
 import queue
 import threading
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from emulator.observe.run_folder import RunFolder
@@ -22,6 +24,10 @@ from vnet.link import wire
 from vnet.link.hosting import Host, load_programs
 from vnet.link.virtual_time import SpinError, VirtualTimeLoop
 from vnet.scenario import Scenario
+
+_folders = TemporaryDirectory(prefix="vnet-apart-")
+atexit.register(_folders.cleanup)
+_numbers = count()
 
 
 class Killed(BaseException):
@@ -49,7 +55,7 @@ def scenario_of(faults: Sequence[dict[str, Any]], program: str, vehicles: int = 
 
 def emulation_of(scenario: Scenario) -> Emulation:
     """The state of a run of `scenario`, in a new folder."""
-    folder = RunFolder.create(Path(mkdtemp()) / "run", scenario)
+    folder = RunFolder.create(Path(_folders.name) / str(next(_numbers)), scenario)
     return Emulation(scenario, build_world(scenario), folder)
 
 

@@ -378,6 +378,26 @@ def test_one_more_fault_changes_nothing_for_the_pairs_it_does_not_touch(seed: in
     assert before == after
 
 
+def test_copies_of_one_fault_do_not_depend_on_how_many_another_made() -> None:
+    """A flood's copies are drawn for themselves, though the duplicates of other pairs take numbers in between."""
+    flood = fault("DoS", nodes={"ids": ["v1"]}, factor=5)
+    replay = fault("DataReplay", nodes={"ids": ["v1"]}, age_s=0.3)
+    more = fault("duplicate", probability=0.5, senders={"ids": ["v1"]}, receivers={"ids": ["v2"]})
+    one, other = Air([flood, replay], loss=0.5), Air([flood, replay, more], loss=0.5)
+    for air in (one, other):
+        air.chat(30)
+    before, after = (
+        Counter(
+            (*pair(row), row["seq"], row["outcome"], row["arrival_ns"])
+            for row in air.rows()
+            if row["receiver"] != "v2"
+        )
+        for air in (one, other)
+    )
+    assert before == after
+    assert max(row["copy"] for row in other.rows()) > max(row["copy"] for row in one.rows())
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.lists(st.sampled_from(EVERYTHING), max_size=5))
 def test_one_more_vehicle_out_of_range_changes_nobodys_luck(seed: int, faults: list[dict[str, Any]]) -> None:
