@@ -107,11 +107,11 @@ def tempering(
 def divergence(
     networks: NetworksOption = None,
     seeds: SeedsOption = 100,
-    duration: Annotated[float, typer.Option(min=1, help="Emulated seconds on N1 and N2; N3 runs for 100.")] = 30.0,
+    duration: Annotated[float, typer.Option(min=1, help="Emulated seconds.")] = 30.0,
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
-    """Does the default profile ever diverge? Many seeds on each network, the worst of them, N3 in full."""
+    """Does the default profile ever diverge? Many seeds on each network, and the worst of them."""
     from emulator.experiments import divergence as study
 
     with one_line_errors():

@@ -8,26 +8,24 @@ from typing import Any
 import numpy as np
 
 from emulator.experiments.cells import DIVERGENT_M, DIVERGENT_S, Cell
-from emulator.experiments.paper import DEFAULT_ROWS, DEFAULT_S, Labels, counted_from, default_scenario
+from emulator.experiments.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table
 
-IN_FULL = "n3"
-"""The sparsest network, where a vehicle goes astray first: its runs have their full length."""
-SHORT_S = 30.0
+LENGTH_S = 30.0
+"""A vehicle that goes astray does so at first, before anybody knows the common error."""
 
 
 def divergence_cells(
-    networks: dict[str, dict[str, Any]], seeds: Sequence[int], duration_s: float = SHORT_S
+    networks: dict[str, dict[str, Any]], seeds: Sequence[int], duration_s: float = LENGTH_S
 ) -> list[Cell]:
-    """Optimized weights on all networks; N3 in full, the others for `duration_s`."""
+    """Optimized weights on all networks, for `duration_s`."""
     cells = []
     for network, section in networks.items():
-        length_s = DEFAULT_S if network == IN_FULL else duration_s
         for seed in seeds:
-            labels: Labels = {"network": network, "mechanism": "optimized", "seed": seed, "duration_s": length_s}
-            scenario = default_scenario(section, seed, DEFAULT_ROWS["optimized"], length_s)
-            cells.append(Cell(labels, scenario, counted_from(length_s)))
+            labels: Labels = {"network": network, "mechanism": "optimized", "seed": seed, "duration_s": duration_s}
+            scenario = default_scenario(section, seed, DEFAULT_ROWS["optimized"], duration_s)
+            cells.append(Cell(labels, scenario, counted_from(duration_s)))
     return cells
 
 
