@@ -55,7 +55,8 @@ def test_the_tempering_is_swept_once_and_leaves_a_table_its_numbers_and_a_pictur
 
 
 def test_divergence_is_counted_over_the_seeds_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(divergence, "DEFAULT_S", 2.0)
+    small = partial(divergence.divergence_cells, duration_s=2.0)
+    monkeypatch.setattr(divergence, "divergence_cells", lambda networks, seeds, _: small(networks, seeds))
     text = run_small(monkeypatch, tmp_path, "divergence")
     assert "0 of 2 runs had a vehicle that diverged: with 95 % confidence, less than 78 %" in text
     rows = pq.read_table(tmp_path / "divergence.parquet").to_pylist()
