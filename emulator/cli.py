@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import shlex
-import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -264,7 +263,6 @@ def campaign(
     fix_hash_seed("emulator.cli")
     from emulator.testing.campaign import Plan, run_campaign
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # either ends it early and keeps what is there
     with one_line_errors():
         sys.path.append(str(Path.cwd()))
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)

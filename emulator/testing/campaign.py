@@ -9,10 +9,12 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import signal
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -207,9 +209,11 @@ class Campaign:
         """What was over, or given up half shrunk, when the campaign was interrupted."""
         taken = {outcome.seed for outcome in self.outcomes}
         for future in futures:
-            done = not future.cancelled() and future.exception() is None
-            if done and future.result().seed not in taken:
-                self._take(future.result())
+            if future.cancelled() or future.exception() is not None:
+                continue
+            outcome = future.result()
+            if outcome.seed not in taken and outcome.trial.verdicts:
+                self._take(outcome)
 
     def _one(self, number: int) -> Outcome:
         scenario = self._plan.draw(number)
@@ -291,6 +295,26 @@ def _folders(name: str) -> Iterator[Path]:
         yield RUNS / (name if number == 1 else f"{name}-{number}")
 
 
+@contextmanager
+def _interrupted_once() -> Iterator[None]:
+    """Ctrl-C and SIGTERM interrupt the block once: a second one must not lose what there is."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        for each in before:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = {each: signal.signal(each, interrupt) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
+
+
 def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
     """Run a campaign, and say what came of it; returns the exit status. Raises VnetError.
 
@@ -302,7 +326,7 @@ def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
         raise VnetError(f"--out {folder}: exists and is not an empty folder")
     folder.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as progress:
+    with _interrupted_once(), Progress(*columns, console=console) as progress:
         campaign = Campaign(plan, folder, progress)
         campaign.run()
     if campaign.failures:

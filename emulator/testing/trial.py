@@ -52,6 +52,10 @@ class Trial:
         return cls({name: Verdict.INVALID}, {name: text})
 
 
+UNKNOWN = Trial({}, {})
+"""Of a run that was given up."""
+
+
 def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     """Simulate and judge a run in this process. Raises VnetError if it cannot be run."""
     started = time.monotonic()
@@ -94,6 +98,8 @@ class Workshop:
 
     def run(self, scenario: Scenario, folder: Path) -> Trial:
         """A trial; one that hangs, or ends its process, has failed. Once closed: one that nothing is known of."""
+        if self.closed:
+            return UNKNOWN
         receiver, sender = self._context.Pipe(duplex=False)
         arguments = (scenario, folder, sender, self.limit_s)
         process = self._context.Process(target=_apart, args=arguments, daemon=True)
@@ -103,6 +109,8 @@ class Workshop:
             return self._await(receiver)
         except EOFError:
             process.join()
+            if self.closed:
+                return UNKNOWN
             return Trial.failure(EMULATOR, f"the process ended with status {process.exitcode}")
         finally:
             process.kill()
@@ -113,7 +121,7 @@ class Workshop:
         deadline = time.monotonic() + self.limit_s
         while not receiver.poll(POLL_S):
             if self.closed:
-                return Trial({}, {})
+                return UNKNOWN
             if time.monotonic() > deadline:
                 text = f"not over within {self.limit_s:g} s of wall clock; logs/stacks.txt says where it stood"
                 return Trial.failure(HUNG, text)
@@ -128,7 +136,8 @@ class Workshop:
 
 def _apart(scenario: Scenario, folder: Path, sender: Connection, limit_s: float) -> None:
     """The process of a trial."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the campaign's
+    for number in (signal.SIGINT, signal.SIGTERM):  # they are the campaign's, which kills this process if it must
+        signal.signal(number, signal.SIG_IGN)
     run_folder = RunFolder.create(folder, scenario)
     with (run_folder.logs / "stacks.txt").open("w") as stacks:
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)

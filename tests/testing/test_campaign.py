@@ -2,6 +2,7 @@
 
 import io
 import json
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -96,11 +97,19 @@ def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch
     def interrupted(futures: list) -> Iterator:
         futures[0].result()
         yield futures[0]
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGTERM)
 
+    def write_under_fire(self: campaign.Campaign) -> None:
+        signal.raise_signal(signal.SIGINT)  # a second one
+        write(self)
+
+    write = campaign.Campaign.write
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(campaign, "as_completed", interrupted)
+    monkeypatch.setattr(campaign.Campaign, "write", write_under_fire)
     status, _ = run(Plan.of(planted("impatient"), "loss", 40, seed=1, jobs=1), tmp_path / "campaign")
     assert status == 130
+    assert signal.getsignal(signal.SIGTERM) == before
     results = results_of(tmp_path / "campaign")
     assert 1 <= len(results) < 40
     assert results[0]["seed"] == 1
