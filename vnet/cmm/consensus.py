@@ -239,6 +239,7 @@ class RatioConsensus:
     def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
+        self._usual_weight = 1.0
         self._running_sum = np.zeros(3)
         self._takers = takers
         self._changed_rounds = 0
@@ -259,13 +260,10 @@ class RatioConsensus:
         then too much for it.
         """
         self._mean_rounds += 1
-        if not self.epoch or self._age < self._config.settle_rounds:
-            return
         weight = float(self._mass[2])
-        if self._age == self._config.settle_rounds:
-            self._usual_weight = weight
         self._usual_weight += (weight - self._usual_weight) / self._config.silence_rounds
-        if weight >= LEAST_SHARE * self._usual_weight:
+        settled = self.epoch and self._age >= self._config.settle_rounds
+        if settled and weight >= LEAST_SHARE * self._usual_weight:
             self._mean, self._mean_rounds = self._mass[:2] / weight, 0
 
     def _split(self) -> None:
