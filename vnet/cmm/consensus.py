@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -102,6 +102,10 @@ class Peers:
         """Peers heard lately that hear this node as well."""
         return frozenset(peer for peer, hears in self._hears_us.items() if hears)
 
+    def longest_silence(self, peers: Set[str]) -> int:
+        """For how many rounds the most silent of `peers` has not been heard."""
+        return max((self._silent.get(peer, 0) for peer in peers), default=0)
+
     def drop(self, peer: str) -> None:
         """Forget a peer at once."""
         self._silent.pop(peer, None)
@@ -118,8 +122,10 @@ class Peers:
             self._hears_us[peer] = self._node in share.heard
 
 
-LEAST_SHARE = 0.3
-"""A ratio of a smaller share of the usual mass is not taken for the mean; the one before serves."""
+LEAST_SHARE, USUAL_ROUNDS = 0.6, 50
+"""A ratio of less than this share of the mass usual in so many rounds is not taken for the mean."""
+DOUBTFUL_ROUNDS = 6
+"""Nor is one while a peer that is given to has been silent for so long: at 10 % loss that is one chance in 10⁶."""
 
 
 class RatioConsensus:
@@ -257,14 +263,15 @@ class RatioConsensus:
         """Take the ratio for the mean, where it can be trusted.
 
         Whoever gives to peers that have died keeps next to nothing of what is usual, and changes of its input are
-        then too much for it.
+        then too much for it; in the end for all, whose mass goes there too.
         """
         self._mean_rounds += 1
-        weight = float(self._mass[2])
-        self._usual_weight += (weight - self._usual_weight) / self._config.silence_rounds
+        weight = float(self._mass[2]) * (len(self._takers) + 1)  # before it was split
+        self._usual_weight += (weight - self._usual_weight) / USUAL_ROUNDS
         settled = self.epoch and self._age >= self._config.settle_rounds
-        if settled and weight >= LEAST_SHARE * self._usual_weight:
-            self._mean, self._mean_rounds = self._mass[:2] / weight, 0
+        doubtful = self._peers.longest_silence(self._takers) >= DOUBTFUL_ROUNDS
+        if settled and not doubtful and weight >= LEAST_SHARE * self._usual_weight:
+            self._mean, self._mean_rounds = self._mass[:2] / self._mass[2], 0
 
     def _split(self) -> None:
         if self.epoch:
