@@ -264,14 +264,14 @@ class RandomPos(_NodeFault):
 
 
 class DataReplay(_NodeFault):
-    """With each frame the nodes send one of their own from `age_s` ago again."""
+    """With each frame the nodes send one of their own from `age_s` ago again, of those since the fault began."""
 
     kind: Literal["DataReplay"]
     age_s: float = Field(1.0, gt=0, le=60)
 
 
 class StaleMessages(_NodeFault):
-    """In place of each frame the nodes send the one from `age_s` ago."""
+    """In place of each frame the nodes send the one from `age_s` ago, once there is one since the fault began."""
 
     kind: Literal["StaleMessages"]
     age_s: float = Field(1.0, gt=0, le=60)
