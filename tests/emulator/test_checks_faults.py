@@ -15,7 +15,7 @@ from emulator.observe.checks import CheckResult, Evidence, NotExercised, Verdict
 from emulator.observe.metrics import STATES
 from emulator.observe.run_folder import Event
 from tests.emulator.test_checks import damaged, result, run_scenario, timely, verdict
-from vnet.faults import KINDS
+from vnet.faults import KINDS, parse_fault
 from vnet.link.node import Node
 from vnet.scenario import Scenario
 
@@ -455,3 +455,13 @@ def test_memory_is_judged_by_its_growth(growth_kb_per_s: float, node: str, expec
     else:
         assert verdict(judged, "memory") is expected
     assert isinstance(result(evidence, "memory"), NotExercised)
+
+
+def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> None:
+    evidence = with_fault("DataReplay")
+    replayed = some(evidence, "delivered", "lost", cause="DataReplay-0", copies=True)
+    original = evidence.sent_ns[(evidence.copy == 0) & (evidence.frame == evidence.frame[replayed[5]])][0]
+    other = parse_fault({"kind": "gnss_outage", "at_s": original / 1e9, "duration_s": 0.5, "nodes": {"random": 1}})
+    run = evidence.scenario.run.model_copy(update={"pacing": "realtime"})
+    both = evidence.scenario.model_copy(update={"run": run, "fault": (*evidence.scenario.fault, other)})
+    assert verdict(replace(evidence, scenario=both), "copies") is Verdict.VALID

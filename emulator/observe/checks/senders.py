@@ -27,8 +27,8 @@ def check_copies(evidence: Evidence) -> Finding:
     name = "copies"
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in evidence.plan):
         return NotExercised(name, "no fault sends frames again" if evidence.plan else NO_FAULTS)
-    sent = np.flatnonzero(~received_twice(evidence) & ~_near_a_change(evidence))
-    first = sent[np.unique(evidence.emission[sent], return_index=True)[1]]
+    once = ~received_twice(evidence)
+    first = _first_rows(evidence, once & ~_near_a_change(evidence))
     originals, copies = first[evidence.copy[first] == 0], first[evidence.copy[first] > 0]
     frame_ns = dict(_of(evidence, originals))
     at_once = np.array([frame_ns.get(f) == t for f, t in _of(evidence, copies)], dtype=bool)
@@ -38,7 +38,8 @@ def check_copies(evidence: Evidence) -> Finding:
     place = np.searchsorted(evidence.frame[originals][order], again)
     counted[order[place]] = often
     wrong = originals[counted != _due(evidence, originals)]
-    odd = _replayed_wrongly(evidence, copies[~at_once], originals)
+    # What is replayed may have been sent near a change.
+    odd = _replayed_wrongly(evidence, copies[~at_once], _first_rows(evidence, once & (evidence.copy == 0)))
     broken = len(wrong) + len(odd)
     text = f"{len(copies):,} frames sent again, as often and as late as they should be"
     broken_text = f"{len(wrong)} frames not sent as often as they should be, {len(odd)} replayed at another time"
@@ -70,6 +71,12 @@ def _due(evidence: Evidence, rows: Rows) -> Whole:
             case Sybil(ghosts=ghosts):
                 due += acts * ghosts
     return due
+
+
+def _first_rows(evidence: Evidence, wanted: NDArray[np.bool_]) -> Rows:
+    """The first row of each emission (a frame, or a copy of one) among the rows `wanted`."""
+    rows = np.flatnonzero(wanted)
+    return np.asarray(rows[np.unique(evidence.emission[rows], return_index=True)[1]])
 
 
 def _replayed_wrongly(evidence: Evidence, late: Rows, originals: Rows) -> list[int]:
