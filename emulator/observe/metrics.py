@@ -42,6 +42,8 @@ STATES = pa.schema(
         "values": pa.map_(pa.string(), pa.list_(pa.float64())),
     }
 )
+ROWS_A_PIECE = 2048
+"""How many states are kept as Python's numbers at most, but for the rest of a period."""
 _COMMON_VALUES = {
     "common_error_m": "common_error_estimate_m",
     "common_error_covariance_m2": "common_error_covariance_m2",
@@ -90,6 +92,7 @@ class Metrics:
         self._period_ns = period_ns
         self.rows: list[PeriodFigures] = []
         self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
+        self._packed: list[pa.Table] = []
 
     def record(self, instant: Instant, reports: Sequence[Report]) -> PeriodFigures:
         """Take the last report of each node in one period; returns the period's figures."""
@@ -162,10 +165,18 @@ class Metrics:
                 fits = isinstance(value, list) and len(value) == _SIZES.get(name, len(value))
                 states[column].append(value if fits else None)
             states["values"].append([(k, v if isinstance(v, list) else [v]) for k, v in sorted(values.items())])
+        if len(states["period"]) >= ROWS_A_PIECE:
+            self._pack()
+
+    def _pack(self) -> None:
+        """Put the rows so far into a table: as Python's numbers they take up many times the room."""
+        self._packed.append(pa.table(self._states, schema=STATES))
+        self._states = {name: [] for name in STATES.names}
 
     def states_table(self) -> pa.Table:
         """A row for each node and period; schema `STATES`."""
-        return pa.table(self._states, schema=STATES)
+        self._pack()
+        return pa.concat_tables(self._packed).unify_dictionaries()
 
     def metrics_table(self) -> pa.Table:
         """A row for each period; columns are the fields of `PeriodFigures`."""

@@ -179,6 +179,21 @@ def test_the_tables_come_back_from_their_files(tmp_path: Path) -> None:
     assert kept.metrics_table()["time_ns"].to_pylist() == [0, 100_000_000]
 
 
+@given(rows_a_piece=st.integers(1, 9), periods=st.integers(0, 8))
+def test_states_do_not_depend_on_how_many_are_packed_at_a_time(rows_a_piece: int, periods: int) -> None:
+    tables = []
+    for rows in (rows_a_piece, 10_000):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("emulator.observe.metrics.ROWS_A_PIECE", rows)
+            kept = metrics()
+            for period in range(periods):
+                said = [Report(0, "a", (1.0, float(period)), None, {"cloud_m": [1.0] * period})]
+                kept.record(instant(POSITION_M, np.ones(2), POSITION_M, period), said[: period % 3])
+            tables.append(kept.states_table())
+    assert tables[0].to_pylist() == tables[1].to_pylist()
+    assert tables[0].schema == tables[1].schema
+
+
 def test_a_summary_passes_over_the_first_fifth_and_what_was_not_reported() -> None:
     kept = metrics()
     for period, x_m in enumerate([1000.0, 1000.0, 1.0, 2.0, None, 3.0, 4.0, None, 5.0, 6.0]):
