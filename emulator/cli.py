@@ -22,6 +22,7 @@ from rich.console import Console
 from emulator.experiments.cli import app as experiment_app
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
+from emulator.map_cli import app as map_app
 from emulator.observe.checks import check_run, recorded_verdict
 from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
@@ -50,6 +51,7 @@ app = typer.Typer(
 )
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(fault_app, name="fault")
+app.add_typer(map_app, name="map")
 app.command()(status)
 
 

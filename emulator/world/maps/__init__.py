@@ -1,0 +1,1 @@
+"""Maps of real and invented cities: reading, writing, drawing and generating them."""

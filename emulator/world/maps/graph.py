@@ -1,0 +1,276 @@
+"""Maps as nodes and directed edges in a NumPy archive (NPZ), read and written.
+
+`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m` and
+`node_y_m`, of which `frame_proj` and `frame_offset_m` say where on the earth they are. Optional, one an edge:
+`edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.world.maps.classes import LANE_WIDTH_M, LANES, MOST_LANES, NAMES, NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
+from emulator.world.maps.frame import Frame, frame_around
+from emulator.world.maps.roads import MOST_POINTS, Ints, Roads, check_extent
+from vnet.errors import ScenarioError, printable, shown
+from vnet.roads.lanes import Array
+
+LARGEST_ARRAY_BYTES = 16 * MOST_POINTS
+_LONGEST_TEXT = 1000
+
+Arrays = dict[str, NDArray[np.generic]]
+
+
+def read_graph(path: Path, frame: Frame | None) -> Roads:
+    """Read roads; positions in degrees get a frame around their middle unless one is given.
+
+    Edges that meet where no others do, and are of one kind, become one road. Raises ScenarioError that names the
+    array and the entry.
+    """
+    arrays = _load(path)
+    node_m, frame = _nodes(path, arrays, frame)
+    edges = _edges(path, arrays, len(node_m))
+    return _Merger(path, node_m, edges, frame).roads()
+
+
+def _load(path: Path) -> Arrays:
+    """All arrays that are known, none of them larger than `LARGEST_ARRAY_BYTES`."""
+    known = "node_lon_deg node_lat_deg node_x_m node_y_m edges edge_class edge_lanes edge_lane_width_m".split()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for entry in archive.infolist():
+                if entry.file_size > LARGEST_ARRAY_BYTES:
+                    raise ScenarioError(f"{path}: {entry.filename}: larger than {LARGEST_ARRAY_BYTES} bytes")
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in (*known, "frame_proj", "frame_offset_m") if name in file}
+    except (ValueError, EOFError, KeyError, OSError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
+        raise ScenarioError(f"{path}: not a NumPy archive: {printable(str(error), 300)}") from None
+
+
+def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) -> Array:
+    """An array of finite numbers (count,)."""
+    if name not in arrays:
+        raise ScenarioError(f"{path}: no array {name!r}")
+    array = arrays[name]
+    if array.ndim != 1 or array.dtype.kind not in "iuf" or count not in (None, len(array)):
+        wanted = "one-dimensional" if count is None else f"of shape ({count},)"
+        raise ScenarioError(f"{path}: {name}: numbers {wanted} are needed, not {array.dtype} {array.shape}")
+    numbers = array.astype(float)
+    if not np.isfinite(numbers).all():
+        raise ScenarioError(f"{path}: {name}[{int(np.argmin(np.isfinite(numbers)))}]: a finite number is needed")
+    return numbers
+
+
+def _nodes(path: Path, arrays: Arrays, frame: Frame | None) -> tuple[Array, Frame | None]:
+    if "node_lon_deg" not in arrays:
+        if "node_x_m" not in arrays:
+            raise ScenarioError(f"{path}: neither 'node_lon_deg' nor 'node_x_m' is among its arrays")
+        x = _numbers(path, arrays, "node_x_m")
+        return np.column_stack([x, _numbers(path, arrays, "node_y_m", len(x))]), _frame(path, arrays)
+    lon = _numbers(path, arrays, "node_lon_deg")
+    lat = _numbers(path, arrays, "node_lat_deg", len(lon))
+    for name, degrees, limit in (("node_lon_deg", lon, 180.0), ("node_lat_deg", lat, 90.0)):
+        beyond = np.abs(degrees) > limit
+        if beyond.any():
+            at = int(np.argmax(beyond))
+            raise ScenarioError(f"{path}: {name}[{at}] = {degrees[at]:g}: not within ±{limit:g}; is it WGS-84?")
+    if not len(lon):
+        raise ScenarioError(f"{path}: no nodes")
+    frame = frame or frame_around(lat, lon)
+    return frame.to_local(lat, lon), frame
+
+
+def _frame(path: Path, arrays: Arrays) -> Frame | None:
+    if "frame_proj" not in arrays:
+        return None
+    proj = arrays["frame_proj"]
+    if proj.shape or proj.dtype.kind != "U" or len(str(proj)) > _LONGEST_TEXT:
+        raise ScenarioError(f"{path}: frame_proj: one text is needed")
+    x, y = _numbers(path, arrays, "frame_offset_m", 2).tolist()
+    return Frame(str(proj), (x, y))
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Directed edges (E, 2) and what is known of each (E,)."""
+
+    ends: Ints
+    kind: Ints
+    lanes: Ints
+    lane_width_m: Array
+
+
+def _edges(path: Path, arrays: Arrays, nodes: int) -> _Edges:
+    if "edges" not in arrays:
+        raise ScenarioError(f"{path}: no array 'edges'")
+    ends = arrays["edges"]
+    if ends.ndim != 2 or ends.shape[1] != 2 or ends.dtype.kind not in "iu":
+        raise ScenarioError(f"{path}: edges: pairs of integers are needed, not {ends.dtype} {ends.shape}")
+    missing = (ends < 0) | (ends >= nodes)  # type: ignore[operator]
+    if missing.any():
+        at = int(np.argmax(missing.any(axis=1)))
+        which = ends[at][missing[at]][0]
+        raise ScenarioError(f"{path}: edges[{at}]: node {which} does not exist; nodes are 0 to {nodes - 1}")
+    kind = _kinds(path, arrays, len(ends))
+    lanes, width_m = LANES[kind], LANE_WIDTH_M[kind]
+    if "edge_class" not in arrays:
+        lanes = np.ones(len(ends), dtype=np.intp)
+    if "edge_lanes" in arrays:
+        lanes = _within(path, arrays, "edge_lanes", len(ends), 1, MOST_LANES).astype(np.intp)
+    if "edge_lane_width_m" in arrays:
+        width_m = _within(path, arrays, "edge_lane_width_m", len(ends), NARROWEST_M, WIDEST_M)
+    return _Edges(ends.astype(np.intp), kind, lanes, width_m)
+
+
+def _within(path: Path, arrays: Arrays, name: str, count: int, least: float, most: float) -> Array:
+    numbers = _numbers(path, arrays, name, count)
+    wrong = (numbers < least) | (numbers > most)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise ScenarioError(f"{path}: {name}[{at}] = {numbers[at]:g}: {least:g} to {most:g} allowed")
+    return numbers
+
+
+def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
+    if "edge_class" not in arrays:
+        return np.full(count, UNKNOWN)
+    names = arrays["edge_class"]
+    if names.shape != (count,) or names.dtype.kind != "U":
+        raise ScenarioError(f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}")
+    distinct, which = np.unique(names, return_inverse=True)
+    for at, name in enumerate(distinct.tolist()):
+        if name not in NUMBER:
+            edge = int(np.argmax(which == at))
+            raise ScenarioError(f"{path}: edge_class[{edge}] = {shown(name)}: allowed are {', '.join(NAMES)}")
+    return np.array([NUMBER[name] for name in distinct.tolist()], dtype=np.intp)[which]
+
+
+class _Merger:
+    """Makes roads of edges: both directions of one, then a chain of those that just go on, become one road."""
+
+    def __init__(self, path: Path, node_m: Array, edges: _Edges, frame: Frame | None) -> None:
+        self._path, self._node_m, self._frame = path, node_m, frame
+        self._notes: dict[str, int] = {}
+        ends = self._pair(edges)
+        # Edges at each node, one after another.
+        self._order = np.argsort(ends.T.ravel(), kind="stable") % max(1, len(ends))
+        self._degree = np.bincount(ends.ravel(), minlength=len(node_m))
+        self._begin = np.concatenate([[0], np.cumsum(self._degree)])
+        self._ends: list[list[int]] = ends.tolist()
+
+    def _pair(self, edges: _Edges) -> Ints:
+        """The edges without their twins (the other direction, and duplicates); returns their ends (U, 2)."""
+        low, high = edges.ends.min(axis=1), edges.ends.max(axis=1)
+        real = low != high
+        self._note("edges without length", int((~real).sum()))
+        against = edges.ends[:, 0] > edges.ends[:, 1]
+        key = low * len(self._node_m) + high
+        _, first, which = np.unique(key[real], return_index=True, return_inverse=True)
+        number = np.flatnonzero(real)
+        lanes = np.zeros((2, len(first)), dtype=np.intp)  # from the lower node to the higher, and back
+        np.maximum.at(lanes, (against[number].astype(np.intp), which), edges.lanes[number])
+        self._note("edges given twice", int(real.sum() - (lanes > 0).sum()))
+        first = number[first]
+        swapped = lanes[0] == 0
+        self._lanes = np.where(swapped, lanes[::-1], lanes)
+        self._kind, self._width_m = edges.kind[first], edges.lane_width_m[first]
+        ends = np.column_stack([low[first], high[first]])
+        ends[swapped] = ends[swapped, ::-1]
+        return ends
+
+    def _note(self, what: str, count: int) -> None:
+        if count:
+            self._notes[what] = count
+
+    def roads(self) -> Roads:
+        """All roads. Raises ScenarioError without any."""
+        check_extent(self._path, self._node_m, len(self._ends))
+        chains = list(self._chains())
+        node = np.array([n for chain, _ in chains for n in chain], dtype=np.intp)
+        first = np.concatenate([[0], np.cumsum([len(chain) for chain, _ in chains])])
+        edge = np.array([edge for _, edge in chains], dtype=np.intp)
+        lanes = self._lanes[:, edge]
+        used, node = np.unique(node, return_inverse=True)
+        self._note("nodes without an edge", len(self._node_m) - len(used))
+        return Roads(
+            self._node_m[used],
+            node,
+            first,
+            tuple(f"edge {number}" for number in edge.tolist()),
+            self._kind[edge],
+            lanes[0],
+            lanes[1],
+            self._width_m[edge],
+            lanes.min(axis=0) == 0,
+            self._frame,
+            self._notes,
+        )
+
+    def _chains(self) -> Iterator[tuple[list[int], int]]:
+        """Nodes of each road, and one of its edges, whose direction is the road's."""
+        done = bytearray(len(self._ends))
+        goes_on = self._goes_on().tolist()
+        for edge, (start, end) in enumerate(self._ends):
+            if not done[edge]:
+                done[edge] = 1
+                ahead = self._walk(edge, end, done, goes_on)
+                behind = self._walk(edge, start, done, goes_on)
+                yield [*reversed(behind), start, end, *ahead], edge
+
+    def _walk(self, edge: int, node: int, done: bytearray, goes_on: list[bool]) -> list[int]:
+        """The nodes that follow `node` on the road of `edge`."""
+        found = []
+        while goes_on[node]:
+            begin = self._begin[node]
+            one, other = self._order[begin], self._order[begin + 1]
+            edge = int(other if one == edge else one)
+            if done[edge]:
+                break  # a ring
+            done[edge] = 1
+            start, end = self._ends[edge]
+            node = end if start == node else start
+            found.append(node)
+        return found
+
+    def _goes_on(self) -> NDArray[np.bool_]:
+        """Nodes (N,) where exactly two edges meet that are the same road's."""
+        two = np.flatnonzero(self._degree == 2)
+        one, other = self._order[self._begin[two]], self._order[self._begin[two] + 1]
+        ends = np.array(self._ends, dtype=np.intp).reshape(-1, 2)
+        # As seen from the node: lanes that come in on the one side go out on the other.
+        out = [np.where(ends[e, 0] == two, self._lanes[0, e], self._lanes[1, e]) for e in (one, other)]
+        into = [np.where(ends[e, 0] == two, self._lanes[1, e], self._lanes[0, e]) for e in (one, other)]
+        same = (into[0] == out[1]) & (into[1] == out[0])
+        same &= (self._kind[one] == self._kind[other]) & (self._width_m[one] == self._width_m[other])
+        goes_on = np.zeros(len(self._node_m), dtype=np.bool_)
+        goes_on[two[same]] = True
+        return goes_on
+
+
+def write_graph(roads: Roads, path: Path) -> None:
+    """Write an NPZ that `read_graph` reads: in degrees where the roads' place on the earth is known."""
+    start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
+    road = roads.road_of[roads.segment]
+    ahead, back = roads.forward[road] > 0, roads.backward[road] > 0
+    edge_road = np.concatenate([road[ahead], road[back]])
+    arrays = {
+        "node_x_m": roads.node_m[:, 0],
+        "node_y_m": roads.node_m[:, 1],
+        "edges": np.concatenate(
+            [np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]
+        ).astype(np.int32),
+        "edge_class": np.array(NAMES)[roads.kind[edge_road]],
+        "edge_lanes": np.concatenate([roads.forward[road[ahead]], roads.backward[road[back]]]).astype(np.uint8),
+        "edge_lane_width_m": roads.lane_width_m[edge_road],
+    }
+    if roads.frame is not None:
+        arrays["frame_proj"] = np.array(roads.frame.proj)
+        arrays["frame_offset_m"] = np.array(roads.frame.offset_m)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)

@@ -1,0 +1,258 @@
+"""Roads: centre lines between shared points, and what is known of each; all readers end here.
+
+From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side on
+which people drive. A road with lanes one way only has its centre line in the middle of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
+from emulator.world.maps.frame import WIDEST_M, Frame
+from vnet.errors import ScenarioError
+from vnet.roads.lanes import Array
+from vnet.roads.road_map import RoadMap
+
+MOST_POINTS = 5_000_000
+"""A map has no more points: a large city has a tenth of that."""
+NARROWEST_SPACE_M = 0.3
+"""Half-width left to a vehicle's centre in a lane that is hardly wider than the vehicle."""
+_SHARPEST = 0.5
+"""At a bend sharper than 120° a lane's corner is cut: 1 + cos of the turn is no less."""
+
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Roads:
+    """R roads through N points.
+
+    Road r runs through the points `node[first[r]:first[r + 1]]` of `node_m` (N, 2), two at least; roads meet where
+    they share a point. `name` (R,) is what the file calls them; `kind` (R,) their class, an index into `NAMES`;
+    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame` says
+    where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
+    """
+
+    node_m: Array
+    node: Ints
+    first: Ints
+    name: tuple[str, ...]
+    kind: Ints
+    forward: Ints
+    backward: Ints
+    lane_width_m: Array
+    one_way: NDArray[np.bool_]
+    frame: Frame | None = None
+    notes: dict[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    @cached_property
+    def road_of(self) -> Ints:
+        """Which road each entry of `node` belongs to, (P,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.first))
+
+    @cached_property
+    def segment(self) -> Ints:
+        """Entries of `node` from which a segment goes to the next entry, (G,)."""
+        return np.flatnonzero(self.road_of[:-1] == self.road_of[1:])
+
+    @cached_property
+    def segment_length_m(self) -> Array:
+        """Lengths (G,) of the segments of the centre lines."""
+        place = self.node_m[self.node]
+        return np.asarray(np.hypot(*(place[self.segment + 1] - place[self.segment]).T))
+
+    @cached_property
+    def length_m(self) -> Array:
+        """Lengths (R,) of the centre lines."""
+        return np.bincount(self.road_of[self.segment], self.segment_length_m, minlength=len(self))
+
+    def within(self, low_m: Array, high_m: Array) -> Roads:
+        """The roads of which a point lies in the box from `low_m` (2,) to `high_m` (2,)."""
+        place = self.node_m[self.node]
+        inside = ((place >= low_m) & (place <= high_m)).all(axis=1)
+        return self.only(np.bincount(self.road_of[inside], minlength=len(self)) > 0)
+
+    def only(self, kept: NDArray[np.bool_]) -> Roads:
+        """The roads marked in `kept` (R,), and the points that they run through."""
+        used, node = np.unique(self.node[kept[self.road_of]], return_inverse=True)
+        first = np.concatenate([[0], np.cumsum(np.diff(self.first)[kept])])
+        name = tuple(name for name, stays in zip(self.name, kept.tolist(), strict=True) if stays)
+        return replace(
+            self,
+            node_m=self.node_m[used],
+            node=node,
+            first=first,
+            name=name,
+            kind=self.kind[kept],
+            forward=self.forward[kept],
+            backward=self.backward[kept],
+            lane_width_m=self.lane_width_m[kept],
+            one_way=self.one_way[kept],
+        )
+
+    # Lanes.
+
+    def lane_map(self, drive_on: str = "right", sigma_m: float = 0.0) -> RoadMap:
+        """The directed lanes of all roads; `drive_on` is `right` or `left`, `sigma_m` as in `RoadMap`."""
+        road, aside_m, against = self._lanes(1.0 if drive_on == "right" else -1.0)
+        counts = np.diff(self.first)[road]
+        lane = np.repeat(np.arange(len(road)), counts)
+        number = np.arange(len(lane)) - np.repeat(np.cumsum(counts) - counts, counts)
+        entry = np.where(against[lane], self.first[road + 1][lane] - 1 - number, self.first[road][lane] + number)
+        place = self.node_m[self.node[entry]] + aside_m[lane, None] * self._aside[entry]
+        step = place[1:] - place[:-1]
+        ahead = self.node_m[self.node[entry[1:]]] - self.node_m[self.node[entry[:-1]]]
+        # Inside a tight bend a lane's short segments turn round: they are no road.
+        goes_on = (lane[1:] == lane[:-1]) & (np.einsum("ij,ij->i", step, ahead) > 0)
+        segment = np.flatnonzero(goes_on)
+        of_lane = lane[segment]
+        of_road = road[of_lane]
+        return RoadMap(
+            place[segment],
+            np.mod(np.arctan2(step[segment, 1], step[segment, 0]), 2 * np.pi),
+            np.hypot(step[segment, 0], step[segment, 1]),
+            np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, NARROWEST_SPACE_M),
+            self.kind[of_road].astype(np.uint8),
+            self.one_way[of_road],
+            of_road.astype(np.int32),
+            of_lane.astype(np.int32),
+            NAMES,
+            sigma_m,
+        )
+
+    def _lanes(self, side: float) -> tuple[Ints, Array, NDArray[np.bool_]]:
+        """All lanes: their road, how far right of its centre line as one drives along it, and who goes against it."""
+        counts = self.forward + self.backward
+        road = np.repeat(np.arange(len(self)), counts)
+        number = np.arange(len(road)) - np.repeat(np.cumsum(counts) - counts, counts)
+        against = number >= self.forward[road]
+        place = np.where(against, number - self.forward[road], number) + 0.5
+        one_sided = (self.forward == 0) | (self.backward == 0)
+        place = np.where(one_sided[road], place - counts[road] / 2, place)
+        return road, side * np.where(against, -1, 1) * place * self.lane_width_m[road], against
+
+    @cached_property
+    def _aside(self) -> Array:
+        """Where the point of each entry of `node` goes when its road is moved right by a metre, (P, 2)."""
+        place = self.node_m[self.node]
+        step = place[1:] - place[:-1]
+        length_m = np.hypot(step[:, 0], step[:, 1])
+        right = np.column_stack([step[:, 1], -step[:, 0]]) / np.where(length_m > 0, length_m, 1)[:, None]
+        right[self.road_of[:-1] != self.road_of[1:]] = 0.0
+        after, before = np.vstack([right, [[0, 0]]]), np.vstack([[[0, 0]], right])
+        both = after.any(axis=1) & before.any(axis=1)
+        scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), _SHARPEST), 1.0)
+        return np.asarray((after + before) / scale[:, None])
+
+
+@dataclass
+class _Row:
+    """What is known of a road while a file is read."""
+
+    name: str
+    kind: int
+    forward: int
+    backward: int
+    lane_width_m: float
+    one_way: bool
+
+
+class RoadsBuilder:
+    """Collects roads as a reader comes by them; points are told apart by a key of the reader's choice."""
+
+    def __init__(self, source: object) -> None:
+        self._source = source
+        self._number: dict[object, int] = {}
+        self._place: list[tuple[float, float]] = []
+        self._node: list[int] = []
+        self._first = [0]
+        self._rows: list[_Row] = []
+        self.notes: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def note(self, what: str) -> None:
+        """Count something odd."""
+        self.notes[what] = self.notes.get(what, 0) + 1
+
+    def add(
+        self,
+        name: str,
+        points: Iterable[tuple[object, tuple[float, float]]],
+        kind: int,
+        lanes: tuple[int, int],
+        lane_width_m: float,
+        one_way: bool | None = None,
+    ) -> None:
+        """A road through points, each with its key; `lanes` are forward and backward. Two equal points are one.
+
+        Raises ScenarioError when there are more points than `MOST_POINTS`.
+        """
+        nodes: list[int] = []
+        for key, place in points:
+            number = self._number.setdefault(key, len(self._place))
+            if number == len(self._place):
+                self._place.append(place)
+            if nodes and nodes[-1] == number:
+                self.note("points twice in a row")
+            else:
+                nodes.append(number)
+        if len(nodes) < 2:
+            self.note("roads without length")
+            return
+        self._node += nodes
+        if len(self._node) > MOST_POINTS:
+            raise ScenarioError(f"{self._source}: {name}: more than {MOST_POINTS} points; cut out a part first")
+        self._first.append(len(self._node))
+        if one_way is None:
+            one_way = 0 in lanes
+        self._rows.append(_Row(name, kind, *lanes, lane_width_m, one_way))
+
+    def places(self) -> Array:
+        """The coordinates of the points so far, (N, 2)."""
+        return np.array(self._place, dtype=float).reshape(-1, 2)
+
+    def build(self, node_m: Array, frame: Frame | None) -> Roads:
+        """The roads, with the points' places in metres (N, 2). Raises ScenarioError without roads or too far apart."""
+        check_extent(self._source, node_m, len(self._rows))
+        return Roads(
+            node_m,
+            np.array(self._node, dtype=np.intp),
+            np.array(self._first, dtype=np.intp),
+            tuple(row.name for row in self._rows),
+            _column([row.kind for row in self._rows]),
+            _column([row.forward for row in self._rows]),
+            _column([row.backward for row in self._rows]),
+            np.array([row.lane_width_m for row in self._rows]),
+            np.array([row.one_way for row in self._rows], dtype=np.bool_),
+            frame,
+            self.notes,
+        )
+
+
+def _column(values: Sequence[int]) -> Ints:
+    return np.array(values, dtype=np.intp)
+
+
+def check_extent(source: object, node_m: Array, roads: int) -> None:
+    """Raises ScenarioError where there are no roads, or where their points lie too far apart to be one map."""
+    if not roads:
+        raise ScenarioError(f"{source}: no roads that vehicles may use")
+    if not np.isfinite(node_m).all():
+        raise ScenarioError(f"{source}: positions that its projection does not reach")
+    span_m = float(np.ptp(node_m, axis=0).max())
+    if span_m > WIDEST_M:
+        raise ScenarioError(
+            f"{source}: spans {span_m / 1000:.0f} km; at most {WIDEST_M / 1000:.0f} are allowed: "
+            "are all points in the same projection?"
+        )
