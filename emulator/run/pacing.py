@@ -18,7 +18,6 @@ from vnet.errors import VnetError
 from vnet.link import wire
 from vnet.link.node import INBOX_LIMIT, Packet
 
-
 WORST_PROCESSES = 8
 """How many are named of those to which deliveries came late."""
 
