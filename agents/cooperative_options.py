@@ -58,7 +58,7 @@ class Options:
     self_floor: float = 0.0
     """Least weight of the vehicle itself, if `fusion = "optimized"`; 0 to 1."""
     ridge_m2: float = 0.0
-    """If positive, the same ridge for all in the weights' quadratic program, in place of each estimate's variance."""
+    """If positive, the ridge of the weights' quadratic program, in place of each estimate's own variance."""
     fusion_interval_s: float = 0.2
     """Time between two fusions."""
     particles: int = 200

@@ -26,16 +26,16 @@ loss_bad = 0.9
 ```
 """
 COMMON = """
-Faults of vehicles have `nodes` besides; those of links also have `senders` and `receivers`, and act on links with an
-end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
+Faults of vehicles have `nodes` besides; those of links also have `senders` and `receivers`, and act on links with
+an end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
 """
 SELECTORS = """
 A selector is a table with one of these keys; without it, all vehicles are meant. So `nodes = { random = 3 }`, or
 `--set nodes.random=3` at the command line.
 """
 MISBEHAVIOUR = """
-Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what payloads
-mean: lies in them are a program, `agents.liar:main`, for some vehicles
+Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what
+payloads mean: lies in them are a program, `agents.liar:main`, for some vehicles
 ([`[[program.exceptions]]`](scenario.md#programexceptions)).
 """
 INFRASTRUCTURE = """
@@ -72,9 +72,8 @@ def page() -> str:
 def _group(kinds: tuple[Kind, ...]) -> Iterator[str]:
     """All kinds of a group in a table, and the keys of those that have some."""
     own = {kind: key_table(kind, without=_without(kind)) for kind in kinds}
-    yield table(
-        ["kind", "of", "what happens"], ([_linked(kind, own[kind]), _of(kind), docstring(kind)] for kind in kinds)
-    )
+    rows = ([_linked(kind, keys), _of(kind), docstring(kind)] for kind, keys in own.items())
+    yield table(["kind", "of", "what happens"], rows)
     for kind in kinds:
         if own[kind]:
             yield f"### `{_name(kind)}`"

@@ -26,7 +26,7 @@ FOLDER = {
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
-    "verdict.json": "[the verdict](#verdictjson): checks with their figures, and the command that has the run again",
+    "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the way in for `vnet fault` and `vnet status`; there while a live run is on",
