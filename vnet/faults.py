@@ -76,13 +76,16 @@ class _LinkFault(_Fault):
 
 
 class Kill(_NodeFault):
-    """The processes are killed (SIGKILL); when the fault ends they start anew, as new incarnations."""
+    """The processes are killed (SIGKILL); when the fault ends the programs start anew.
+
+    `node.incarnation` is then one higher, and `node.rng` another stream.
+    """
 
     kind: Literal["kill"]
 
 
 class Restart(_NodeFault):
-    """The programs are ended in order (their `finally` blocks run) and start anew when the fault ends."""
+    """As `kill`, but the programs are ended in order: their `finally` blocks run."""
 
     kind: Literal["restart"]
 
@@ -253,7 +256,10 @@ class GnssFreeze(_NodeFault):
 
 
 class Skew(_NodeFault):
-    """The nodes' clocks are off by a constant."""
+    """The nodes' clocks are off by a constant.
+
+    `node.now_ns`, the times at which packets are received, and all timers of a program go by them.
+    """
 
     kind: Literal["skew"]
     offset_ms: float = Field(ge=-3.6e6, le=3.6e6)
@@ -261,7 +267,7 @@ class Skew(_NodeFault):
 
 
 class Drift(_NodeFault):
-    """The nodes' clocks run too fast or too slow."""
+    """The nodes' clocks run too fast or too slow. As `skew`, they are what a program goes by."""
 
     kind: Literal["drift"]
     rate_ppm: float = Field(ge=-500_000, le=500_000)
