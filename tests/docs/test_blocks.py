@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -99,6 +100,6 @@ def test_an_excerpt_is_told_from_what_is_none(shown: str, is_excerpt: bool) -> N
     ],
     ids=["no trigger", "no machine", "two things at once", "no action"],
 )
-def test_a_workflow_that_is_none_fails(workflow: dict) -> None:
+def test_a_workflow_that_is_none_fails(workflow: dict[str, Any]) -> None:
     with pytest.raises(DocsError):
         check_workflow(workflow)

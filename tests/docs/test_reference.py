@@ -13,6 +13,7 @@ from docs.generate.keys import key_table
 from docs.generate.markdown import attribute_docstrings
 from emulator.channel.outcomes import Outcome
 from emulator.observe.checks import OF_BELIEFS, OF_FRAMES, OF_THE_RADIO, OF_THE_RUN
+from emulator.observe.metrics import STATES
 from emulator.observe.run_folder import RunFolder
 from emulator.run.conclude import conclude
 from emulator.run.emulation import Emulation
@@ -74,7 +75,7 @@ class Example:
 
 def test_a_column_without_a_text_is_refused() -> None:
     with pytest.raises(LookupError, match="cloud_m"):
-        files.columns(files.STATES, {name: text for name, text in files.STATE.items() if name != "cloud_m"})
+        files.columns(STATES, {name: text for name, text in files.STATE.items() if name != "cloud_m"})
 
 
 def event_kinds() -> set[str]:
