@@ -94,8 +94,8 @@ EVENTS = {
     "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
     "late_deliveries": (
         "",
-        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`",
-        "real time: all deliveries, those over 20 ms late, and how late they were",
+        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`",
+        "real time: all deliveries, those over 20 ms late, how late they were, and the processes with most of them",
     ),
 }
 VERDICT = {
