@@ -101,9 +101,9 @@ class Trace:
         """Give rows their outcome."""
         self._rows["outcome"][rows] = outcome
 
-    def rows(self, numbers: NDArray[np.intp]) -> NDArray[np.void]:
-        """A copy of these rows, as records of type `ROW`."""
-        return self._rows[numbers]
+    def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
+        """These rows as records of type `ROW`, which they are: to be read only."""
+        return self._rows[which]
 
     def to_table(self) -> pa.Table:
         """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy)."""

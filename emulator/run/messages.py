@@ -66,7 +66,7 @@ class Messages:
         """The rows that the last message did not see decided."""
         trace = self._emulation.engine.trace
         number = np.concatenate([self._undecided, np.arange(self._seen, len(trace))])
-        rows = trace.rows(number)
+        rows = np.concatenate([trace.rows(self._undecided), trace.rows(slice(self._seen, len(trace)))])
         # In real time a frame of the next period may have been sent by now, and its fate be known.
         self._undecided = number[(rows["outcome"] == Outcome.pending) | (decided_ns(rows) >= end_ns)]
         self._seen = len(trace)
