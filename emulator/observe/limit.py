@@ -67,7 +67,10 @@ class Limit:
         squares = np.zeros(len(self._node_ids))
         for label, rbpf in enumerate(self._filters):
             group = self._component == label
-            rbpf.step(elapsed_s, {self._node_ids[i]: self._see(fix_m[i], heading_rad[i]) for i in np.flatnonzero(group & seen)})
+            rbpf.step(
+                elapsed_s,
+                {self._node_ids[i]: self._see(fix_m[i], heading_rad[i]) for i in np.flatnonzero(group & seen)},
+            )
             squares[group] = np.sum((rbpf.estimate_m - truth_m) ** 2)
         reporting = np.isfinite(unpack(period["common_error_estimate_m"], 2)).all(axis=1)
         return float(np.sqrt(squares[reporting].mean())) if reporting.any() else None

@@ -186,6 +186,7 @@ def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
             recording.set_sinks(*_rerun_sinks(sinks))
         except RuntimeError as error:
             raise VnetError(f"{sinks.save}: cannot write the recording: {error}") from None
+        recording.set_log_time_enabled(False)  # emulated time is all that counts
         stack.callback(recording.disconnect)
         stack.callback(recording.flush, timeout_sec=CLOSE_TIMEOUT_S)
         recording.send_recording_name(name)
