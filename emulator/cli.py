@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, view, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -26,6 +26,7 @@ from emulator.observe.checks import check_run, recorded_verdict
 from emulator.observe.run_folder import RunFolder
 from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
+from emulator.playback_cli import play, render
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
@@ -54,6 +55,8 @@ app.add_typer(experiment_app, name="experiment")
 app.add_typer(fault_app, name="fault")
 app.command()(status)
 app.command()(view)
+app.command()(render)
+app.command()(play)
 
 
 class Pacing(StrEnum):
