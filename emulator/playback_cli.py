@@ -25,12 +25,17 @@ from vnet.scenario import NS_PER_S
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who draw need it
     from emulator.observe.recorder import Recorder
 
+VehicleOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="The vehicle that is looked at closely; by default the first.")
+]
+
 
 def render(
     run: RunArgument = LATEST,
     out: Annotated[
         Path | None, typer.Option(help=f"The recording to write; the default is RUN/{RECORDING}.")
     ] = None,
+    vehicle: VehicleOption = None,
 ) -> None:
     """Make a run's recording anew, from its files alone."""
     with one_line_errors():
@@ -38,13 +43,13 @@ def render(
         recording = out or run / RECORDING
         if not recording.parent.is_dir():
             raise VnetError(f"{recording}: there is no folder {recording.parent}")
-        RunFolder(recording.parent).put(recording.name, lambda part: _write_recording(played, part))
+        RunFolder(recording.parent).put(recording.name, lambda part: _write_recording(played, part, vehicle))
         print(recording)
 
 
-def _write_recording(played: Iterator[Message], path: Path) -> None:
+def _write_recording(played: Iterator[Message], path: Path, vehicle: str | None) -> None:
     stream, scene = next(played)
-    with _recorder(Sinks(save=path), scene["name"]) as recorder:
+    with _recorder(Sinks(save=path), scene["name"], vehicle) as recorder:
         recorder.take(stream, scene)
         console = Console(stderr=True)
         total = scene["duration_ns"] / scene["period_ns"]
@@ -56,9 +61,10 @@ def _write_recording(played: Iterator[Message], path: Path) -> None:
 
 def play(
     run: RunArgument = LATEST,
-    speed: Annotated[float, typer.Option(help="Emulated seconds a second.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="How many times as fast as real time.")] = 1.0,
     start: Annotated[float, typer.Option("--from", min=0.0, help="Emulated second to begin at.")] = 0.0,
     end: Annotated[float | None, typer.Option("--to", help="Emulated second to stop at.")] = None,
+    vehicle: VehicleOption = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
@@ -76,7 +82,7 @@ def play(
         scheduled = schedule(played, speed, round(start * NS_PER_S), None if end is None else round(end * NS_PER_S))
         sinks = Sinks(serve=place_to_serve(rerun_bind, rerun_port), spawn=has_display() and not serve)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
+        with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"], vehicle) as recorder:
             recorder.take(stream, scene)
             assert sinks.serve is not None
             print(f"playing {run} at {speed:g}× real time\n{sinks.serve.told()}", flush=True)
@@ -86,7 +92,7 @@ def play(
             signal.pause()
 
 
-def _recorder(sinks: Sinks, name: str) -> Recorder:
+def _recorder(sinks: Sinks, name: str, vehicle: str | None) -> Recorder:
     from emulator.observe.recorder import Recorder
 
-    return Recorder(sinks, name)
+    return Recorder(sinks, name, vehicle)
