@@ -234,7 +234,7 @@ def test_faults_and_the_dead_have_their_spans(entities: dict[str, Entity]) -> No
     assert spans == {
         "/faults/kill-0": {1.0: ["acting"], 2.0: [""]},
         "/faults/partition-1": {1.2: ["acting"], 1.8: [""]},
-        "/faults/down": {1.0: ["1: v02"], 2.0: [""]},
+        "/faults/down": {0.0: ["none"], 1.0: ["1: v02"], 2.0: ["none"]},
     }
 
 
