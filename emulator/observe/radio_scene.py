@@ -61,7 +61,8 @@ class RadioScene:
     def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
         self._canvas = canvas
         self._count = len(scene["node_ids"])
-        self._period_s = scene["period_ns"] / 1e9
+        self._period_ns: int = scene["period_ns"]
+        self._period_s = self._period_ns / 1e9
         self._range_m: float | None = scene["range_m"]
         periods = round(WINDOW_S / self._period_s)
         self._tried, self._delivered = Window(periods), Window(periods)
@@ -88,7 +89,7 @@ class RadioScene:
 
     def _stack(self, period: Period) -> None:
         """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back."""
-        times = period.time_s + self._period_s * np.arange(2 * STROKES) / (2 * STROKES)
+        times_ns = (period.time_ns + self._period_ns * np.arange(2 * STROKES) // (2 * STROKES)).tolist()
         lower = 0.0
         for outcome, colour in OUTCOME_COLOURS.items():
             count = period.message["outcomes"].get(outcome.name, 0)
@@ -101,7 +102,7 @@ class RadioScene:
                 self._canvas.log(entity, style, static=True)
             if entity in self._announced:
                 layer = [lower, lower + count] * STROKES if count else [np.nan]
-                self._canvas.plot_at(entity, times[: len(layer)].tolist(), layer)
+                self._canvas.plot_at(entity, times_ns[: len(layer)], layer)
             lower += count
 
     def _load(self, period: Period) -> None:
