@@ -6,11 +6,12 @@ Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 1
 from __future__ import annotations
 
 import asyncio
+import json
 import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,10 +32,10 @@ from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
 from emulator.run.live import run_live
-from emulator.run.progress import ProgressLine
+from emulator.run.progress import Progress, show_progress
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
-from emulator.terminal import one_line_errors
+from emulator.terminal import LogFormat, one_line_errors, run_app
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.link.access import Access, Credentials, is_tls
@@ -96,6 +97,19 @@ RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into
 DeterminismOption = Annotated[
     bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
 ]
+LogFormatOption = Annotated[
+    LogFormat, typer.Option(help="json: one object a line on stderr, and verdict.json in one line on stdout.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors, and the verdict in one line.")]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was asked for beside the run itself."""
+
+    log_format: LogFormat
+    quiet: bool
+    check_determinism: bool = False
 
 
 @app.command()
@@ -112,9 +126,11 @@ def run(
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    with one_line_errors():
+    with one_line_errors(log_format):
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
@@ -127,7 +143,8 @@ def run(
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate)
-            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, check_determinism)
+            asked = Asked(log_format, quiet, check_determinism)
+            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, asked)
 
 
 @app.command()
@@ -140,19 +157,22 @@ def simulate(
     overrides: SetOption = None,
     rerun: RerunOption = Rerun.OFF,
     check_determinism: DeterminismOption = False,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
-    with one_line_errors():
+    with one_line_errors(log_format):
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         sys.path.append(str(Path.cwd()))
         emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
-        with ExitStack() as stack:
-            if rerun is Rerun.SAVE:
-                _record_here(emulation, stack)
-            stack.enter_context(ProgressLine(emulation))
-            wall_s, interrupted = run_simulation(emulation)
-        _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
+        with show_progress(emulation, log_format, quiet) as progress:
+            with ExitStack() as stack:
+                if rerun is Rerun.SAVE:
+                    _record_here(emulation, stack)
+                wall_s, interrupted = run_simulation(emulation)
+            asked = Asked(log_format, quiet, check_determinism)
+            _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
 
 
 def _record_here(emulation: Emulation, stack: ExitStack) -> None:
@@ -183,9 +203,11 @@ def emulator(
     out: OutOption = None,
     overrides: SetOption = None,
     rerun: RerunOption = Rerun.OFF,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
-    with one_line_errors():
+    with one_line_errors(log_format):
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
@@ -195,9 +217,9 @@ def emulator(
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
-        print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
         options = LiveOptions(users, listen, connect, launch=False)
-        _run_live(loaded, world, folder, rerun, options)
+        where = f"credentials of the agents: {access}/credentials/NODE.json"
+        _run_live(loaded, world, folder, rerun, options, Asked(log_format, quiet), where)
 
 
 @app.command("access")
@@ -334,16 +356,19 @@ def _run_live(
     folder: RunFolder,
     rerun: Rerun,
     options: LiveOptions,
-    check_determinism: bool = False,
+    asked: Asked,
+    first_of_all: str | None = None,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
     if rerun is Rerun.SAVE:
         options = replace(options, record=folder.path / "recording.rrd")
-    with ProgressLine(emulation) as progress:
-        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
-    _finish(emulation, wall_s, interrupted, "run", check_determinism)
+    with show_progress(emulation, asked.log_format, asked.quiet) as progress:
+        if first_of_all is not None:
+            progress.state(first_of_all)
+        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state, on_missing=progress.awaits))
+        _finish(emulation, progress, wall_s, interrupted, "run", asked)
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:
@@ -353,17 +378,31 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
-def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str, check_determinism: bool) -> None:
+def _finish(
+    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: Asked
+) -> None:
+    """Judge a run and print its summary; exits with the verdict's status."""
+    progress.judging()
     judgement, verdict = conclude(emulation, wall_s, command)
-    if check_determinism and not interrupted:
-        verdict = run_again(emulation, judgement, verdict, command)
-    print_summary(judgement, verdict, emulation.folder.path, Console())
-    raise typer.Exit(130 if interrupted else judgement.exit_status)
+    progress.close()
+    if asked.check_determinism and not interrupted:
+        again = ["--quiet"] if asked.quiet or asked.log_format is LogFormat.JSON else []
+        verdict = run_again(emulation, judgement, verdict, command, again)
+    status = 130 if interrupted else judgement.exit_status
+    folder = emulation.folder.path
+    progress.ended(verdict, str(folder), status)
+    if asked.log_format is LogFormat.JSON:
+        print(json.dumps(verdict))
+    elif asked.quiet:
+        print(f"verdict: {judgement.verdict}  {folder}")
+    else:
+        print_summary(judgement, verdict, folder, Console())
+    raise typer.Exit(status)
 
 
 def main() -> None:
     """The console script."""
-    app()
+    sys.exit(run_app(app, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import json
+import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from msgspec import convert
 from rich.console import Console
 from rich.table import Table
 
 from emulator.run.control import ask
+from emulator.run.course import Snapshot
+from emulator.run.dashboard import Dashboard
+from emulator.run.painter import Painter
+from emulator.run.progress import terminal
 from emulator.terminal import one_line_errors
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError
 from vnet.faults import KINDS, parse_fault
 
 app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
 
 RunOption = Annotated[Path, typer.Option("--run", help="The folder of the run.")]
 LATEST = Path("runs/latest")
+WATCH_EVERY_S = 1.0
+ALL_ROWS = 50
 
 
 @app.command()
@@ -60,17 +70,40 @@ def list_faults(run: RunOption = LATEST) -> None:
         _show(ask(run, "status")["faults"])
 
 
-def status(run: RunOption = LATEST) -> None:
-    """How a running emulator gets on."""
+def status(
+    run: RunOption = LATEST,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object: emulated seconds, metres, pairs of frame and receiver.")
+    ] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until the run is over.")] = False,
+) -> None:
+    """How a running emulator gets on: time, vehicles, errors, frames, faults, events."""
     with one_line_errors():
+        if as_json and watch:
+            raise VnetError("--json and --watch exclude each other")
         found = ask(run, "status")
-        table = Table(title=f"run {found['run']}", show_header=False)
-        table.add_row("time", f"{found['emulated_s']:.1f} of {found['duration_s']:g} s, {found['pacing']}")
-        table.add_row("vehicles", f"{found['vehicles']}, down: {', '.join(found['down']) or 'none'}")
-        table.add_row("frames", ", ".join(f"{name} {count:,}" for name, count in found["frames"].items()))
-        acting = [fault["fault"] for fault in found["faults"] if fault["state"] == "acting"]
-        table.add_row("faults acting", ", ".join(acting) or "none")
-        Console().print(table)
+        if as_json:
+            print(json.dumps(found))
+        elif watch:
+            _watch(run, convert(found, Snapshot))
+        else:
+            Console().print(Dashboard(convert(found, Snapshot)), height=ALL_ROWS, end="")
+
+
+def _watch(run: Path, shot: Snapshot) -> None:
+    """Show how a run gets on until it is over."""
+    console = terminal(sys.stdout)
+    if console is None:
+        raise VnetError("--watch: needs a terminal; elsewhere use --json, now and then")
+    taken_s = time.monotonic()
+    with Painter(console, lambda: Dashboard(shot, time.monotonic() - taken_s)):
+        while True:
+            time.sleep(WATCH_EVERY_S)
+            try:
+                shot, taken_s = convert(ask(run, "status"), Snapshot), time.monotonic()
+            except VnetError:
+                break
+    print(f"{run}: the run is over")
 
 
 def _set(fault: dict[str, Any], parameter: str) -> None:

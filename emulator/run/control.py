@@ -11,10 +11,11 @@ import contextlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from emulator.faults.plan import PlannedFault
+from emulator.run.course import Course, fault_state
 from emulator.run.emulation import Emulation
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.faults import parse_fault
@@ -29,16 +30,18 @@ LEASE_MS = 10_000
 ANSWER_TIMEOUT_S = 10.0
 
 
-def answer(emulation: Emulation, verb: str, payload: bytes, now_ns: int, own_router: bool) -> dict[str, Any]:
+def answer(
+    emulation: Emulation, course: Course, verb: str, payload: bytes, now_ns: int, own_router: bool
+) -> dict[str, Any]:
     """Do what a query asks for. Raises VnetError, in one line, if it cannot be done."""
     match verb:
         case "status":
-            return _status(emulation, now_ns)
+            return asdict(course.snapshot(now_ns))
         case "inject":
             fault = parse_fault(_json(payload))
             if fault.kind == "router_restart" and not own_router:
                 raise ScenarioError("router_restart: needs a router of its own: vnet run --router separate")
-            return _described(emulation.inject(fault, now_ns), emulation, now_ns)
+            return asdict(fault_state(emulation.inject(fault, now_ns), emulation, now_ns))
         case "heal":
             label = _json(payload)
             if not isinstance(label, str):
@@ -62,31 +65,6 @@ def _json(payload: bytes) -> Any:
         return json.loads(payload)
     except (ValueError, RecursionError) as error:
         raise ScenarioError(f"not valid JSON: {error}") from None
-
-
-def _status(emulation: Emulation, now_ns: int) -> dict[str, Any]:
-    scenario = emulation.scenario
-    return {
-        "run": scenario.run.name,
-        "pacing": scenario.run.pacing,
-        "emulated_s": now_ns / 1e9,
-        "duration_s": scenario.run.duration_s,
-        "vehicles": len(emulation.world.node_ids),
-        "down": [node for node, up in emulation.up.items() if not up],
-        "frames": {outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
-        "faults": [_described(planned, emulation, now_ns) for planned in emulation.faults.faults],
-    }
-
-
-def _described(planned: PlannedFault, emulation: Emulation, now_ns: int) -> dict[str, Any]:
-    state = "acting" if planned.acts_at(now_ns) else ("ended" if planned.end_ns <= now_ns else "to come")
-    return {
-        "fault": planned.label,
-        "state": state,
-        "start_s": planned.start_ns / 1e9,
-        "end_s": planned.end_ns / 1e9,
-        "nodes": [node for node, number in emulation.number.items() if planned.nodes[number]],
-    }
 
 
 @contextmanager
