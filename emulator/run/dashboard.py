@@ -49,14 +49,15 @@ IDLE_S = 5.0
 """So long without a period that has ended is worth telling."""
 
 # The rows in the order in which they are worth having.
-ROWS = "title time vehicles common_error frames events faults deviation shares position".split()
+ROWS = ["title", "time", "vehicles", "common_error", "frames"]
+ROWS += ["events", "faults", "deviation", "shares", "position"]
 MORE_ROWS = ["events", "faults"] * 5
 GROUPS = (("title", "time"), ("vehicles",), ("common_error", "deviation", "position"), ("frames", "shares"),
           ("faults",), ("events",))  # fmt: skip
 FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m", "position": "position_rmse_m"}
 PATIENCE_S = 1.0
 """Of emulated time: what programs have not reported by then has no row."""
-JOINING_ROWS = ["title", "joining", "vehicles", "missing"]
+EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
 
 
 class Dashboard:
@@ -79,8 +80,8 @@ class Dashboard:
         """The rows, at most `height` of them; the caller cuts what is wider than `width`."""
         shot = self._snapshot
         draw = _Rows(shot, self._later_s, width, coloured)
-        if shot.phase in ("starting", "joining"):
-            return [line for row in JOINING_ROWS[:height] for line in getattr(draw, row)(1)]
+        if shot.phase in EARLY_ROWS:
+            return [line for row in EARLY_ROWS[shot.phase][:height] for line in getattr(draw, row)(1)]
         late = shot.emulated_s >= PATIENCE_S
         useless = {row for row, figure in FIGURES.items() if late and shot.never_reported(figure)}
         if not shot.faults:
@@ -155,12 +156,10 @@ class _Rows:
         done = min(int(share * self._axis), self._axis)
         return [Segment("━" * done, SKY), Segment("─" * (self._axis - done), DIM)]
 
-    def joining(self, rows: int) -> list[Line]:
+    def joined(self, rows: int) -> list[Line]:
         """How many have joined, and how long they still may take."""
         shot = self._shot
         count = len(shot.node_ids)
-        if shot.phase == "starting":
-            return [self._row("starting", self._bar(0.0), [])]
         joined = count - len(shot.missing)
         words = [Segment(f"{joined} of {count}", BOLD)]
         waited_s = shot.wall_s + self._later_s
@@ -169,20 +168,18 @@ class _Rows:
 
     def missing(self, rows: int) -> list[Line]:
         """Who has not joined."""
-        missing = self._shot.missing
-        named = [Segment(_names(missing, self._width - self._label))] if missing else []
-        return [[Segment("missing".ljust(self._label), DIM), *named]]
+        named = _names(self._shot.missing, self._width - self._label)
+        return [[Segment("missing".ljust(self._label), DIM), Segment(named)]]
 
     def vehicles(self, rows: int) -> list[Line]:
         """A dot a vehicle, and the names of those who are down."""
         shot = self._shot
-        if shot.phase in ("starting", "joining"):
-            away, words = shot.missing or shot.node_ids * (shot.phase == "starting"), []
-        else:
-            away = shot.down
-            words = [Segment(f"{len(shot.node_ids) - len(away)} up", BOLD)]
+        away = shot.missing or shot.down
         strip = self._strip(shot.node_ids, set(away))
-        if away and words:
+        if shot.phase == "joining":
+            return [self._row("vehicles", strip, [])]
+        words = [Segment(f"{len(shot.node_ids) - len(away)} up", BOLD)]
+        if away:
             words.append(Segment(f"  {len(away)} down: ", BAD))
             room = self._width - self._label - self._axis - 2 - sum(segment.cell_length for segment in words)
             words.append(Segment(_names(away, room), RED))
