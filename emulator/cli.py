@@ -43,15 +43,25 @@ from vnet.link.hosting import fix_hash_seed
 from vnet.link.session import quiet_zenoh
 from vnet.scenario import Scenario, load_scenario
 
+
+class Panel(StrEnum):
+    """Under what commands are listed."""
+
+    RUNS = "Run a scenario"
+    LIVE = "While a run is on"
+    AFTER = "Afterwards"
+    STUDIES = "Studies"
+    APART = "Apart from the emulator"
+
+
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     no_args_is_help=True,
     help="An asyncio message-passing emulator for connected vehicles over Zenoh.",
 )
-app.add_typer(experiment_app, name="experiment")
-app.add_typer(fault_app, name="fault")
-app.command()(status)
+app.add_typer(experiment_app, name="experiment", rich_help_panel=Panel.STUDIES)
+app.add_typer(fault_app, name="fault", rich_help_panel=Panel.LIVE)
 
 
 class Pacing(StrEnum):
@@ -79,13 +89,25 @@ DEFAULT_ADDRESS = "127.0.0.1:7447"
 DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 
 ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
-ProgramOption = Annotated[str | None, typer.Option(help="What every vehicle runs, as package.module:function.")]
-PacingOption = Annotated[Pacing | None, typer.Option(help="Virtual time, or the wall clock.")]
-SeedOption = Annotated[int | None, typer.Option(help="Same seed, same run.")]
-DurationOption = Annotated[float | None, typer.Option(help="Emulated seconds.")]
-OutOption = Annotated[Path | None, typer.Option(help="Folder for the run's files; the default is runs/NAME-SEED.")]
+ProgramOption = Annotated[
+    str | None, typer.Option(metavar="MODULE:FUNCTION", help="What every vehicle runs, as agents.beacon:main.")
+]
+PacingOption = Annotated[
+    Pacing | None,
+    typer.Option(help="Virtual time, the same on every machine; or the wall clock. Default: the scenario's."),
+]
+SeedOption = Annotated[
+    int | None, typer.Option(metavar="N", help="Of all that is drawn at random: same seed, same run.")
+]
+DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
+OutOption = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="For the run's files. Default: runs/NAME-SEED.")
+]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scenario key.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. As often as need be."
+    ),
 ]
 TlsNameOption = Annotated[
     list[str] | None,
@@ -95,12 +117,13 @@ TlsNameOption = Annotated[
 ]
 RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
 DeterminismOption = Annotated[
-    bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
+    bool,
+    typer.Option("--check-determinism", metavar="", help="Run it twice, and show the first row that differs."),
 ]
 LogFormatOption = Annotated[
-    LogFormat, typer.Option(help="json: one object a line on stderr, and verdict.json in one line on stdout.")
+    LogFormat, typer.Option(help="json: an object a line on stderr, and verdict.json in one line on stdout.")
 ]
-QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Only errors, and the verdict in one line.")]
+QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only errors, and the verdict in one line.")]
 
 
 @dataclass(frozen=True)
@@ -112,7 +135,7 @@ class Asked:
     check_determinism: bool = False
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.RUNS)
 def run(
     scenario: ScenarioArgument,
     program: ProgramOption = None,
@@ -147,7 +170,7 @@ def run(
             _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, asked)
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.RUNS)
 def simulate(
     scenario: ScenarioArgument,
     program: ProgramOption = None,
@@ -184,17 +207,24 @@ def _record_here(emulation: Emulation, stack: ExitStack) -> None:
     emulation.watch(lambda view: recorder.period(view.message(emulation.world.node_ids)))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.RUNS)
 def emulator(
     scenario: ScenarioArgument,
     listen: Annotated[
         str | None,
-        typer.Option(help="Be the router, and listen at this endpoint (tcp/HOST:PORT or tls/HOST:PORT)."),
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Be the router, at tcp/HOST:PORT or tls/HOST:PORT. Default: {DEFAULT_LISTEN}.",
+        ),
     ] = None,
-    connect: Annotated[str | None, typer.Option(help="Be a client of the zenohd at this endpoint.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Be a client of the zenohd that is there.")
+    ] = None,
     access: Annotated[
         Path | None,
-        typer.Option(help="Folder written by vnet access; made if it does not exist. Default: OUT/access."),
+        typer.Option(
+            metavar="FOLDER", help="Users, as vnet access wrote them; made if not there. Default: OUT/access."
+        ),
     ] = None,
     program: ProgramOption = None,
     pacing: PacingOption = None,
@@ -222,20 +252,28 @@ def emulator(
         _run_live(loaded, world, folder, rerun, options, Asked(log_format, quiet), where)
 
 
-@app.command("access")
+app.command(rich_help_panel=Panel.LIVE)(status)
+
+
+@app.command("access", rich_help_panel=Panel.APART)
 def write_access(
     scenario: ScenarioArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("access"),
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="For the files.")] = Path("access"),
     listen: Annotated[
-        str, typer.Option(help="Where the zenohd is to listen; at tls/HOST:PORT everybody gets a certificate.")
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Where the zenohd is to listen; at tls/HOST:PORT everybody gets a certificate.",
+        ),
     ] = DEFAULT_LISTEN,
     tls_name: TlsNameOption = None,
     router_folder: Annotated[
-        Path | None, typer.Option(help="Where the zenohd sees the folder, if elsewhere (a container).")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where the zenohd sees --out, if elsewhere (in a container)."),
     ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """Write a separate zenohd's configuration (zenohd -c OUT/zenohd.json5) and everybody's credentials."""
+    """Write the configuration of a separate router (zenohd) and everybody's credentials."""
     with one_line_errors():
         loaded = _load(scenario, overrides)
         users = _create_access(loaded, build_world(loaded), listen, tls_name or ())
@@ -244,7 +282,7 @@ def write_access(
         print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.AFTER)
 def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]) -> None:
     """Judge a run again, from its files alone."""
     with one_line_errors():
@@ -253,13 +291,15 @@ def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's fo
         raise typer.Exit(judgement.exit_status)
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.STUDIES)
 def analyze(
     scenario: ScenarioArgument,
-    run: Annotated[Path | None, typer.Option(help="A run's folder: what its filters did is set beside.")] = None,
+    run: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Folder of a run: set beside what its filters did.")
+    ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """What the network's graph says without a run: components, degrees, how well each rule of weights mixes."""
+    """What the graph says without a run: components, degrees, how well each rule of weights mixes."""
     from emulator.experiments.analyze import analysis_table
     from emulator.experiments.analyze import analyze as analyze_scenario
 
@@ -267,21 +307,29 @@ def analyze(
         Console().print(analysis_table(analyze_scenario(_load(scenario, overrides), run)))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.STUDIES)
 def campaign(
     scenario: ScenarioArgument,
-    runs: Annotated[int, typer.Option(min=1, help="How many runs.")] = 200,
-    faults: Annotated[str, typer.Option(help="random, or the kinds to draw from: kill,partition.")] = "random",
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="How many runs.")] = 200,
+    faults: Annotated[
+        str, typer.Option(metavar="KINDS", help="random, or the kinds to draw from: kill,partition.")
+    ] = "random",
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the campaign's files.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the campaign's files.")] = None,
     overrides: SetOption = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at once; as many as there are cores.")] = None,
-    shrink_steps: Annotated[int, typer.Option(min=0, max=50, help="Runs to shrink a failure with.")] = 50,
-    time_limit: Annotated[float, typer.Option(min=1.0, help="Wall-clock seconds a run may take.")] = 300.0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
+    ] = None,
+    shrink_steps: Annotated[
+        int, typer.Option(min=0, max=50, metavar="N", help="Runs to shrink a failure with.")
+    ] = 50,
+    time_limit: Annotated[
+        float, typer.Option(min=1.0, metavar="SECONDS", help="Wall clock that a run may take.")
+    ] = 300.0,
 ) -> None:
-    """Run a scenario many times under random faults; shrink what fails; a matrix of faults and checks."""
+    """Run a scenario many times under random faults, and shrink what fails to the least that still does."""
     fix_hash_seed("emulator.cli")
     from emulator.testing.campaign import Plan, run_campaign
 
@@ -295,12 +343,14 @@ def campaign(
         raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.APART)
 def record(
-    connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint.")],
-    run: Annotated[str, typer.Option(help="The name of the run.")],
-    out: Annotated[Path, typer.Option(help="The recording to write.")] = Path("recording.rrd"),
-    credentials: Annotated[Path | None, typer.Option(help="The observer's credentials file.")] = None,
+    connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Of the emulator, or of its router.")],
+    run: Annotated[str, typer.Option(metavar="NAME", help="The name of the run: run.name of its scenario.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The recording to write.")] = Path("recording.rrd"),
+    credentials: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The observer's: access/credentials/observer.json.")
+    ] = None,
 ) -> None:
     """Watch a run from outside and write a Rerun recording of it."""
     from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it

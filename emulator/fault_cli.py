@@ -25,7 +25,7 @@ from vnet.faults import KINDS, parse_fault
 
 app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
 
-RunOption = Annotated[Path, typer.Option("--run", help="The folder of the run.")]
+RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
 LATEST = Path("runs/latest")
 WATCH_EVERY_S = 1.0
 ALL_ROWS = 50
@@ -33,16 +33,22 @@ ALL_ROWS = 50
 
 @app.command()
 def inject(
-    kind: Annotated[str, typer.Argument(help=f"One of {', '.join(KINDS)}.")],
-    lasting: Annotated[float, typer.Option("--for", help="Emulated seconds.")] = 5.0,
-    at: Annotated[float | None, typer.Option(help="When, in emulated seconds; the default is now.")] = None,
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(KINDS)}.")],
+    lasting: Annotated[float, typer.Option("--for", metavar="SECONDS", help="How long, in emulated time.")] = 5.0,
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="When, in emulated time. Default: now.")
+    ] = None,
     parameters: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="As in a scenario: probability=0.5, nodes.random=3"),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. As often as need be.",
+        ),
     ] = None,
     run: RunOption = LATEST,
 ) -> None:
-    """Start a fault: vnet fault inject loss --for 5 --set probability=0.5 --set nodes.fraction=0.2"""
+    """Start a fault: vnet fault inject loss --for 5 --set probability=0.5"""
     with one_line_errors():
         fault: dict[str, Any] = {"kind": kind, "duration_s": lasting}
         if at is not None:
@@ -55,7 +61,8 @@ def inject(
 
 @app.command()
 def heal(
-    name: Annotated[str, typer.Argument(help="The fault's name, as loss-0, or all.")], run: RunOption = LATEST
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The fault's name, such as loss-0; or all.")],
+    run: RunOption = LATEST,
 ) -> None:
     """End a fault now."""
     with one_line_errors():
@@ -67,15 +74,20 @@ def heal(
 def list_faults(run: RunOption = LATEST) -> None:
     """All faults of the run: those that were, are and will be."""
     with one_line_errors():
-        _show(ask(run, "status")["faults"])
+        if faults := ask(run, "status")["faults"]:
+            _show(faults)
+        else:
+            print("no faults are planned")
 
 
 def status(
     run: RunOption = LATEST,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object: emulated seconds, metres, pairs of frame and receiver.")
+        bool, typer.Option("--json", metavar="", help="As one JSON object; docs/terminal.md says what is in it.")
     ] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on showing it until the run is over.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", metavar="", help="Go on showing it until the run is over.")
+    ] = False,
 ) -> None:
     """How a running emulator gets on: time, vehicles, errors, frames, faults, events."""
     with one_line_errors():
@@ -87,7 +99,7 @@ def status(
         elif watch:
             _watch(run, convert(found, Snapshot))
         else:
-            Console().print(Dashboard(convert(found, Snapshot)), height=ALL_ROWS, end="")
+            Console().print(Dashboard(convert(found, Snapshot), steady=False), height=ALL_ROWS, end="")
 
 
 def _watch(run: Path, shot: Snapshot) -> None:

@@ -54,7 +54,7 @@ def _in_one_line(error: typer.TyperException) -> str:
     """What is wrong with a command line, what may have been meant, and where to read more."""
     meant = getattr(error, "possibilities", None)
     text = f"{error.message}; did you mean {' or '.join(meant)}?" if meant else error.format_message()
-    text = " ".join(text.replace("Value error, ", "").split()).removesuffix(".")
+    text = " ".join(text.replace("Value error, ", "").replace(". Did you", "; did you").split()).removesuffix(".")
     context = getattr(error, "ctx", None)
     command = "vnet" if context is None else context.command_path
     return printable(f"{text[:1].lower()}{text[1:]} ({command} --help says more)", LONGEST_MESSAGE)

@@ -10,10 +10,12 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import zenoh
 
 from emulator.run.course import Course, fault_state
 from emulator.run.emulation import Emulation
@@ -84,6 +86,17 @@ def way_in(folder: Path, endpoint: str, access: Access) -> Iterator[None]:
                 left.unlink()
 
 
+@contextmanager
+def _connected(folder: Path, endpoint: str, login: Credentials) -> Iterator[zenoh.Session]:
+    """A session with the run; one that was killed has left its way in behind."""
+    with ExitStack() as stack:
+        try:
+            session = stack.enter_context(open_client(endpoint, login, LEASE_MS))
+        except LinkError as error:
+            raise LinkError(f"{folder}: the run does not answer (was it killed?): {error}") from None
+        yield session
+
+
 def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
     """Put a query to the run whose folder this is. Raises VnetError: no such run, no answer, or what it says."""
     path = folder / CONTROL_FILE
@@ -95,7 +108,7 @@ def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError):
         raise VnetError(f"{path}: not what a run writes") from None
     login = Credentials.load(folder / OPERATOR_FILE)
-    with open_client(endpoint, login, LEASE_MS) as session:
+    with _connected(folder, endpoint, login) as session:
         replies = session.get(
             keys.control(run, verb), payload=json.dumps(payload).encode(), timeout=ANSWER_TIMEOUT_S
         )

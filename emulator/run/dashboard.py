@@ -61,11 +61,15 @@ EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", 
 
 
 class Dashboard:
-    """A run as a rich renderable; `later_s` is the age of the snapshot."""
+    """A run as a rich renderable; `later_s` is the age of the snapshot.
 
-    def __init__(self, snapshot: Snapshot, later_s: float = 0.0) -> None:
+    `steady`: room is kept for events to come, so that nothing moves when they do.
+    """
+
+    def __init__(self, snapshot: Snapshot, later_s: float = 0.0, steady: bool = True) -> None:
         self._snapshot = snapshot
         self._later_s = later_s
+        self._steady = steady
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         # The line below the picture is the cursor's.
@@ -96,7 +100,8 @@ class Dashboard:
             found += gap if number else []
             for row, rows in group:
                 found += getattr(draw, row)(rows)
-        return found
+        spare = height - len(found) if self._steady else 0
+        return found + [[]] * min(spare, count["events"] - max(1, len(shot.events)))
 
 
 class _Rows:
@@ -188,8 +193,9 @@ class _Rows:
     def _strip(self, node_ids: Sequence[str], away: set[str]) -> Line:
         """Where there are more vehicles than room, one dot stands for several, and is hollow if any is away."""
         dots = min(len(node_ids), self._axis)
+        hollow = DIM if self._shot.phase == "joining" else RED
         parts = (node_ids[n * len(node_ids) // dots : (n + 1) * len(node_ids) // dots] for n in range(dots))
-        return _joined(("○", RED) if any(node in away for node in part) else ("●", GREEN) for part in parts)
+        return _joined(("○", hollow) if any(node in away for node in part) else ("●", GREEN) for part in parts)
 
     def common_error(self, rows: int) -> list[Line]:
         """RMSE of the common error."""
@@ -282,7 +288,7 @@ class _Rows:
             lines.append([Segment(label.ljust(self._label), DIM), Segment(when, DIM), Segment(about, style)])
         if not lines:
             lines.append([Segment("events".ljust(self._label), DIM), Segment("none yet", DIM)])
-        return lines + [[] for _ in range(rows - len(lines))]
+        return lines
 
 
 def is_bad(event: Event) -> bool:

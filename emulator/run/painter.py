@@ -62,7 +62,7 @@ class Painter:
         self._thread.join()
         if self._waiting and not self._waiting[-1].endswith("\n"):
             self.print_above("\n")
-        self._draw([])
+        self.draw([])
 
     def print_above(self, text: str) -> None:
         """Have text pass above the picture, at the next redraw."""
@@ -70,7 +70,7 @@ class Painter:
             self._waiting.append(text)
             self._waiting_characters += len(text)
         if self._waiting_characters > MOST_WAITING:
-            self._draw()
+            self.draw()
 
     def _take_waiting(self) -> str:
         """The whole lines of what is to pass above."""
@@ -86,9 +86,9 @@ class Painter:
 
     def _draw_on(self) -> None:
         while not self._done.wait(EVERY_S):
-            self._draw()
+            self.draw()
 
-    def _draw(self, lines: list[str] | None = None) -> None:
+    def draw(self, lines: list[str] | None = None) -> None:
         with self._drawing:
             columns = self._console.size.width
             lines = self._rendered() if lines is None else lines

@@ -77,9 +77,9 @@ class _Simulation:
         self._gate = gate or (lambda lockstep: None)
         self._seq = 0
         self.interrupted = False
-        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
-        self._programs = load_programs(welcomes)
+        self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
+        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._host = Host(welcomes, lambda: self.loop.now_ns)
 
     def run(self) -> None:
