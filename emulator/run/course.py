@@ -123,6 +123,11 @@ class Course:
         for name, series in self._over_time.items():
             series.add(end_ns, self._figures[name])
 
+    @property
+    def wall_s(self) -> float:
+        """Wall clock since the beginning."""
+        return self._clock() - self._began_s
+
     def news(self, after: int = 0) -> list[Event]:
         """What has happened, but for the first `after` events of the run."""
         return [event for event in self._emulation.folder.events[after:] if event.kind not in FOR_THE_CHECKS]
@@ -131,7 +136,6 @@ class Course:
         """How the run gets on at this emulated instant, or at the end of its last period."""
         emulation = self._emulation
         run = emulation.scenario.run
-        wall_s = self._clock()
         factor = self._real_time_factor()
         now_ns = emulation.emulated_ns if now_ns is None else min(now_ns, emulation.duration_ns)
         memory_kb = resident_kb()
@@ -148,8 +152,8 @@ class Course:
             join_timeout_s=run.join_timeout_s,
             real_time_factor=factor,
             remaining_s=None if not factor else (emulation.duration_ns - now_ns) / NS_PER_S / factor,
-            idle_s=wall_s - self._period_ended_s,
-            wall_s=wall_s - self._began_s,
+            idle_s=self._clock() - self._period_ended_s,
+            wall_s=self.wall_s,
             **self._figures,
             over_time={name: series.means() for name, series in self._over_time.items()},
             frames_by_outcome={outcome.name: count for outcome, count in emulation.engine.counts.items() if count},

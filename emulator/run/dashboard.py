@@ -86,22 +86,29 @@ class Dashboard:
         draw = _Rows(shot, self._later_s, width, coloured)
         if shot.phase in EARLY_ROWS:
             return [line for row in EARLY_ROWS[shot.phase][:height] for line in getattr(draw, row)(1)]
-        late = shot.emulated_s >= PATIENCE_S
-        useless = {row for row, figure in FIGURES.items() if late and shot.never_reported(figure)}
-        if not shot.faults:
-            useless.add("faults")
-        count = Counter([row for row in ROWS + MORE_ROWS if row not in useless][:height])
-        count["faults"] = min(count["faults"], len(shot.faults))
-        groups = [[(row, count[row]) for row in group if count[row] > 0] for group in GROUPS]
+        count = self._allot(height)
+        groups = [[row for row in group if count[row]] for group in GROUPS]
         groups = [group for group in groups if group]
         gap: list[Line] = [[]] if count.total() + len(groups) - 1 <= height else []
         found: list[Line] = []
         for number, group in enumerate(groups):
             found += gap if number else []
-            for row, rows in group:
-                found += getattr(draw, row)(rows)
+            for row in group:
+                found += getattr(draw, row)(count[row])
         spare = height - len(found) if self._steady else 0
         return found + [[]] * min(spare, count["events"] - max(1, len(shot.events)))
+
+    def _allot(self, height: int) -> Counter[str]:
+        """How many rows each part gets."""
+        shot = self._snapshot
+        most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults)}
+        if shot.emulated_s >= PATIENCE_S:
+            most |= {row: 0 for row, figure in FIGURES.items() if shot.never_reported(figure)}
+        count: Counter[str] = Counter()
+        for row in ROWS + MORE_ROWS:
+            if count[row] < most[row] and count.total() < height:
+                count[row] += 1
+        return count
 
 
 class _Rows:
@@ -232,23 +239,24 @@ class _Rows:
         return [self._row("frames", bar, words)]
 
     def shares(self, rows: int) -> list[Line]:
-        """The legend of the bar above."""
+        """The legend of the bar above; with rates where there is room for them."""
+        for rated in (True, False):
+            line = self._legend(rated)
+            if sum(segment.cell_length for segment in line) <= self._width:
+                break
+        return [line]
+
+    def _legend(self, rated: bool) -> Line:
         rates = _shown(self._shot.frames_per_s)
         total = sum(rates.values())
-        line: Line = [Segment(" " * self._label)]
-        room = self._width - self._label
+        line: Line = [Segment(" " * (self._label - 2))]
         for outcome, rate in rates.items():
             style, sign = OUTCOMES[outcome]
-            words = f" {outcome.replace('_', ' ')} "
-            share = f"{rate / total:.1%}"
-            number = f" {rate:,.0f}/s  "
-            room -= 1 + len(words) + len(share) + len(number)
-            if room < -2:  # the blanks at its end are free
-                line.append(Segment("…", DIM))
-                break
             mark = Segment("■" if self._coloured else sign, style)
-            line += [mark, Segment(words), Segment(share, BOLD), Segment(number, DIM)]
-        return [line]
+            number = Segment(f" {rate:,.0f}/s" if rated else "", DIM)
+            name, share = Segment(f" {outcome.replace('_', ' ')} "), Segment(f"{rate / total:.1%}", BOLD)
+            line += [Segment("  "), mark, name, share, number]
+        return line
 
     def faults(self, rows: int) -> list[Line]:
         """Those that act, then the next, then the last that were; in the order in which they begin."""

@@ -85,10 +85,12 @@ class Painter:
         self._lines, self._columns = [], 0
 
     def _draw_on(self) -> None:
+        self.draw()
         while not self._done.wait(EVERY_S):
             self.draw()
 
     def draw(self, lines: list[str] | None = None) -> None:
+        """Draw these lines, or the picture of now, if anything has changed."""
         with self._drawing:
             columns = self._console.size.width
             lines = self._rendered() if lines is None else lines

@@ -211,12 +211,11 @@ class JsonLines(_Lines):
     every_s = JSON_LINE_EVERY_S
 
     def _say(self, kind: str, **fields: Any) -> None:
-        self._write(json.dumps({"kind": kind, **fields}))
+        self._write(json.dumps({"kind": kind, "wall_s": round(self._course.wall_s, 3), **fields}))
 
-    def _state(self, text: str | None = None) -> None:
+    def _state(self, **text: str) -> None:
         shot = self._course.snapshot()
-        fields = {"phase": shot.phase, "wall_s": round(shot.wall_s, 3)}
-        self._say("state", **fields, vehicles=len(shot.node_ids), missing=shot.missing, text=text)
+        self._say("state", phase=shot.phase, vehicles=len(shot.node_ids), missing=shot.missing, **text)
 
     def __enter__(self) -> JsonLines:
         self._state()
@@ -224,7 +223,7 @@ class JsonLines(_Lines):
 
     def state(self, text: str) -> None:
         """An object with a text."""
-        self._state(text)
+        self._state(text=text)
 
     def awaits(self, nodes: Sequence[str]) -> None:
         """An object when joining begins, when it is over, and now and then."""
@@ -242,12 +241,13 @@ class JsonLines(_Lines):
     def ended(self, verdict: dict[str, Any], folder: str, exit_status: int) -> None:
         """The last object."""
         self.close()
-        told = {key: verdict[key] for key in ("verdict", "emulated_s", "wall_s", "real_time_factor", "seed")}
+        told = {key: verdict[key] for key in ("verdict", "emulated_s", "real_time_factor", "seed")}
         self._say("ended", exit_status=exit_status, folder=folder, **told)
 
     def _progress(self, shot: Snapshot) -> None:
         acting = [fault.fault for fault in shot.faults if fault.state == "acting"]
-        left_out = ("node_ids", "phase", "missing", "over_time", "faults", "events", "join_timeout_s", "idle_s")
+        left_out = {"node_ids", "phase", "missing", "over_time", "faults", "events"}
+        left_out |= {"join_timeout_s", "idle_s", "wall_s"}
         fields = {key: value for key, value in asdict(shot).items() if key not in left_out}
         self._say("progress", **fields, vehicles=len(shot.node_ids), faults_acting=acting)
 
