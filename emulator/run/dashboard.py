@@ -316,7 +316,7 @@ def describe(event: Event) -> str:
     for key in ("where", "log_tail", "key"):  # pages of text; they are in the run's folder
         details.pop(key, None)
     said = [str(details.pop(key)) for key in ("how", "error", "reason") if key in details]
-    if isinstance(nodes, list):
+    if isinstance(nodes, list) and nodes:
         said.append(_names(nodes, 40))
     said += [f"{key} {value}" for key, value in details.items() if isinstance(value, (str, int, float))]
     text = f"{who} {what.replace('_', ' ')}".strip()
