@@ -18,7 +18,9 @@ from itertools import zip_longest
 from typing import Any, TextIO, cast
 
 from rich.cells import cell_len
-from rich.console import Console, RenderableType
+from rich.color import ColorSystem
+from rich.console import COLOR_SYSTEMS, Console, RenderableType
+from rich.segment import Segment
 
 EVERY_S = 0.25
 MOST_WAITING = 1 << 20
@@ -92,10 +94,12 @@ class Painter:
     def draw(self, lines: list[str] | None = None) -> None:
         """Draw these lines, or the picture of now, if anything has changed."""
         with self._drawing:
+            above = self._take_waiting()
+            if self._gone:
+                return
             columns = self._console.size.width
             lines = self._rendered() if lines is None else lines
-            above = self._take_waiting()
-            if self._gone or (lines, columns, above) == (self._lines, self._columns, ""):
+            if (lines, columns, above) == (self._lines, self._columns, ""):
                 return
             text = self._redraw(lines, above, columns)
             self._lines, self._columns = lines, columns
@@ -107,9 +111,10 @@ class Painter:
 
     def _rendered(self) -> list[str]:
         """The picture's lines, with their colours."""
-        with self._console.capture() as captured:
-            self._console.print(self._picture(), end="")
-        return captured.get().splitlines()
+        name = self._console.color_system
+        colours = None if name is None else COLOR_SYSTEMS[name]
+        lines = self._console.render_lines(self._picture(), pad=False)
+        return ["".join(_coloured(segment, colours) for segment in line) for line in lines]
 
     def _redraw(self, lines: list[str], above: str, columns: int) -> str:
         """What turns the old picture, with the cursor on the line below it, into the new one."""
@@ -128,6 +133,11 @@ class Painter:
         if columns >= self._columns:
             return 1
         return max(1, -(-cell_len(_COLOURS.sub("", line)) // columns))
+
+
+def _coloured(segment: Segment, colours: ColorSystem | None) -> str:
+    style = segment.style
+    return segment.text if colours is None or style is None else style.render(segment.text, color_system=colours)
 
 
 class _Above:
