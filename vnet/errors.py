@@ -46,7 +46,7 @@ def did_you_mean(word: object, known: Iterable[str]) -> str:
     if not isinstance(word, str) or len(word) > LONGEST_SHOWN:  # comparing takes time in the square of its length
         return ""
     by_small_letters = {name.lower(): name for name in known}
-    close = get_close_matches(word.lower(), by_small_letters, n=1)
+    close = get_close_matches(word.lower(), by_small_letters, n=1, cutoff=0.7)
     return f" (did you mean {by_small_letters[close[0]]}?)" if close else ""
 
 
