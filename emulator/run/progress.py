@@ -209,13 +209,20 @@ class JsonLines(_Lines):
     """One JSON object a line; docs/terminal.md says what is in them."""
 
     every_s = JSON_LINE_EVERY_S
+    _phase_told = ""
 
     def _say(self, kind: str, **fields: Any) -> None:
         self._write(json.dumps({"kind": kind, "wall_s": round(self._course.wall_s, 3), **fields}))
 
     def _state(self, **text: str) -> None:
         shot = self._course.snapshot()
+        self._phase_told = shot.phase
         self._say("state", phase=shot.phase, vehicles=len(shot.node_ids), missing=shot.missing, **text)
+
+    def _period(self, view: PeriodView) -> None:
+        if self._phase_told != "running":
+            self._state()
+        super()._period(view)
 
     def __enter__(self) -> JsonLines:
         self._state()

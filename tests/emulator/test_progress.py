@@ -135,7 +135,7 @@ def test_lines_of_json_hold_the_figures_of_the_run(tmp_path: Path, monkeypatch: 
     walls = [line["wall_s"] for line in lines]
     assert walls == sorted(walls)
     states = [(line["phase"], line.get("text")) for line in lines if line["kind"] == "state"]
-    assert states == [("starting", None), ("starting", "all set"), ("judging", None)]
+    assert states == [("starting", None), ("starting", "all set"), ("running", None), ("judging", None)]
     events = [json.loads(line) for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
     assert [line["event"] for line in lines if line["kind"] == "event"] == events
     progress = [line for line in lines if line["kind"] == "progress"]

@@ -9,13 +9,16 @@ import signal
 import socket
 import struct
 import subprocess
+import sys
 import termios
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from emulator.cli import app
 from emulator.run.control import ask, way_in
+from emulator.run.course import Snapshot
 from emulator.terminal import run_app
 from tests.emulator.screen import Screen
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
@@ -24,6 +27,7 @@ from vnet.errors import LinkError
 from vnet.link import session
 from vnet.link.access import Access
 
+DOCS = (ROOT / "docs" / "terminal.md").read_text()
 SHORT = ["scenarios/beacon.toml", "--duration", "3", "--set", "network.vehicles=4"]
 CONTROL = re.compile(r"\x1b\[(\??)[\d;]*([A-Za-z])")
 
@@ -110,6 +114,53 @@ def test_json_for_machines(vnet: Vnet) -> None:
     assert (ended["verdict"], ended["exit_status"], ended["folder"]) == ("valid", 0, str(done.folder))
     assert done.stdout.count("\n") == 1
     assert json.loads(done.stdout) == done.verdict
+
+
+def fields_in_the_docs(heading: str) -> set[str]:
+    """The names in the first column of the table under a heading of docs/terminal.md."""
+    _, _, after = DOCS.partition(heading)
+    rows = re.findall(r"^\| (`.*?) \|", after.partition("\n\n##")[0].partition("\n\nOn stdout")[0], re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+
+
+def test_the_docs_name_every_field(tmp_path: Path) -> None:
+    told = subprocess.run(
+        [*VNET, "simulate", *SHORT, "--out", str(tmp_path / "run"), "--log-format", "json"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    lines = [json.loads(line) for line in told.stderr.splitlines()]
+    (progress, *_) = [line for line in lines if line["kind"] == "progress"]
+    assert fields_in_the_docs("A `progress` object:") == progress.keys() - {"kind", "wall_s"}
+    in_status = {field.name for field in fields(Snapshot)}
+    beside = in_status - progress.keys()
+    assert fields_in_the_docs("## A run that is on") == beside
+    assert progress.keys() - in_status == {"kind", "vehicles", "faults_acting"}
+    kinds = {line["kind"] for line in lines} | {"error"}
+    assert kinds <= fields_in_the_docs("## JSON for machines")
+
+
+def test_the_mistakes_of_the_docs_are_answered_so(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    examples = re.findall(r"^\$ vnet (.*)\n(vnet: .*\n)", DOCS, re.MULTILINE)
+    assert len(examples) == 2
+    for command, said in examples:
+        assert run_app(app, command.split()) == 2
+        assert capsys.readouterr().err == said
+
+
+def test_the_shell_command_of_the_docs_works(tmp_path: Path) -> None:
+    (code,) = re.findall(r"```sh\n(.*?)```", DOCS, re.DOTALL)
+    (tmp_path / "vnet").write_text(f'#!/bin/sh\nexec {sys.executable} -P -m emulator.cli "$@"\n')
+    (tmp_path / "vnet").chmod(0o755)
+    (tmp_path / "scenarios").symlink_to(ROOT / "scenarios")
+    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    told = subprocess.run(["sh", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert re.fullmatch(r"valid \d+\n", told.stdout), told.stderr
+    assert json.loads((tmp_path / "progress.jsonl").read_text().splitlines()[-1])["kind"] == "ended"
 
 
 def test_json_of_a_run_that_is_had_twice_is_that_of_one(vnet: Vnet) -> None:
