@@ -6,6 +6,7 @@ Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 1
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import shlex
 import sys
@@ -452,6 +453,8 @@ def _finish(
 
 def main() -> None:
     """The console script."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a sign that a terminal does not know is no reason to fail
     sys.exit(run_app(app, sys.argv[1:]))
 
 

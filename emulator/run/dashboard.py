@@ -239,24 +239,27 @@ class _Rows:
         return [self._row("frames", bar, words)]
 
     def shares(self, rows: int) -> list[Line]:
-        """The legend of the bar above; with rates where there is room for them."""
-        for rated in (True, False):
-            line = self._legend(rated)
-            if sum(segment.cell_length for segment in line) <= self._width:
+        """The legend of the bar above; where there is no room, first without rates, then without the least."""
+        rates = _shown(self._shot.frames_per_s)
+        named = list(rates)
+        line = self._legend(rates, named, rated=True)
+        while sum(segment.cell_length for segment in line) > self._width:
+            line = self._legend(rates, named, rated=False)
+            if not named:
                 break
+            named.remove(min(named, key=rates.__getitem__))
         return [line]
 
-    def _legend(self, rated: bool) -> Line:
-        rates = _shown(self._shot.frames_per_s)
+    def _legend(self, rates: Mapping[str, float], named: Sequence[str], rated: bool) -> Line:
         total = sum(rates.values())
         line: Line = [Segment(" " * (self._label - 2))]
-        for outcome, rate in rates.items():
+        for outcome in named:
             style, sign = OUTCOMES[outcome]
             mark = Segment("■" if self._coloured else sign, style)
-            number = Segment(f" {rate:,.0f}/s" if rated else "", DIM)
-            name, share = Segment(f" {outcome.replace('_', ' ')} "), Segment(f"{rate / total:.1%}", BOLD)
+            number = Segment(f" {rates[outcome]:,.0f}/s" if rated else "", DIM)
+            name, share = Segment(f" {outcome.replace('_', ' ')} "), Segment(f"{rates[outcome] / total:.1%}", BOLD)
             line += [Segment("  "), mark, name, share, number]
-        return line
+        return line if len(named) == len(rates) else [*line, Segment("  …", DIM)]
 
     def faults(self, rows: int) -> list[Line]:
         """Those that act, then the next, then the last that were; in the order in which they begin."""

@@ -222,6 +222,21 @@ def test_colours_and_none() -> None:
     assert bar.split()[1] == "█" * 28 + "▒" * 13 + "▤" * 5, "signs tell outcomes apart"
 
 
+@pytest.mark.parametrize(
+    ("width", "legend"),
+    [
+        (200, "■ delivered 80.0% 800/s ■ lost 10.0% 100/s ■ peer cap 3.0% 30/s ■ fault 7.0% 70/s"),
+        (80, "■ delivered 80.0% ■ lost 10.0% ■ peer cap 3.0% ■ fault 7.0%"),
+        (60, "■ delivered 80.0% ■ lost 10.0% …"),
+        (40, "■ delivered 80.0% …"),
+        (20, "…"),
+    ],
+)
+def test_the_legend_leaves_out_rates_and_then_the_least(width: int, legend: str) -> None:
+    shot = make(frames_per_s={"delivered": 800.0, "lost": 100.0, "peer_cap": 30.0, "fault": 70.0})
+    assert legend in [" ".join(line.split()) for line in rows(shot, width, 15)]
+
+
 def test_many_vehicles_share_a_dot_and_whoever_is_down_shows() -> None:
     shot = make(node_ids=tuple(f"n{n}" for n in range(460)), down=("n459",))
     assert row(shot, "vehicles") == f"vehicles {'●' * 45}○ 459 up 1 down: n459"
