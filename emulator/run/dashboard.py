@@ -54,7 +54,7 @@ ROWS += ["events", "faults", "deviation", "shares", "position"]
 MORE_ROWS = ["events", "faults"] * 5
 GROUPS = (("title", "time"), ("vehicles",), ("common_error", "deviation", "position"), ("frames", "shares"),
           ("faults",), ("events",))  # fmt: skip
-FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m", "position": "position_rmse_m"}
+FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m"}
 PATIENCE_S = 1.0
 """Of emulated time: what programs have not reported by then has no row."""
 EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
@@ -213,7 +213,9 @@ class _Rows:
         return [self._figure("deviation", "deviation_m", "between vehicles")]
 
     def position(self, rows: int) -> list[Line]:
-        """RMSE of the positions, beside that of the raw fixes."""
+        """RMSE of the positions, beside that of the raw fixes; or that alone."""
+        if self._shot.never_reported("position_rmse_m"):
+            return [self._figure("raw fixes", "fix_rmse_m", "RMSE")]
         raw_m = self._shot.fix_rmse_m
         raw = "" if raw_m is None else f"raw fixes {_short(raw_m)} m"
         return [self._figure("position", "position_rmse_m", raw)]

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from emulator.observe.run_folder import Event
-from emulator.run.course import BINS, FaultState, Snapshot
+from emulator.run.course import BINS, FIGURES, FaultState, Snapshot
 from emulator.run.dashboard import BAD_EVENTS, Dashboard, describe, is_bad, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
@@ -46,7 +46,7 @@ def make(**changes: object) -> Snapshot:
         deviation_m=0.05,
         position_rmse_m=0.43,
         fix_rmse_m=6.31,
-        over_time={"common_error_rmse_m": falling, "deviation_m": falling, "position_rmse_m": falling},
+        over_time=dict.fromkeys(FIGURES, falling),
         frames_by_outcome={"delivered": 900, "lost": 100, "out_of_range": 77},
         frames_per_s={"delivered": 60.0, "lost": 30.0, "receiver_down": 10.0, "out_of_range": 7.0},
         faults=FAULTS,
@@ -184,6 +184,8 @@ def test_what_nobody_reports_has_no_row() -> None:
     assert "deviation" not in text
     assert "position" in text
     assert "common error" in "\n".join(rows(replace(shot, emulated_s=0.5))), "it may still come"
+    fixes_only = replace(shot, over_time={**shot.over_time, "position_rmse_m": (None,)}, position_rmse_m=None)
+    assert row(fixes_only, "raw fixes").endswith("6.31 m RMSE")
 
 
 def test_joining() -> None:

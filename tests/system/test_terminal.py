@@ -11,7 +11,9 @@ import struct
 import subprocess
 import sys
 import termios
+from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -29,20 +31,27 @@ from vnet.link.access import Access
 
 DOCS = (ROOT / "docs" / "terminal.md").read_text()
 SHORT = ["scenarios/beacon.toml", "--duration", "3", "--set", "network.vehicles=4"]
+WIDTH, HEIGHT = 90, 24
 CONTROL = re.compile(r"\x1b\[(\??)[\d;]*([A-Za-z])")
 
 
-def at_a_terminal(*arguments: str, width: int = 90, height: int = 24, **environment: str) -> tuple[int, str]:
-    """A vnet command on a pseudo-terminal: its status, and all that it wrote."""
+def at_a_terminal(
+    *arguments: str, awaited: str = "", then: Callable[[], None] = lambda: None, **environment: str
+) -> tuple[int, str]:
+    """A vnet command on a pseudo-terminal: its status, and what it wrote; once it writes `awaited`, do `then`."""
     master, slave = os.openpty()
-    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", HEIGHT, WIDTH, 0, 0))
     kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
     environment = {**kept, "TERM": "xterm-256color", "PYTHONHASHSEED": "0", **environment}
     with subprocess.Popen([*VNET, *arguments], cwd=ROOT, stdout=slave, stderr=slave, env=environment) as process:
         os.close(slave)
         written = b""
+        done = False
         while part := _read(master):
             written += part
+            if awaited and not done and awaited in written.decode(errors="ignore"):
+                done = True
+                then()
         os.close(master)
     return process.returncode, written.decode().replace("\r\n", "\n")
 
@@ -55,8 +64,8 @@ def _read(master: int) -> bytes:
         return b""
 
 
-def on_screen(written: str, width: int = 90, height: int = 24) -> str:
-    screen = Screen(width, height)
+def on_screen(written: str) -> str:
+    screen = Screen(WIDTH, HEIGHT)
     screen.feed(written)
     return screen.text
 
@@ -274,7 +283,11 @@ def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
         assert status["real_time_factor"] > 0
         assert status["fix_rmse_m"] > 0
         assert ask(folder, "status")["emulated_s"] >= status["emulated_s"]
-        process.send_signal(signal.SIGINT)
+        ends = partial(process.send_signal, signal.SIGINT)
+        watch = ("status", "--run", str(folder), "--watch")
+        exit_status, written = at_a_terminal(*watch, awaited="vehicles", then=ends)
+        assert exit_status == 0
+        assert on_screen(written) == f"{folder}: the run is over"
         process.communicate(timeout=TIMEOUT_S)
 
 
