@@ -374,7 +374,8 @@ class LiveRun:
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
         arguments += ["--out", str(sinks.save), *sinks.arguments]
-        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
+        environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), environment)
 
     def _recorder_listens(self) -> bool:
         return self._options.record is None or self._link.is_watched("period")
