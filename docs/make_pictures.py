@@ -20,6 +20,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,7 @@ def native_pictures(recording: Path, scratch: Path, out: Path) -> None:
         size = f"{DESK[0]}x{DESK[1]}"
         command = viewer_command("--headless", "--port", str(port), "--window-size", size, str(recording), str(tab))
         with running(command):
-            client = until(lambda port=port: ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy"))
+            client = until(partial(ViewerClient.connect, f"rerun+http://127.0.0.1:{port}/proxy"))
             until(client.get_state)
             time.sleep(SETTLE_S)
             client.set_time("emulated time", duration=AT_S, play_state="paused")
