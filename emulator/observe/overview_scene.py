@@ -40,7 +40,7 @@ ELLIPSES_EVERY_S = 0.5
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-LIMIT_VEHICLES = 200
+LIMIT_VEHICLES = 100
 """The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60

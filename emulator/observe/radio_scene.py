@@ -37,22 +37,22 @@ LARGEST_MATRIX = 400
 
 
 class Window:
-    """Sums of arrays over the last periods."""
+    """Sums of arrays of whole numbers over the last periods."""
 
     def __init__(self, periods: int) -> None:
-        self._kept: deque[NDArray[Any]] = deque(maxlen=max(1, periods))
+        self._kept: deque[NDArray[Any]] = deque()
+        self._periods = max(1, periods)
+        self.total: NDArray[Any] = np.zeros(1)
 
     def add(self, array: NDArray[Any]) -> None:
         """Take one period's."""
         self._kept.append(array)
+        self.total = self.total + array
+        if len(self._kept) > self._periods:
+            self.total -= self._kept.popleft()
 
     def __len__(self) -> int:
         return len(self._kept)
-
-    @property
-    def total(self) -> NDArray[Any]:
-        """The sum."""
-        return np.asarray(np.sum(self._kept, axis=0))
 
 
 class RadioScene:
@@ -81,8 +81,8 @@ class RadioScene:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
-        self._sent.add(period.numbers("sent_bytes"))
-        self._received.add(period.numbers("received_bytes"))
+        self._sent.add(period.numbers("sent_bytes").astype(float))
+        self._received.add(period.numbers("received_bytes").astype(float))
         if period.time_s >= self._next_s:
             self._next_s = period.time_s + EVERY_S
             self._charts(period)
