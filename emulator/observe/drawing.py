@@ -154,13 +154,19 @@ def link_states(period: Period) -> tuple[NDArray[np.intp], NDArray[np.intp], NDA
     A link is `delivered` if a frame got through; else its state is what befell most of them.
     """
     pairs = period.pairs
-    rank = np.where(pairs[:, 2] == Outcome.delivered, np.iinfo(np.int32).max, pairs[:, 3])
-    order = np.lexsort((-rank, pairs[:, 1], pairs[:, 0]))
-    pairs = pairs[order]
-    first = np.ones(len(pairs), dtype=bool)
-    first[1:] = (pairs[1:, :2] != pairs[:-1, :2]).any(axis=1)
-    chosen = pairs[first]
-    return chosen[:, 0].astype(np.intp), chosen[:, 1].astype(np.intp), chosen[:, 2]
+    if not len(pairs):
+        return np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.int32)
+    link = pairs[:, 0].astype(np.intp) * len(period.node_ids) + pairs[:, 1]
+    order = np.argsort(link, kind="stable")  # as a rule they come so
+    pairs, link = pairs[order], link[order]
+    rank = np.where(pairs[:, 2] == Outcome.delivered, _FIRST, pairs[:, 3])
+    starts = np.flatnonzero(np.diff(link, prepend=-1))
+    best = np.maximum.reduceat(rank * len(Outcome) + pairs[:, 2], starts)
+    return link[starts] // len(period.node_ids), link[starts] % len(period.node_ids), best % len(Outcome)
+
+
+_FIRST = np.int64(1) << 40
+"""More than there are frames."""
 
 
 def ellipses(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Floats:
