@@ -222,6 +222,7 @@ class Canvas:
         self._points: dict[str, _Rows] = defaultdict(_Rows)
         self._strips: dict[str, _Rows] = defaultdict(_Rows)
         self._plots: dict[str, tuple[list[int], list[float]]] = {}
+        self._bars: dict[str, Floats] = {}
 
     def at(self, time_ns: int) -> None:
         """What is drawn from now on belongs to this emulated time."""
@@ -322,6 +323,17 @@ class Canvas:
         times.extend(times_ns)
         numbers.extend(values)
 
+    def bars(self, entity: str, values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> None:
+        """A bar chart with bars of `width` around `middles`, which are only told when they change."""
+        where, heights = np.asarray(middles, dtype=np.float32), np.asarray(values, dtype=np.float32)
+        told = self._bars.get(entity)
+        if told is None or not np.array_equal(told, where):
+            self._bars[entity] = where
+            widths = np.full(len(where), width, dtype=np.float32)
+            self.log(entity, rr.BarChart(heights, color=colour, abscissa=where, widths=widths))
+        else:
+            self.log(entity, rr.BarChart.from_fields(values=heights))
+
     def send(self) -> None:
         """Send what has been kept."""
         for entity, rows in self._points.items():
@@ -370,14 +382,3 @@ def in_length(length_m: float) -> str:
 def flipped(position: ArrayLike) -> Floats:
     """East, north as Rerun's x right, y down."""
     return np.asarray(position, dtype=np.float32) * np.array([1, -1], dtype=np.float32)
-
-
-def bars(values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> rr.BarChart:
-    """A bar chart with bars of `width` around `middles`."""
-    heights = np.asarray(values, dtype=np.float32)
-    return rr.BarChart(
-        heights,
-        color=colour,
-        abscissa=np.asarray(middles, dtype=np.float32),
-        widths=np.full(len(heights), width, dtype=np.float32),
-    )

@@ -3,7 +3,7 @@
 One particle filter for each connected component of the network, on the same fixes as the vehicles', with the
 constants of the world itself. No cooperation of vehicles that hear only each other can be expected to do better.
 
-A step of it takes milliseconds, so that there are two a second, on the mean of each vehicle's fixes: while errors and
+A step of it takes milliseconds, so that there are two a second, on the mean of each vehicle's fixes: as errors and
 speeds hardly change it says what all of them say.
 """
 
