@@ -40,7 +40,7 @@ ELLIPSES_EVERY_S = 0.5
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-LIMIT_VEHICLES = 200
+LIMIT_VEHICLES = 100
 """The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60
@@ -112,7 +112,7 @@ class OverviewScene:
         self._trust(period)
         self._faults_and_downs(period)
         self.events(period.message["events"])
-        self._canvas.at(period.time_s)
+        self._canvas.at(period.time_ns)
 
     def _map(self, period: Period) -> None:
         canvas, position = self._canvas, period.points("position_m")
@@ -185,7 +185,7 @@ class OverviewScene:
     def events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Write down what happened, each event at its own time."""
         for event in events:
-            self._canvas.at(event["time_ns"] / 1e9)
+            self._canvas.at(event["time_ns"])
             level = "WARN" if event["kind"] in WARNINGS else "INFO"
             self._canvas.log("events", rr.TextLog(in_words(event), level=level))
 
