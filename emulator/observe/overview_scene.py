@@ -94,7 +94,7 @@ class OverviewScene:
 
     def _set_styles(self) -> None:
         canvas = self._canvas
-        canvas.strip_style("map/links", None, 1.0, -10.0)
+        canvas.strip_style("map/links", None, 1.8, -10.0)
         canvas.point_style("map/true", None, 5.0, self._node_ids)
         canvas.point_style("map/fix", GREY, 2.0)
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
@@ -102,7 +102,7 @@ class OverviewScene:
         canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
         canvas.point_style("common/particles", GREY, 1.0)
         canvas.point_style("common/estimates", SKY, 4.0, self._node_ids)
-        canvas.strip_style("common/ellipses", (*SKY, 110), 1.0)
+        canvas.strip_style("common/ellipses", (*SKY, 130), 1.2)
 
     def period(self, period: Period) -> None:
         """Draw a period."""
@@ -219,7 +219,8 @@ def draw_legend(canvas: Canvas) -> None:
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     links = [(outcome_title(outcome), colour) for outcome, colour in OUTCOME_COLOURS.items()]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
-        place = [[LEGEND_STEP * number, row] for number in range(len(items))]
+        place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
+        canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
         colours = [list(colour) for _, colour in items]
         canvas.point_style(f"legend/{entity}", colours, 5.0, [label for label, _ in items], show_labels=True)
         canvas.points(f"legend/{entity}", place, static=True)
