@@ -15,7 +15,7 @@ from rich.text import Text
 from emulator.observe.checks import Judgement, Verdict
 
 _STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
-_FIGURES = {
+FIGURES = {
     "common_error_rmse_m": "common error, RMSE",
     "deviation_m": "deviation between vehicles",
     "position_rmse_m": "position, RMSE of the estimates",
@@ -59,7 +59,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
     for check in judgement.checks:
         table.add_row(check.name, Text(check.verdict.value, style=_STYLE[check.verdict]), Text(check.text))
     console.print(table)
-    for reason, names in _left_out(judgement).items():
+    for reason, names in left_out(judgement).items():
         console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
@@ -71,7 +71,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
 
 
-def _left_out(judgement: Judgement) -> dict[str, list[str]]:
+def left_out(judgement: Judgement) -> dict[str, list[str]]:
     """What could not be exercised, by reason."""
     names: dict[str, list[str]] = {}
     for left in judgement.not_exercised:
@@ -86,11 +86,12 @@ def _offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
-        table.add_row(*(Text(_cell(row.get(column))) for column in columns))
+        table.add_row(*(Text(cell(row.get(column))) for column in columns))
     return table
 
 
-def _cell(value: Any) -> str:
+def cell(value: Any) -> str:
+    """A value as a table shows it."""
     if isinstance(value, float):
         return f"{value:.6g}"
     return "" if value is None else str(value)
@@ -114,7 +115,7 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
     table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
-    for name, title in _FIGURES.items():
+    for name, title in FIGURES.items():
         if (value := verdict["figures"].get(name)) is not None:
             table.add_row(title, f"{value:.3f} m")
     return table
