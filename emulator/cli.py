@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, report, compare and others.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -27,6 +27,7 @@ from emulator.observe.run_folder import RunFolder
 from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
 from emulator.playback_cli import play, render
+from emulator.report_cli import ReportOption, compare, report, report_at_end
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
@@ -57,6 +58,8 @@ app.command()(status)
 app.command()(view)
 app.command()(render)
 app.command()(play)
+app.command()(report)
+app.command()(compare)
 
 
 class Pacing(StrEnum):
@@ -118,6 +121,7 @@ def run(
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    report: ReportOption = True,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
@@ -138,7 +142,7 @@ def run(
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
-            _run_live(loaded, world, RunFolder.create(out, loaded), options, check_determinism)
+            _run_live(loaded, world, RunFolder.create(out, loaded), options, check_determinism, report)
 
 
 @app.command()
@@ -152,6 +156,7 @@ def simulate(
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
@@ -167,7 +172,7 @@ def simulate(
                 _record_here(emulation, sinks, stack)
             stack.enter_context(ProgressLine(emulation))
             wall_s, interrupted = run_simulation(emulation)
-        _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
+        _finish(emulation, wall_s, interrupted, "simulate", check_determinism, report)
 
 
 def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
@@ -204,6 +209,7 @@ def emulator(
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
     with one_line_errors():
@@ -220,7 +226,7 @@ def emulator(
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
         options = LiveOptions(users, listen, connect, launch=False, record=sinks)
-        _run_live(loaded, world, folder, options)
+        _run_live(loaded, world, folder, options, report=report)
 
 
 @app.command("access")
@@ -367,6 +373,7 @@ def _run_live(
     folder: RunFolder,
     options: LiveOptions,
     check_determinism: bool = False,
+    report: bool = True,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
@@ -378,7 +385,7 @@ def _run_live(
             print(sinks.serve.told(), file=sys.stderr)
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
-    _finish(emulation, wall_s, interrupted, "run", check_determinism)
+    _finish(emulation, wall_s, interrupted, "run", check_determinism, report)
 
 
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:
@@ -394,11 +401,15 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
-def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str, check_determinism: bool) -> None:
+def _finish(
+    emulation: Emulation, wall_s: float, interrupted: bool, command: str, check_determinism: bool, report: bool
+) -> None:
     judgement, verdict = conclude(emulation, wall_s, command)
     if check_determinism and not interrupted:
         verdict = run_again(emulation, judgement, verdict, command)
-    print_summary(judgement, verdict, emulation.folder.path, Console())
+    print_summary(judgement, verdict, emulation.folder.path, Console(), report)
+    if report:
+        report_at_end(emulation.folder.path)
     raise typer.Exit(130 if interrupted else judgement.exit_status)
 
 

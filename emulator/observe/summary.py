@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.observe.checks import Judgement, Verdict
+from emulator.observe.report.names import REPORT
 from emulator.observe.sinks import RECORDING, is_closed, mending_command
 
 _STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
@@ -25,14 +26,17 @@ FIGURES = {
 }
 
 
-def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console) -> None:
-    """The whole summary of a run that has just ended."""
+def print_summary(
+    judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console, report: bool = False
+) -> None:
+    """The whole summary of a run that has just ended; with `report`, its report is about to be written."""
     print_checks(judgement, console, verdict["reproduce"])
     console.print(_figures(verdict))
     console.print(_frames(verdict["frames_by_outcome"]))
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
+    following[f"vnet report {folder} --open"] = f"read {folder / REPORT}" if report else "have a report of it"
     if (recording := folder / RECORDING).exists():
         following[f"vnet view {folder}"] = "look at it"
         if not is_closed(recording):

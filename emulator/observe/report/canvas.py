@@ -260,7 +260,9 @@ def _make_plain(element: ElementTree.Element, names: dict[str, str]) -> None:
     if href := element.attrib.pop(_HREF, None):
         element.set("href", f"#{names[href[1:]]}")
     if "clip-path" in element.attrib:
-        element.set("clip-path", _REFERENCE.sub(lambda match: f"url(#{names[match[1]]})", element.get("clip-path", "")))
+        element.set(
+            "clip-path", _REFERENCE.sub(lambda match: f"url(#{names[match[1]]})", element.get("clip-path", ""))
+        )
     if "d" in element.attrib:
         element.set("d", _round(" ".join(element.get("d", "").split())))
     for attribute in ("x", "y"):

@@ -107,7 +107,12 @@ def time_figure(lines: Sequence[Line], y_label: str, end_s: float, spans: Sequen
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
         marker = "o" if np.isfinite(line.value).sum() < 3 else None
-        shown: dict[str, Any] = {"color": line.colour, "linestyle": line.dash, "marker": marker, "label": line.label}
+        shown: dict[str, Any] = {
+            "color": line.colour,
+            "linestyle": line.dash,
+            "marker": marker,
+            "label": line.label,
+        }
         made.axes.plot(*thin(line.time_s, line.value), **shown)
     everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
     positive = everything[everything > 0]
@@ -365,7 +370,9 @@ def weights(source: Source) -> Drawing:
         least = largest
     _dress_matrix(made, [printable(node, 7) for node in ids])
     legend(made, handles)
-    return Drawing(made, "Row by row what a vehicle gave each estimate when it mixed them, its own included; means.")
+    return Drawing(
+        made, "Row by row what a vehicle gave each estimate when it mixed them, its own included; means."
+    )
 
 
 def _dress_matrix(made: Canvas, ids: Sequence[str]) -> None:

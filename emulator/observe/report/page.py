@@ -19,19 +19,21 @@ SIGNS = {Verdict.VALID: "✓", Verdict.INVALID: "✗", Verdict.UNKNOWN: "?"}
 LONGEST_TEXT = 20_000
 """Characters of a text that others wrote."""
 
-# Series have the colours of Okabe and Ito (2008), which those who are colour-blind tell apart, brighter on dark paper.
+# Series have the colours of Okabe and Ito (2008), which the colour-blind tell apart, brighter on dark paper.
 STYLE = """
 :root { color-scheme: light dark;
   --paper: #ffffff; --panel: #f5f6f8; --ink: #1b1f24; --quiet: #59626d; --line: #d5d9df; --grid: #e6e9ed;
   --blue: #0072b2; --orange: #e69f00; --green: #009e73; --red: #d55e00; --purple: #cc79a7; --sky: #56b4e9;
   --grey: #8b929b; --link: #00609a;
-  --good: #0b6b50; --good-paper: #d9f0e8; --bad: #ffffff; --bad-paper: #b54a00; --open: #6a4a00; --open-paper: #fbeac4;
+  --good: #0b6b50; --good-paper: #d9f0e8; --bad: #ffffff; --bad-paper: #b54a00; --open: #6a4a00;
+  --open-paper: #fbeac4;
 }
 @media (prefers-color-scheme: dark) { :root {
   --paper: #14171b; --panel: #1d2126; --ink: #e4e7ea; --quiet: #9ba4ae; --line: #363c44; --grid: #292e35;
   --blue: #3fa2e0; --orange: #f0b132; --green: #1fbf94; --red: #f5803a; --purple: #e29bc3; --sky: #8fd0f7;
   --grey: #7d858f; --link: #6cbcf0;
-  --good: #7fe0c0; --good-paper: #123a30; --bad: #1b1206; --bad-paper: #f5803a; --open: #f5cf7d; --open-paper: #3d3010;
+  --good: #7fe0c0; --good-paper: #123a30; --bad: #1b1206; --bad-paper: #f5803a; --open: #f5cf7d;
+  --open-paper: #3d3010;
 } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; max-width: 82rem; padding: 1.5rem clamp(1rem, 2.5vw, 2rem) 4rem; color: var(--ink);
@@ -41,7 +43,8 @@ h1 { font-size: 1.75rem; line-height: 1.2; margin: .2rem 0 .6rem; overflow-wrap:
 h2 { font-size: 1.25rem; margin: 2.75rem 0 .75rem; padding-top: 1rem; border-top: 1px solid var(--line); }
 h3 { font-size: 1rem; margin: 0 0 .25rem; }
 p { margin: .4rem 0; max-width: 46rem; } a { color: var(--link); } small, .quiet { color: var(--quiet); }
-.quiet { font-size: .9rem; } code, pre { font-family: ui-monospace, "SF Mono", Menlo, Consolas, monospace; font-size: .85rem; }
+.quiet { font-size: .9rem; } code, pre { font-family: ui-monospace, "SF Mono", Menlo, Consolas, monospace;
+  font-size: .85rem; }
 pre { background: var(--panel); padding: .75rem .9rem; overflow-x: auto; border-radius: .4rem; margin: .5rem 0; }
 nav { display: flex; flex-wrap: wrap; gap: .25rem 1.1rem; margin: 1rem 0 0; font-size: .95rem; }
 .badge { display: inline-block; border-radius: .3rem; padding: .05rem .5rem; font-size: .85rem; font-weight: 600;
@@ -51,16 +54,20 @@ nav { display: flex; flex-wrap: wrap; gap: .25rem 1.1rem; margin: 1rem 0 0; font
 .badge.unknown, td.unknown { background: var(--open-paper); color: var(--open); }
 h1 .badge { font-size: 1rem; vertical-align: .3rem; margin-left: .4rem; }
 .wide { overflow-x: auto; max-width: 100%; }
-table { border-collapse: collapse; font-size: .9rem; } caption { text-align: left; padding-bottom: .4rem; color: var(--quiet); }
-th, td { padding: .3rem .7rem .3rem 0; text-align: left; vertical-align: top; border-bottom: 1px solid var(--grid); }
+table { border-collapse: collapse; font-size: .9rem; } caption { text-align: left; padding-bottom: .4rem;
+  color: var(--quiet); }
+th, td { padding: .3rem .7rem .3rem 0; text-align: left; vertical-align: top;
+  border-bottom: 1px solid var(--grid); }
 th { font-weight: 600; } thead th { color: var(--quiet); font-weight: 500; white-space: nowrap; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 dl.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1px; margin: 0;
   background: var(--line); border: 1px solid var(--line); border-radius: .4rem; overflow: hidden; }
 dl.tiles div { background: var(--paper); padding: .6rem .8rem; }
-dl.tiles dt { color: var(--quiet); font-size: .8rem; line-height: 1.3; } dl.tiles dd { margin: .15rem 0 0; font-size: 1.2rem;
+dl.tiles dt { color: var(--quiet); font-size: .8rem; line-height: 1.3; } dl.tiles dd { margin: .15rem 0 0;
+  font-size: 1.2rem;
   font-variant-numeric: tabular-nums; }
-dl.pairs { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: .4rem 0; font-size: .9rem; }
+dl.pairs { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: .4rem 0;
+  font-size: .9rem; }
 dl.pairs dt { color: var(--quiet); } dl.pairs dd { margin: 0; overflow-wrap: anywhere; min-width: 0; }
 details > summary { cursor: pointer; }
 """

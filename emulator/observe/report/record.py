@@ -1,4 +1,4 @@
-"""What a run says of itself in `verdict.json`, read as a foreign file: typed, bounded, or one line that says why not."""
+"""What a run says of itself in `verdict.json`, read as a foreign file: typed and bounded."""
 
 from __future__ import annotations
 

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
-from emulator.observe.metrics import STATES as ALL_STATES
 from emulator.observe.checks.evidence import Evidence
+from emulator.observe.metrics import STATES as ALL_STATES
 from emulator.observe.report.canvas import Span
 from emulator.observe.report.record import Record, read_record
 from emulator.observe.run_folder import Event, read_events
@@ -183,3 +183,12 @@ def maybe(read: Callable[[], T]) -> T | None:
         return read()
     except VnetError:
         return None
+
+
+def why_not(read: Callable[[], object]) -> str:
+    """Why `read` raises VnetError; "" where it does not."""
+    try:
+        read()
+    except VnetError as error:
+        return str(error)
+    return ""

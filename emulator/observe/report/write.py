@@ -14,31 +14,35 @@ from typing import Any
 from emulator.observe.checks.verdicts import CheckResult, Verdict
 from emulator.observe.report.figures import Chart, draw
 from emulator.observe.report.index import write_index
+from emulator.observe.report.names import REPORT
 from emulator.observe.report.page import badge, escape, page, pairs, put_page, table
 from emulator.observe.report.record import Record
-from emulator.observe.report.source import Source, maybe
+from emulator.observe.report.source import Source, maybe, why_not
 from emulator.observe.run_folder import RUNS, Event
 from emulator.observe.summary import FIGURES, left_out
 from vnet.errors import VnetError
 
-REPORT = "report.html"
 MOST_EVENTS = 200
 MOST_SCENARIO = 50_000
 """Characters of a scenario that are shown; one with a matrix of links may have millions."""
 MOST_NAMED = 8
 
 STYLE = """
-.facts { display: flex; flex-wrap: wrap; gap: .1rem 1.1rem; margin: 0; padding: 0; list-style: none; color: var(--quiet); }
+.facts { display: flex; flex-wrap: wrap; gap: .1rem 1.1rem; margin: 0; padding: 0; list-style: none;
+  color: var(--quiet); }
 .checks { list-style: none; margin: .75rem 0; padding: 0; border-top: 1px solid var(--grid); }
 .checks > li { border-bottom: 1px solid var(--grid); padding: .4rem 0; }
 .checks summary { display: grid; grid-template-columns: 6.2rem 13rem 1fr; gap: .1rem .75rem; align-items: baseline;
   list-style: none; } .checks summary::-webkit-details-marker { display: none; }
-.checks b { font-weight: 600; overflow-wrap: anywhere; } .checks summary > span:last-child { overflow-wrap: anywhere; }
+.checks b { font-weight: 600; overflow-wrap: anywhere; }
+.checks summary > span:last-child { overflow-wrap: anywhere; }
 .checks summary:hover b { text-decoration: underline; text-decoration-thickness: 1px; }
 .checks .more { margin: .5rem 0 .6rem 6.95rem; }
-.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 22rem), 1fr)); gap: 2rem 1.75rem;
+.figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 22rem), 1fr));
+  gap: 2rem 1.75rem;
   align-items: start; }
-figure { margin: 0; } figure figcaption { font-size: .85rem; line-height: 1.4; color: var(--quiet); margin: .3rem 0 0; }
+figure { margin: 0; } figure figcaption { font-size: .85rem; line-height: 1.4; color: var(--quiet);
+  margin: .3rem 0 0; }
 .chart { display: block; width: 100%; height: auto; overflow: visible; stroke-linejoin: round; }
 .chart text { font-family: inherit; }
 @media (max-width: 44rem) {
@@ -125,10 +129,7 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
 def _checks(source: Source, record: Record | None) -> Iterator[str]:
     yield '<section id="checks"><h2>Checks</h2>'
     if record is None:
-        try:
-            yield escape(source.record)  # never: there is none
-        except VnetError as error:
-            yield f"<p>Nothing was judged: {escape(error)}</p>"
+        yield f"<p>Nothing was judged: {escape(why_not(lambda: source.record))}.</p>"
     else:
         counts = {verdict: sum(check.verdict is verdict for check in record.checks) for verdict in Verdict}
         said = ", ".join(f"{count} {verdict.value}" for verdict, count in counts.items() if count)
@@ -139,7 +140,8 @@ def _checks(source: Source, record: Record | None) -> Iterator[str]:
         reasons = left_out(record.judgement)
         if reasons:
             rows = {reason[0].upper() + reason[1:]: ", ".join(names) for reason, names in reasons.items() if reason}
-            yield f'<h3>Left out, and why</h3><ul class="quiet">{"".join(_reason(*row) for row in rows.items())}</ul>'
+            listed = "".join(_reason(*row) for row in rows.items())
+            yield f'<h3>Left out, and why</h3><ul class="quiet">{listed}</ul>'
     yield "</section>"
 
 
@@ -197,7 +199,9 @@ def _key_figures(record: Record) -> Iterator[str]:
 def key_figures(record: Record) -> dict[str, str]:
     """What a run comes to, in few numbers, by name."""
     found = {
-        title: f"{value:.3f} m" for name, title in FIGURES.items() if (value := record.figures.get(name)) is not None
+        title: f"{value:.3f} m"
+        for name, title in FIGURES.items()
+        if (value := record.figures.get(name)) is not None
     }
     if (delivered := record.share_of("delivered")) is not None:
         found["delivered, of pairs in range"] = f"{delivered:.2%}"
