@@ -17,7 +17,7 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import ScenarioError, did_you_mean, printable, shown
 from vnet.faults import Fault
 from vnet.sections import Section, first_problem
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
@@ -30,6 +30,8 @@ FAR_M = 1e9
 WILD_M = 1e5
 """No standard deviation is larger, so that fixes stay near enough for frames to say."""
 MANY = 1_000_000_000
+MOST_NAMED = 8
+"""Files that a message names."""
 
 
 class Run(Section):
@@ -250,7 +252,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     try:
         data = read_toml(path)
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
     recorded_digests = data.pop("inputs", {})
@@ -270,6 +272,17 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         if recorded_digests.get(name, digest) != digest:
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
     return scenario
+
+
+def _instead(path: Path) -> str:
+    """What may have been meant by a path that is no file."""
+    try:
+        inside = sorted(each.name for each in path.glob("*.toml"))
+        if inside:
+            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+        return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
+    except (OSError, ValueError):
+        return ""
 
 
 def dump_scenario(scenario: Scenario) -> str:

@@ -16,7 +16,7 @@ from emulator.observe.checks import Judgement, Verdict
 from emulator.observe.report.names import REPORT
 from emulator.observe.sinks import RECORDING, is_closed, mending_command
 
-_STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
+STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 FIGURES = {
     "common_error_rmse_m": "common error, RMSE",
     "deviation_m": "deviation between vehicles",
@@ -57,14 +57,12 @@ def as_typed(command: str) -> str:
 
 def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None:
     """The verdict and its checks; of those that failed the offending rows, and how to have them again."""
-    table = Table(
-        title=Text(f"verdict: {judgement.verdict}", style=_STYLE[judgement.verdict]), title_justify="left"
-    )
+    table = Table(title=Text(f"verdict: {judgement.verdict}", style=STYLE[judgement.verdict]), title_justify="left")
     table.add_column("check")
     table.add_column("verdict")
     table.add_column("what was seen", overflow="fold")
     for check in judgement.checks:
-        table.add_row(check.name, Text(check.verdict.value, style=_STYLE[check.verdict]), Text(check.text))
+        table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
     console.print(table)
     for reason, names in left_out(judgement).items():
         console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
@@ -73,7 +71,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
             _print_details(check.figures, console)
         if rows := check.figures.get("rows"):
             console.print(Text(f"{check.name}: the first offending rows", style="bold red"))
-            console.print(_offending(rows))
+            console.print(offending(rows))
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
 
@@ -86,7 +84,7 @@ def left_out(judgement: Judgement) -> dict[str, list[str]]:
     return names
 
 
-def _offending(rows: Sequence[Mapping[str, Any]]) -> Table:
+def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows that a failed check holds against the run."""
     table = Table(box=None, padding=(0, 1, 0, 0))
     columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
