@@ -63,7 +63,8 @@ class Comparison:
     def check_rows(self) -> list[Row]:
         """The checks whose verdicts differ, and the runs' verdicts."""
         ours, theirs = ({check.name: check.verdict.value for check in record.checks} for record in self.records)
-        rows = [("the run", *(record.verdict.value for record in self.records), "")]
+        one, other = self.records
+        rows = [("the run", one.verdict.value, other.verdict.value, "")]
         for name in {**ours, **theirs}:
             if ours.get(name) != theirs.get(name):
                 rows.append((name, ours.get(name, "left out"), theirs.get(name, "left out"), ""))
@@ -115,8 +116,8 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     difference = comparison.first_difference
     assert isinstance(difference, CheckResult), difference
     console.print(Text(difference.text, style=STYLE[difference.verdict]), soft_wrap=True)
-    if rows := difference.figures.get("rows"):
-        console.print(offending(rows))
+    if differing := difference.figures.get("rows"):
+        console.print(offending(differing))
 
 
 def _table(title: str, names: tuple[str, str], rows: list[Row]) -> Table:

@@ -202,7 +202,7 @@ def outcomes(source: Source) -> Drawing:
         above = below + share[:, number]
         low, high = (np.append(some, some[-1]) for some in (below, above))
         drawn: dict[str, Any] = {"color": OUTCOME_COLOURS[names[number]], "linewidth": 0, "label": names[number]}
-        made.axes.fill_between(edges, low, high, step="post", zorder=0.3, alpha=0.85, **drawn)
+        made.axes.fill_between(edges, low, high, step="post", zorder=0.6, **drawn)
         below = above
     made.axes.set_ylim(0, 100)
     legend(made)

@@ -60,9 +60,8 @@ th, td { padding: .3rem .7rem .3rem 0; text-align: left; vertical-align: top;
   border-bottom: 1px solid var(--grid); }
 th { font-weight: 600; } thead th { color: var(--quiet); font-weight: 500; white-space: nowrap; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-dl.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1px; margin: 0;
-  background: var(--line); border: 1px solid var(--line); border-radius: .4rem; overflow: hidden; }
-dl.tiles div { background: var(--paper); padding: .6rem .8rem; }
+dl.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1px; margin: 0; }
+dl.tiles div { outline: 1px solid var(--line); padding: .6rem .8rem; }
 dl.tiles dt { color: var(--quiet); font-size: .8rem; line-height: 1.3; } dl.tiles dd { margin: .15rem 0 0;
   font-size: 1.2rem;
   font-variant-numeric: tabular-nums; }

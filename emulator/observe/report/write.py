@@ -252,7 +252,12 @@ def _event(event: Event) -> dict[str, Any]:
     """A row of the table of events."""
     details = {name: value for name, value in event.details.items() if name != "where"}
     text = ", ".join(f"{name} {_listed(value)}" for name, value in details.items())
-    return {"time": f"{event.time_ns / 1e9:.3f} s", "event": event.kind, "node": event.node or "", "details": text}
+    return {
+        "time (s)": f"{event.time_ns / 1e9:.3f}",
+        "event": event.kind,
+        "node": event.node or "",
+        "details": text,
+    }
 
 
 def _listed(value: Any) -> str:
