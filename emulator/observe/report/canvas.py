@@ -12,6 +12,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -51,7 +52,7 @@ _LETTER_PX = 5.6
 """The width of a letter of a fault's label, on average."""
 MOST_POINTS = 2 * (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
 
-STYLED = {
+STYLED: dict[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "vnet",
     "text.parse_math": False,

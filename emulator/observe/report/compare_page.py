@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +76,10 @@ def _tables(comparison: Comparison) -> Iterator[str]:
 def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, str]]:
     charts, missing = [], {}
     drawers: dict[str, tuple[str, Callable[[], Drawing]]] = {
-        key: (title, lambda name=name, label=label: _metric(comparison, name, label))
-        for key, (title, name, label) in METRICS.items()
+        key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
     }
-    drawers["delivered"] = ("Delivered", lambda: _delivered(comparison))
-    drawers["latency"] = ("Latency", lambda: _latency(comparison))
+    drawers["delivered"] = ("Delivered", partial(_delivered, comparison))
+    drawers["latency"] = ("Latency", partial(_latency, comparison))
     for key, (title, draw) in drawers.items():
         try:
             drawing = draw()
@@ -107,7 +107,7 @@ def _over_time(comparison: Comparison, read: Callable[[Source], Any], y_label: s
     """`read` gives times (n,) in seconds and values (n,) of a run."""
     found, note = _of_both(comparison, read)
     spans, said = _spans(comparison)
-    lines = [Line(name, *read_, colour, dash) for (name, colour, dash), read_ in found]
+    lines = [Line(name, times, values, colour, dash) for (name, colour, dash), (times, values) in found]
     made = time_figure(lines, y_label, max(comparison.first.end_s, comparison.second.end_s), spans)
     return Drawing(made, f"{caption}{said}{note}".strip())
 

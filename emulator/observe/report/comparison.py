@@ -89,15 +89,13 @@ class Comparison:
     def outcomes(self) -> list[Row]:
         """Shares of the pairs in range by outcome, in percent, with B − A in percentage points."""
         ours, theirs = self.records
-        names = ours.frames_by_outcome | theirs.frames_by_outcome
-        shares = {
-            name: [record.share_of(name) for record in self.records] for name in names if name != "out_of_range"
-        }
-        return [
-            _difference(f"{name} (%)", *(None if share is None else 100 * share for share in pair), ".2f")
-            for name, pair in shares.items()
-            if any(pair)
-        ]
+        rows = []
+        for name in ours.frames_by_outcome | theirs.frames_by_outcome:
+            shares = [record.share_of(name) for record in self.records]
+            if name != "out_of_range" and any(shares):
+                percent = [None if share is None else 100 * share for share in shares]
+                rows.append(_difference(f"{name} (%)", percent[0], percent[1], ".2f"))
+        return rows
 
 
 def _told(finding: Finding) -> CheckResult:
@@ -154,9 +152,8 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
 def _table(title: str, rows: Sequence[Mapping[str, Any]], style: Any = lambda text: "") -> Table:
     table = Table(title=title, title_justify="left")
     for column in rows[0]:
-        table.add_column(
-            column, overflow="fold", justify="right" if "figure" in rows[0] and column != "figure" else "left"
-        )
+        numeric = "figure" in rows[0] and column != "figure"
+        table.add_column(column, overflow="fold", justify="right" if numeric else "left")
     for row in rows:
         table.add_row(*(Text(cell(value), style=style(value)) for value in row.values()))
     return table

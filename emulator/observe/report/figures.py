@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path as Outline
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.stats import binom
 
@@ -346,7 +347,7 @@ def degrees(source: Source) -> Drawing:
         cap = source.scenario.radio.max_peers
         made.axes.axvline(cap + 0.5, color=INK, linestyle=DASHES[2], label=f"peer cap {cap}")
     made.axes.set_xlim(edges[0] - 0.3, max(edges[-1], 4) + 0.3)
-    made.axes.xaxis.get_major_locator().set_params(integer=True)
+    made.axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     whole_numbers(made.axes)
     legend(made)
     radio = source.scenario.radio
@@ -384,9 +385,9 @@ def _dress_matrix(made: Canvas, ids: Sequence[str]) -> None:
     axes = made.axes
     axes.set(xlim=(0, len(ids)), ylim=(len(ids), 0))
     every = int(np.ceil(len(ids) / 12))
-    ticks = np.arange(0, len(ids), every)
+    ticks = range(0, len(ids), every)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_ticks(ticks + 0.5, [ids[tick] for tick in ticks])
+        axis.set_ticks([tick + 0.5 for tick in ticks], [ids[tick] for tick in ticks])
         axis.set_tick_params(labelsize=9, length=0)
     axes.grid(visible=False)
 

@@ -126,7 +126,7 @@ class Source:
     @cached_property
     def time_s(self) -> Array:
         """(periods,) when the periods of the metrics start."""
-        return self.metrics["time_ns"].to_numpy() / 1e9
+        return np.asarray(self.metrics["time_ns"].to_numpy() / 1e9)
 
     def metric(self, name: str) -> Array:
         """(periods,) a column of the metrics; NaN where nobody reported. Raises VnetError if nobody ever did."""
