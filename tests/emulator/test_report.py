@@ -5,6 +5,7 @@ import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -48,9 +49,14 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
+def vnet(arguments: list[str]) -> Any:
+    """Run a command in this process; without a fixed hash seed, it would start itself anew."""
+    return CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
+
+
 def simulate(folder: Path, *options: str, scenario: str = "faults.toml") -> Path:
     arguments = ["simulate", str(ROOT / "scenarios" / scenario), "--out", str(folder), *options]
-    done = CliRunner().invoke(app, arguments)
+    done = vnet(arguments)
     assert (folder / "verdict.json").exists(), done.output
     return folder
 
@@ -133,7 +139,7 @@ def test_a_run_that_lost_a_file_has_a_report_that_says_so(beacon: Path, lost: st
 
 
 def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, ["report", str(tmp_path)])
+    done = vnet(["report", str(tmp_path)])
     assert done.exit_code == 2 and "not a run's folder" in done.output and done.output.count("\n") == 1
 
 
@@ -162,22 +168,22 @@ def test_simulate_writes_the_report_and_a_failure_leaves_the_verdict(
 ) -> None:
     scenario = str(ROOT / "scenarios" / "beacon.toml")
     arguments = ["simulate", scenario, "--duration", "2", "--out"]
-    written = CliRunner().invoke(app, [*arguments, str(tmp_path / "one")])
+    written = vnet([*arguments, str(tmp_path / "one")])
     assert (tmp_path / "one" / "report.html").exists() and "report.html" in written.output.replace("\n", "")
 
     def fail(folder: Path) -> Path:
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(report_cli, "_write_report", fail)
-    failed = CliRunner().invoke(app, [*arguments, str(tmp_path / "two")])
+    failed = vnet([*arguments, str(tmp_path / "two")])
     assert failed.exit_code == written.exit_code == 0
     assert "the report could not be written" in failed.output and "no ink" in failed.output
-    left_out = CliRunner().invoke(app, [*arguments, str(tmp_path / "three"), "--no-report"])
+    left_out = vnet([*arguments, str(tmp_path / "three"), "--no-report"])
     assert left_out.exit_code == 0 and "could not be written" not in left_out.output
 
 
 def test_compare_finds_a_planted_difference(beacon_run: Path, beacon: Path, tmp_path: Path) -> None:
-    same = CliRunner().invoke(app, ["compare", str(beacon_run), str(beacon)])
+    same = vnet(["compare", str(beacon_run), str(beacon)])
     assert same.exit_code == 0 and "two runs agree" in same.output
     trace = pq.read_table(beacon / "trace.parquet")
     size = trace["size_bytes"].to_pylist()
@@ -186,7 +192,7 @@ def test_compare_finds_a_planted_difference(beacon_run: Path, beacon: Path, tmp_
     planted = trace.set_column(place, "size_bytes", pa.array(size, trace.schema.field(place).type))
     pq.write_table(planted, beacon / "trace.parquet")
     out = tmp_path / "both.html"
-    done = CliRunner().invoke(app, ["compare", str(beacon_run), str(beacon), "--out", str(out)])
+    done = vnet(["compare", str(beacon_run), str(beacon), "--out", str(out)])
     assert done.exit_code == 1
     assert "first in row 7 of the trace: size_bytes" in done.output
     page = Page(out.read_text())
@@ -214,5 +220,5 @@ def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_p
 
 def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> None:
     (beacon / "states.parquet").unlink()
-    with pytest.raises(VnetError, match="states.parquet"):
+    with pytest.raises(VnetError, match=r"states\.parquet"):
         Comparison.of(beacon_run, beacon)
