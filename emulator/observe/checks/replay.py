@@ -24,36 +24,44 @@ ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outc
 def check_replay(folder: Path) -> Finding:
     """Compare a run with the second one in its folder. Raises VnetError if a table cannot be read."""
     again = folder / AGAIN
-    if not (again / "verdict.json").exists():
-        return ONCE
+    return compare_folders(folder, again) if (again / "verdict.json").exists() else ONCE
+
+
+def compare_folders(first: Path, second: Path) -> Finding:
+    """Compare two finished runs. Raises VnetError if a table cannot be read, or has other columns in one."""
+    tables = []
+    for name in TABLES:
+        ours, theirs = _read(first, name), _read(second, name)
+        if set(ours.column_names) != set(theirs.column_names):
+            raise VnetError(f"{second / name}.parquet: has other columns than the one of {first}")
+        tables.append((name, ours, theirs))
+    return compare(tables)
+
+
+def _read(folder: Path, name: str) -> pa.Table:
     try:
-        return compare(read_tables(folder, again))
+        return pq.read_table(folder / f"{name}.parquet")
     except (OSError, pa.ArrowInvalid) as error:
-        raise VnetError(f"{again}: not the folder of a finished run: {error}") from None
+        raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
 
 
-def read_tables(first: Path, second: Path) -> list[tuple[str, pa.Table, pa.Table]]:
-    """The tables (name, first, second) of two runs. Raises OSError and ArrowException."""
-    return [(name, *(pq.read_table(folder / f"{name}.parquet") for folder in (first, second))) for name in TABLES]
-
-
-def compare(tables: list[tuple[str, pa.Table, pa.Table]], names: tuple[str, str] = ("first", "again")) -> Finding:
-    """Compare tables (name, first, second) of two runs; the first difference is shown, with the runs' `names`."""
+def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
+    """Compare tables (name, first, second) of two runs; the first difference is shown."""
     for name, first, second in tables:
         place = first_difference(first, second)
         if place is not None:
-            return _difference(name, first, second, place, names)
+            return _difference(name, first, second, place)
     text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
     return result("replay", 0, text, "", rows_each=len(tables[0][1]))
 
 
-def _difference(name: str, first: pa.Table, second: pa.Table, place: int, names: tuple[str, str]) -> Finding:
+def _difference(name: str, first: pa.Table, second: pa.Table, place: int) -> Finding:
     ours, theirs = _row(first, place), _row(second, place)
     differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
     how = ", ".join(differing) if ours and theirs else "one has no such row"
     shown = [
         {"run": run, "row": place, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
-        for run, row in zip(names, (ours, theirs), strict=True)
+        for run, row in (("first", ours), ("again", theirs))
     ]
     text = f"two runs differ, first in row {place} of the {name}: {how}"
     return result("replay", 1, "", text, shown, table=name, row=place, differing=differing)

@@ -1,169 +1,174 @@
-"""Two runs side by side: what was asked of them, what became of it, and where they first differ."""
+"""Two runs side by side: where their scenarios differ, what each came to, and the first row in which they part."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from emulator.observe.checks.replay import compare, read_tables
+from emulator.observe.checks.replay import compare_folders
 from emulator.observe.checks.verdicts import CheckResult, Finding, Verdict
 from emulator.observe.report.record import Record
 from emulator.observe.report.source import Source
-from emulator.observe.summary import FIGURES, STYLE, offending
-from vnet.errors import VnetError
-from vnet.scenario import Scenario
+from emulator.observe.summary import FIGURES, cell
+from vnet.toml_text import parse_toml
 
-Row = tuple[str, str, str, str]
-"""What is compared, of the first run, of the second, and the difference."""
+A, B = "A", "B"
+LONGEST_VALUE = 200
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two finished runs. `first_difference` says in which row of which table they part."""
+    """Two finished runs, and the first difference between their tables: valid where there is none."""
 
     first: Source
     second: Source
-    first_difference: Finding
+    finding: CheckResult
 
     @classmethod
     def of(cls, first: Path, second: Path) -> Comparison:
-        """Compare the runs in two folders. Raises VnetError if one is not a finished run's."""
+        """Read two runs' folders. Raises VnetError if one is not that of a finished run of this vnet."""
         sources = Source(first), Source(second)
         for source in sources:
-            _ = source.record, source.scenario
-        try:
-            tables = read_tables(first, second)
-        except (OSError, pa.ArrowException) as error:
-            raise VnetError(f"{first}, {second}: a table cannot be read: {error}") from None
-        return cls(*sources, compare(tables, (str(first), str(second))))
+            _ = source.record, source.scenario, source.evidence
+        return cls(*sources, _told(compare_folders(first, second)))
 
     @property
     def records(self) -> tuple[Record, Record]:
-        """Both verdict.json."""
+        """What each run says of itself."""
         return self.first.record, self.second.record
 
     @property
     def same_trace(self) -> bool:
-        """Whether every frame had the same fate in both."""
-        return self.records[0].trace_sha256 == self.records[1].trace_sha256
+        """Whether the traces are the same; states and metrics may still differ."""
+        return self.finding.figures.get("table") != "trace"
 
-    def scenario_rows(self) -> list[Row]:
-        """The keys of the scenarios that differ."""
-        ours, theirs = _flat(self.first.scenario), _flat(self.second.scenario)
-        keys = [key for key in {**ours, **theirs} if ours.get(key) != theirs.get(key)]
-        return [(key, _told(ours.get(key)), _told(theirs.get(key)), "") for key in keys]
+    @cached_property
+    def scenario(self) -> list[Row]:
+        """The keys of the scenarios that differ, with both values; None where a run has no such key."""
+        ours, theirs = (dict(_flat(parse_toml(source.scenario_text))) for source in (self.first, self.second))
+        keys = [key for key in ours | theirs if ours.get(key) != theirs.get(key)]
+        return [{"key": key, A: _short(ours.get(key)), B: _short(theirs.get(key))} for key in keys]
 
-    def check_rows(self) -> list[Row]:
-        """The checks whose verdicts differ, and the runs' verdicts."""
-        ours, theirs = ({check.name: check.verdict.value for check in record.checks} for record in self.records)
-        one, other = self.records
-        rows = [("the run", one.verdict.value, other.verdict.value, "")]
-        for name in {**ours, **theirs}:
-            if ours.get(name) != theirs.get(name):
-                rows.append((name, ours.get(name, "left out"), theirs.get(name, "left out"), ""))
+    @cached_property
+    def checks(self) -> list[Row]:
+        """The verdict, and that of each check; "left out" where a run could not exercise it."""
+        judged = [
+            {check.name: check.verdict.value for check in record.checks}
+            | {left.name: "left out" for left in record.not_exercised}
+            for record in self.records
+        ]
+        rows = [{"check": "the run", A: self.records[0].verdict.value, B: self.records[1].verdict.value}]
+        for name in judged[0] | judged[1]:
+            verdicts = [each.get(name, "left out") for each in judged]
+            if verdicts != ["left out"] * 2:
+                rows.append({"check": name, A: verdicts[0], B: verdicts[1]})
         return rows
 
-    def figure_rows(self) -> list[Row]:
-        """Errors, shares of outcomes and speed, with the second's less the first's."""
-        return [*self._errors(), *self._shares(), *self._speed()]
+    @cached_property
+    def figures(self) -> list[Row]:
+        """Key figures with B − A; lengths in metres."""
+        ours, theirs = (record.figures for record in self.records)
+        rows = [
+            _difference(f"{title} (m)", ours.get(name), theirs.get(name), ".3f")
+            for name, title in FIGURES.items()
+            if ours.get(name) is not None or theirs.get(name) is not None
+        ]
+        times = [(record.emulated_s, record.wall_s) for record in self.records]
+        rows.append(_difference("emulated time (s)", times[0][0], times[1][0], ".1f"))
+        return [*rows, _difference("wall-clock time (s)", times[0][1], times[1][1], ".1f")]
 
-    def _errors(self) -> Iterator[Row]:
-        one, other = self.records
-        for name, title in FIGURES.items():
-            a, b = one.figures.get(name), other.figures.get(name)
-            if a is not None or b is not None:
-                change = f"{b - a:+.3f} m" if a is not None and b is not None else ""
-                yield title, _metres(a), _metres(b), change
+    @cached_property
+    def outcomes(self) -> list[Row]:
+        """Shares of the pairs in range by outcome, in percent, with B − A in percentage points."""
+        ours, theirs = self.records
+        rows = []
+        for name in ours.frames_by_outcome | theirs.frames_by_outcome:
+            shares = [record.share_of(name) for record in self.records]
+            if name != "out_of_range" and any(shares):
+                percent = [None if share is None else 100 * share for share in shares]
+                rows.append(_difference(f"{name} (%)", percent[0], percent[1], ".2f"))
+        return rows
 
-    def _shares(self) -> Iterator[Row]:
-        one, other = self.records
-        for outcome in {**one.frames_by_outcome, **other.frames_by_outcome}:
-            if outcome == "out_of_range":
-                continue
-            a, b = one.share_of(outcome), other.share_of(outcome)
-            if a or b:
-                change = f"{100 * (b - a):+.2f} points" if a is not None and b is not None else ""
-                yield f"pairs {outcome}", _share(a), _share(b), change
 
-    def _speed(self) -> Iterator[Row]:
-        a, b = (record.real_time_factor for record in self.records)
-        if a and b:
-            yield "real-time factor", f"{a:.2f}", f"{b:.2f}", f"× {b / a:.2f}"
+def _told(finding: Finding) -> CheckResult:
+    """The finding with the runs called by their letters."""
+    assert isinstance(finding, CheckResult), "two folders were compared"
+    figures = dict(finding.figures)
+    if "rows" in figures:
+        figures["rows"] = [{**row, "run": name} for row, name in zip(figures["rows"], (A, B), strict=True)]
+    return CheckResult("first difference", finding.verdict, finding.text, figures)
+
+
+def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value of nested tables and lists of tables by its dotted key."""
+    if isinstance(data, dict):
+        for name, value in data.items():
+            yield from _flat(value, f"{key}.{name}" if key else name)
+    elif isinstance(data, list) and data and all(isinstance(item, dict) for item in data):
+        for number, item in enumerate(data):
+            yield from _flat(item, f"{key}.{number}")
+    else:
+        yield key, data
+
+
+def _short(value: Any) -> str | None:
+    """A value as one short text."""
+    text = "" if value is None else str(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+
+
+def _difference(name: str, ours: float | None, theirs: float | None, form: str) -> Row:
+    values = ["–" if value is None else format(value, form) for value in (ours, theirs)]
+    change = "" if ours is None or theirs is None else format(theirs - ours, f"+{form}")
+    return {"figure": name, A: values[0], B: values[1], "B − A": change}
 
 
 def print_comparison(comparison: Comparison, console: Console) -> None:
-    """All of it, for a terminal."""
-    names = comparison.first.folder, comparison.second.folder
-    sections = {
-        "scenario, where it differs": comparison.scenario_rows(),
-        "verdicts, where they differ": comparison.check_rows(),
-        "figures (means after the first fifth of each run)": comparison.figure_rows(),
-    }
-    for title, rows in sections.items():
-        if rows:
-            console.print(_table(title, (str(names[0]), str(names[1])), rows))
-    for source in (comparison.first, comparison.second):
-        console.print(
-            f"trace sha256 {source.record.trace_sha256}  {source.folder}", highlight=False, soft_wrap=True
-        )
-    difference = comparison.first_difference
-    assert isinstance(difference, CheckResult), difference
-    console.print(Text(difference.text, style=STYLE[difference.verdict]), soft_wrap=True)
-    if differing := difference.figures.get("rows"):
-        console.print(offending(differing))
+    """The whole comparison, for a terminal."""
+    console.print(f"A  {comparison.first.folder}", highlight=False, soft_wrap=True)
+    console.print(f"B  {comparison.second.folder}", highlight=False, soft_wrap=True)
+    if comparison.scenario:
+        console.print(_table("scenario, where they differ", comparison.scenario))
+    else:
+        console.print("scenario: the same")
+    console.print(_table("verdicts", comparison.checks, _verdict_style))
+    console.print(_table("figures (errors: means after the first fifth)", comparison.figures))
+    if comparison.outcomes:
+        console.print(_table("shares of the pairs in range", comparison.outcomes))
+    finding = comparison.finding
+    console.print(Text(finding.text, style="green" if finding.verdict is Verdict.VALID else "bold red"))
+    if rows := finding.figures.get("rows"):
+        console.print(_turned(rows))
 
 
-def _table(title: str, names: tuple[str, str], rows: list[Row]) -> Table:
+def _table(title: str, rows: Sequence[Mapping[str, Any]], style: Any = lambda text: "") -> Table:
     table = Table(title=title, title_justify="left")
-    table.add_column("")
-    for name in names:
-        table.add_column(name, overflow="fold")
-    with_change = any(change for *_, change in rows)
-    if with_change:
-        table.add_column("change", justify="right")
-    for name, a, b, change in rows:
-        cells = [Text(value, style=_style(value)) for value in (a, b)]
-        table.add_row(name, *cells, *([change] if with_change else []))
+    for column in rows[0]:
+        numeric = "figure" in rows[0] and column != "figure"
+        table.add_column(column, overflow="fold", justify="right" if numeric else "left")
+    for row in rows:
+        table.add_row(*(Text(cell(value), style=style(value)) for value in row.values()))
     return table
 
 
-def _style(value: str) -> str:
-    return STYLE[Verdict(value)] if value in {verdict.value for verdict in Verdict} else ""
+def _verdict_style(value: object) -> str:
+    return {"valid": "green", "invalid": "bold red", "unknown": "yellow"}.get(str(value), "")
 
 
-def _flat(scenario: Scenario) -> dict[str, Any]:
-    """A scenario's values by their dotted keys; faults by number."""
-    flat: dict[str, Any] = {}
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                walk(f"{prefix}.{key}" if prefix else key, inner)
-        elif isinstance(value, list) and value and all(isinstance(inner, dict) for inner in value):
-            for number, inner in enumerate(value):
-                walk(f"{prefix}.{number}", inner)
-        else:
-            flat[prefix] = value
-
-    walk("", scenario.model_dump(mode="json", exclude_none=True))
-    return flat
+def _turned(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Two rows of a table as columns: long rows do not fit into a terminal."""
+    return _table("", turned(rows))
 
 
-def _told(value: Any) -> str:
-    text = "–" if value is None else str(value)
-    return text if len(text) <= 60 else text[:59] + "…"
-
-
-def _metres(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f} m"
-
-
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2%}"
+def turned(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Two rows of a table, A and B, as columns."""
+    names = dict.fromkeys(key for row in rows for key in row if key != "run")
+    return [{"column": name, A: rows[0].get(name), B: rows[1].get(name)} for name in names]

@@ -186,7 +186,7 @@ def consistency(source: Source) -> Drawing:
 
 
 def outcomes(source: Source) -> Drawing:
-    names, code, decided_s = _decided(source)
+    names, code, decided_s = decided(source)
     period_s = source.scenario.period_ns / 1e9
     periods = max(1, int(np.ceil(source.end_s / period_s - 1e-9)))
     width_s = int(np.ceil(periods / MOST_BINS)) * period_s
@@ -210,7 +210,7 @@ def outcomes(source: Source) -> Drawing:
     return Drawing(made, text + _faults_note(made, source))
 
 
-def _decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
+def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
     """Names of outcomes, and each row's number among them and when it was decided, in seconds."""
     trace = source.evidence.trace
     if not len(trace):
@@ -306,12 +306,17 @@ def _why_less(source: Source) -> str:
     return f" Links below it met {', '.join(names)} as well." if names else ""
 
 
-def latency(source: Source) -> Drawing:
+def latencies_ms(source: Source) -> Array:
+    """(k,) from sending to arrival of each delivery. Raises VnetError if there is none."""
     evidence = source.evidence
     delivered = evidence.outcome_is("delivered")
     if not delivered.any():
         raise VnetError("nothing was delivered")
-    latency_ms = (evidence.arrival_ns[delivered] - evidence.sent_ns[delivered]) / 1e6
+    return np.asarray((evidence.arrival_ns[delivered] - evidence.sent_ns[delivered]) / 1e6)
+
+
+def latency(source: Source) -> Drawing:
+    latency_ms = latencies_ms(source)
     median, late, latest = np.percentile(latency_ms, [50, 99, 100])
     shown_ms = min(latest, 2.5 * np.percentile(latency_ms, 99.5))
     counts, edges = np.histogram(latency_ms, bins=50, range=(0, max(shown_ms * 1.02, 1e-3)))
@@ -380,9 +385,9 @@ def _dress_matrix(made: Canvas, ids: Sequence[str]) -> None:
     axes = made.axes
     axes.set(xlim=(0, len(ids)), ylim=(len(ids), 0))
     every = int(np.ceil(len(ids) / 12))
-    ticks = np.arange(0, len(ids), every)
+    ticks = range(0, len(ids), every)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_ticks(ticks + 0.5, [ids[int(tick)] for tick in ticks])
+        axis.set_ticks([tick + 0.5 for tick in ticks], [ids[tick] for tick in ticks])
         axis.set_tick_params(labelsize=9, length=0)
     axes.grid(visible=False)
 

@@ -72,6 +72,8 @@ class Entry:
     folder: Path
     when: datetime
     record: Record | None
+    without: str
+    """What it has instead of a verdict, in two words."""
     problem: str
 
 
@@ -95,14 +97,15 @@ def _entries(folder: Path) -> Iterator[Entry]:
     for path in below:
         if path.is_symlink() and path.resolve().parent == folder.resolve():
             continue  # `latest`, which is listed under its own name
-        record, problem = None, "no verdict.json: it is still going on, or was ended from outside"
+        record, without = None, "no verdict"
+        problem = "no verdict.json: it is still going on, or was ended from outside"
         if (path / "verdict.json").exists():
             try:
                 record = read_record(path)
             except VnetError as error:
-                problem = str(error).removeprefix(f"{path}/")
+                without, problem = "broken", str(error).removeprefix(f"{path}/")
         try:
-            yield Entry(path, when(path), record, problem)
+            yield Entry(path, when(path), record, without, problem)
         except VnetError:
             continue  # somebody has just removed it
 
@@ -133,8 +136,8 @@ def _body(folder: Path, entries: list[Entry]) -> Iterator[str]:
 def _row(entry: Entry, is_latest: bool) -> str:
     record = entry.record
     verdict = record.verdict.value if record else "none"
-    cells = [_named(entry, is_latest), (verdict, badge(record.verdict if record else None))]
-    cells.append((entry.when.isoformat(), f"{entry.when:%Y-%m-%d %H:%M}"))
+    cells = [_named(entry, is_latest), (verdict, badge(record.verdict if record else None, entry.without))]
+    cells.append((entry.when.isoformat(), f"{entry.when:%Y-%m-%d %H:%M}".replace(" ", "\u00a0")))
     cells += _numbers(record) if record else [("", "")] * 5
     cells.append(("", _files(entry.folder)))
     shown = (

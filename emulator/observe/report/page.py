@@ -60,8 +60,9 @@ th, td { padding: .3rem .7rem .3rem 0; text-align: left; vertical-align: top;
   border-bottom: 1px solid var(--grid); }
 th { font-weight: 600; } thead th { color: var(--quiet); font-weight: 500; white-space: nowrap; }
 td.number, th.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
-dl.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1px; margin: 0; }
-dl.tiles div { outline: 1px solid var(--line); padding: .6rem .8rem; }
+dl.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: 1px; margin: 0;
+  border: 1px solid var(--line); border-radius: .4rem; overflow: hidden; }
+dl.tiles div { padding: .6rem .8rem; box-shadow: 0 0 0 1px var(--line); }
 dl.tiles dt { color: var(--quiet); font-size: .8rem; line-height: 1.3; } dl.tiles dd { margin: .15rem 0 0;
   font-size: 1.2rem;
   font-variant-numeric: tabular-nums; }
@@ -94,10 +95,10 @@ def page(title: str, body: Iterable[str], style: str = "", script: str = "") -> 
     return "\n".join(parts) + "\n"
 
 
-def badge(verdict: Verdict | None) -> str:
+def badge(verdict: Verdict | None, otherwise: str = "no verdict") -> str:
     """A verdict as a coloured word with a sign, as colour alone says nothing to some."""
     if verdict is None:
-        return '<span class="badge">no verdict</span>'
+        return f'<span class="badge">{escape(otherwise)}</span>'
     return f'<span class="badge {verdict.value}">{SIGNS[verdict]} {verdict.value}</span>'
 
 
@@ -108,7 +109,8 @@ def pairs(rows: Mapping[str, object]) -> str:
 
 def table(rows: Sequence[Mapping[str, Any]], caption: str = "") -> str:
     """Rows of named values; columns in which nothing stands are left out."""
-    columns = list(dict.fromkeys(key for row in rows for key in row if row[key] not in (None, "")))
+    names = dict.fromkeys(key for row in rows for key in row)
+    columns = [name for name in names if any(row.get(name) not in (None, "") for row in rows)]
     numeric = {c for c in columns if all(isinstance(row.get(c), (int, float, type(None))) for row in rows)}
     head = "".join(f'<th scope="col"{_class(c in numeric)}>{escape(c)}</th>' for c in columns)
     body = "".join(

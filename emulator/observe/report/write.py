@@ -36,6 +36,7 @@ STYLE = """
   list-style: none; } .checks summary::-webkit-details-marker { display: none; }
 .checks b { font-weight: 600; overflow-wrap: anywhere; }
 .checks summary > span:last-child { overflow-wrap: anywhere; }
+.checks .badge { justify-self: start; }
 .checks summary:hover b { text-decoration: underline; text-decoration-thickness: 1px; }
 .checks .more { margin: .5rem 0 .6rem 6.95rem; }
 .figures { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 22rem), 1fr));
