@@ -24,7 +24,7 @@ COLUMNS = {
     "vehicles": "number less",
     "emulated (s)": "number less",
     "RMSE (m)": "number",
-    "deviation (m)": "number",
+    "deviation (m)": "number less",
     "delivered (%)": "number",
     "files": "less",
 }
@@ -39,7 +39,7 @@ th[aria-sort=ascending] button::after { content: " ↑"; } th[aria-sort=descendi
 table { width: 100%; } td:first-child { overflow-wrap: anywhere; min-width: 7rem; }
 td small { display: block; }
 @media (max-width: 44rem) { .less { display: none; } th, td { padding-right: .5rem; }
-  thead th { white-space: normal; } }
+  thead th.number { white-space: normal; } }
 """
 SCRIPT = """
 const body = document.querySelector("tbody"), rows = [...body.rows];
