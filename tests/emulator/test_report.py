@@ -200,12 +200,8 @@ def test_compare_finds_a_planted_difference(beacon_run: Path, beacon: Path, tmp_
         "first in row 7 of the trace: size_bytes" in page.text
         and f"size_bytes {size[7] - 1} {size[7]}" in page.text
     )
-<<<<<<< HEAD
     assert "latency (ms)" in page.text
     assert all(reference.startswith("#") for reference in page.references)
-=======
-    assert "latency (ms)" in page.text and all(reference.startswith("#") for reference in page.references)
->>>>>>> report2
 
 
 def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_path: Path) -> None:
