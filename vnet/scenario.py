@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -30,6 +30,11 @@ FAR_M = 1e9
 WILD_M = 1e5
 """No standard deviation is larger, so that fixes stay near enough for frames to say."""
 MANY = 1_000_000_000
+FAR_S = 1e11
+"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg", "fastest_mps", "longest_gap_s")
+"""Keys of `[network]` for vehicles that move."""
+NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
 
 
 class Run(Section):
@@ -51,23 +56,44 @@ class Run(Section):
 
 
 class Network(Section):
-    """`[network]`: which vehicles there are and where, either generated or from a CSV file.
+    """`[network]`: which vehicles there are and where they are, or drive.
 
     `file` reads `path` (columns id, x_m, y_m, heading_rad; relative to the scenario file). `generated` draws
     `vehicles` of them: `layout = "urban"` has the degree histogram and components of the published networks,
     `layout = "dense"` packs them so that degrees exceed 30. `seed` draws the network, and not the run.
+
+    `trips` reads how vehicles drive (NPZ, CSV, Parquet, or what SUMO writes with `--fcd-output`), and `sumo` has
+    SUMO drive the configuration `path`, with `seed`; docs/motion.md. For these two: `start_s` is the time of the
+    file at which the run begins, its first sample's if left out; at most `max_vehicles` take part, those that
+    come first; only within the `disc` (x, y, radius in m). `origin_deg` (latitude, longitude) is the zero of
+    metres for files in degrees, the middle of the trips if left out. What would take a vehicle more than
+    `fastest_mps` is a jump; up to `longest_gap_s` without a sample are bridged, after that a vehicle has left.
     """
 
-    kind: Literal["generated", "file"] = "generated"
+    kind: Literal["generated", "file", "trips", "sumo"] = "generated"
     path: Path | None = None
     vehicles: int = Field(38, ge=1, le=10_000)
     layout: Literal["urban", "dense"] = "urban"
     seed: int = Field(1, ge=0, lt=2**63)
+    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    max_vehicles: int | None = Field(None, ge=1, le=10_000)
+    disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
+    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = None
+    fastest_mps: float | None = Field(None, gt=0, le=1000)
+    longest_gap_s: float | None = Field(None, gt=0, le=DAY_S)
+
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave."""
+        return self.kind in ("trips", "sumo")
 
     @model_validator(mode="after")
-    def _path_goes_with_file(self) -> Network:
-        if (self.kind == "file") != (self.path is not None):
-            raise ValueError('path is required with kind = "file", and only then')
+    def _keys_go_with_their_kind(self) -> Network:
+        if (self.kind != "generated") != (self.path is not None):
+            raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
+        given = [name for name in OF_TRIPS if getattr(self, name) is not None]
+        if given and not self.moves:
+            raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         return self
 
 
