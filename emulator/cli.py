@@ -23,7 +23,6 @@ from emulator.experiments.cli import app as experiment_app
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
-from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
 from emulator.observe.summary import print_checks, print_summary
 from emulator.run.attachment import LiveOptions
@@ -31,6 +30,7 @@ from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
 from emulator.run.live import run_live
+from emulator.run.messages import Messages
 from emulator.run.progress import ProgressLine
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
@@ -160,8 +160,9 @@ def _record_here(emulation: Emulation, stack: ExitStack) -> None:
     from emulator.observe.recorder import Recorder  # Rerun is slow to import, and only recordings need it
 
     recorder = stack.enter_context(Recorder(emulation.folder.path / "recording.rrd"))
-    recorder.scene(scene_message(emulation.world, emulation.scenario))
-    emulation.watch(lambda view: recorder.period(view.message(emulation.world.node_ids)))
+    messages = Messages(emulation)
+    recorder.scene(messages.scene())
+    emulation.watch(lambda view: recorder.period(messages.period(view)))
 
 
 @app.command()

@@ -168,6 +168,10 @@ class Engine:
         """When the next pending frame arrives anywhere."""
         return min((pending[0][0] for pending in self._pending if pending), default=None)
 
+    def pending_rows(self) -> list[int]:
+        """The rows of the trace whose frames are on their way."""
+        return [row for pending in self._pending for *_, row, _ in pending]
+
     def advance(self, time_ns: int) -> list[Delivery]:
         """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
         arrived = list(self._arrivals(time_ns))

@@ -44,6 +44,10 @@ class PlannedFault:
         """Whether it acts at this instant."""
         return self.start_ns <= time_ns < self.end_ns
 
+    def acts_between(self, start_ns: int, end_ns: int) -> bool:
+        """Whether it acts at any instant in [start, end)."""
+        return max(self.start_ns, start_ns) < min(self.end_ns, end_ns)
+
 
 class FaultPlan:
     """All faults of a run, those that have been and those to come. Raises ScenarioError if one does not fit."""

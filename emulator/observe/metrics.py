@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -97,11 +97,10 @@ class Metrics:
     def record(self, instant: Instant, reports: Sequence[Report]) -> PeriodFigures:
         """Take the last report of each node in one period; returns the period's figures."""
         last = {report.node: report for report in reports}
-        count = len(self._node_ids)
-        estimate = _collect(count, self._number, last, lambda r: r.estimate_m, 2)
-        covariance = _collect(count, self._number, last, lambda r: r.covariance_m2, 4)
+        estimate = collect(self._number, last, lambda r: r.estimate_m, 2)
+        covariance = collect(self._number, last, lambda r: r.covariance_m2, 4)
         named = {
-            name: _collect(count, self._number, last, lambda r, name=name: r.values.get(name), size)
+            name: collect(self._number, last, lambda r, name=name: r.values.get(name), size)
             for name, size in _SIZES.items()
         }
         self._store(instant, last)
@@ -216,9 +215,9 @@ def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
     return summary
 
 
-def _collect(count: int, number: dict[str, int], last: dict[str, Report], get: Any, size: int) -> Array:
-    """(count, size) with NaN where a node did not report a value of that size."""
-    array = np.full((count, size), np.nan)
+def collect(number: Mapping[str, int], last: Mapping[str, Report], get: Any, size: int) -> Array:
+    """(N, size) of what `get` finds in each node's report; NaN where it finds nothing of that size."""
+    array = np.full((len(number), size), np.nan)
     for node, report in last.items():
         value = get(report)
         if isinstance(value, (list, tuple)) and len(value) == size:

@@ -16,7 +16,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.observe.observation import unpack
+from emulator.channel.outcomes import Outcome
+from emulator.observe.observation import unpack, unpack_pairs
 
 # Okabe & Ito 2008: colours that the colour-blind can tell apart.
 BLUE, ORANGE, GREEN, RED, GREY, BLACK = (
@@ -56,7 +57,7 @@ class Recorder:
         self._recording.set_sinks(rr.FileSink(str(path)))
         self._recording.send_blueprint(_blueprint())
         self._scene: dict[str, Any] | None = None
-        self._counts: dict[str, int] = {}
+        self._seen: set[str] = set()
 
     def __enter__(self) -> Recorder:
         return self
@@ -101,7 +102,8 @@ class Recorder:
     def _vehicles(self, message: dict[str, Any], node_ids: list[str]) -> None:
         position = unpack(message["position_m"], 2)
         self._points("map/vehicles", position, BLUE, 4.0, labels=node_ids)
-        links = np.frombuffer(message["links"], dtype="<i2").reshape(-1, 2)
+        pairs = unpack_pairs(message)
+        links = pairs[pairs[:, 2] == Outcome.delivered, :2]
         links = np.unique(np.sort(links, axis=1), axis=0)
         strips = rr.LineStrips2D(
             _flip(position[links]), colors=[(*GREEN, 90)], radii=rr.Radius.ui_points(0.5), draw_order=-1.0
@@ -123,11 +125,10 @@ class Recorder:
             if value is not None:
                 self._recording.log(f"series/{entity}", rr.Scalars(value))
         for outcome in OUTCOMES:
-            count = message["counts"].get(outcome, 0)
-            if count == 0:  # nothing of the kind so far: no line
-                continue
-            self._recording.log(f"series/frames/{outcome}", rr.Scalars(count - self._counts.get(outcome, 0)))
-        self._counts = message["counts"]
+            count = message["outcomes"].get(outcome, 0)
+            if count or outcome in self._seen:  # nothing of the kind so far: no line
+                self._seen.add(outcome)
+                self._recording.log(f"series/frames/{outcome}", rr.Scalars(count))
 
     def _points(
         self,

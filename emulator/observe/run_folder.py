@@ -87,9 +87,9 @@ def read_events(folder: Path) -> list[Event]:
     for line in lines:
         try:
             data = json.loads(line)
-        except ValueError:
+            events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
+        except (ValueError, KeyError, AttributeError):
             continue  # the last line of a run that was killed
-        events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
     return events
 
 

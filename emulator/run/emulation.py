@@ -17,7 +17,6 @@ from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.faults.sensors import BentGnss, clock_of
 from emulator.observe.metrics import Metrics, PeriodFigures
-from emulator.observe.observation import period_message
 from emulator.observe.run_folder import RunFolder, write_text
 from emulator.world.world import Instant, World, components
 from vnet.faults import Fault, Infrastructure
@@ -34,11 +33,6 @@ class PeriodView:
     reports: list[Report]
     figures: PeriodFigures
     counts: dict[str, int]
-    deliveries: list[Delivery]
-
-    def message(self, node_ids: Sequence[str]) -> dict[str, Any]:
-        """The period as observers are told it."""
-        return period_message(node_ids, self.instant, self.reports, self.figures, self.counts, self.deliveries)
 
 
 @dataclass(frozen=True)
@@ -89,7 +83,7 @@ class Emulation:
         self._period = 0
         self._finished = False
         self._reports: list[Report] = []
-        self._delivered: list[Delivery] = []
+        self._arrived: list[Delivery] = []
 
     def watch(self, watcher: Callable[[PeriodView], None]) -> None:
         """Call `watcher` at the end of every period from now on."""
@@ -175,6 +169,7 @@ class Emulation:
         The caller has taken all that arrived before `time_ns`. Without `starts_at_once` nodes that start anew are
         up only when it says that they `come_back`.
         """
+        self.close_periods(time_ns)
         self._acted_ns = time_ns
         self._next_fault_ns = self.faults.next_change_ns(time_ns)
         active = self.faults.active(time_ns)
@@ -257,8 +252,8 @@ class Emulation:
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
-        deliveries = self.engine.advance(time_ns)
-        self._delivered.extend(deliveries)
+        deliveries = self._arrived + self.engine.advance(time_ns)
+        self._arrived = []
         return deliveries
 
     def fix_time_ns(self, period: int) -> int | None:
@@ -274,17 +269,21 @@ class Emulation:
             self.engine.drain()
 
     def close_periods(self, time_ns: int) -> None:
-        """Record the periods that end by then; nobody has anything more to report of them."""
-        while (self._period + 1) * self.world.period_ns <= time_ns:
+        """Record the periods that end by then; nobody has anything more to report of them.
+
+        What arrives in them, whether or not anybody waits for it, has arrived by then: `advance` hands it out.
+        """
+        while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
+            self._arrived += self.engine.advance(end_ns - 1)
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
             figures = self.metrics.record(instant, reports)
             self._period += 1
             counts = {outcome.name: count for outcome, count in self.engine.counts.items()}
-            view = PeriodView(instant, reports, figures, counts, self._delivered)
+            view = PeriodView(instant, reports, figures, counts)
             for watcher in self._watchers:
                 watcher(view)
-            self._reports, self._delivered = [], []
+            self._reports = []
 
 
 def node_seed(seed: int, node: str, incarnation: int) -> int:

@@ -21,13 +21,13 @@ from typing import Any
 
 import zenoh
 
-from emulator.observe.observation import scene_message
 from emulator.run.attachment import Attachment, LiveOptions
 from emulator.run.control import answer, way_in
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
 from emulator.run.memory import MemoryWatch
+from emulator.run.messages import Messages
 from emulator.run.pacing import Lockstep, ProtocolError, RealTime
 from emulator.run.router import ROUTER
 from vnet.errors import LinkError, ProgramError, VnetError, WireError
@@ -149,6 +149,8 @@ class LiveRun:
         self._join_failure: VnetError | None = None
         self._standing: dict[str, str] = {}
         self._refused: dict[str, int] = {}
+        self._messages = Messages(emulation)
+        self._watched = True  # from the first period on, by a recorder of the run's own
         self._memory = MemoryWatch(emulation.duration_ns)
         lease_ms = _lease_ms(emulation.scenario)
         self._link = Attachment(
@@ -381,7 +383,7 @@ class LiveRun:
 
     async def _course(self) -> None:
         processes = self._members.processes()
-        self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        self._link.publish("scene", self._messages.scene())
         if self._emulation.scenario.run.pacing == "lockstep":
             self._pacing = lockstep = Lockstep(self._emulation, processes)
             await self._run_lockstep(lockstep)
@@ -567,7 +569,7 @@ class LiveRun:
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
-        self._link.publish("end", {})
+        self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
         self._launcher.stop(patience_s)
@@ -579,8 +581,13 @@ class LiveRun:
         self._memory.look(view.instant.time_ns, processes)
 
     def _publish_period(self, view: PeriodView) -> None:
-        if not self._link.is_watched("period"):
+        """Tell who watches. A message is of a whole period: who comes within one hears of the next."""
+        was_watched, self._watched = self._watched, self._link.is_watched("period")
+        if not self._watched:
             return
-        if view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
-            self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
-        self._link.publish("period", view.message(self._emulation.world.node_ids))
+        if not was_watched or view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
+            self._link.publish("scene", self._messages.scene())
+        if was_watched:
+            self._link.publish("period", self._messages.period(view))
+        else:
+            self._messages.begin()

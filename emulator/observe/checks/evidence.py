@@ -224,7 +224,7 @@ class Evidence:
     @cached_property
     def reported(self) -> Mask:
         """(periods, N), who reported anything in which period."""
-        values = self.states["values"].combine_chunks().cast(_AS_LIST)
+        values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
         something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
         for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
             something |= np.asarray(self.states[name].combine_chunks().is_valid())
@@ -340,4 +340,4 @@ class Evidence:
         return max((planned.end_ns for planned in self.plan), default=0)
 
 
-_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
+VALUES_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
