@@ -22,9 +22,9 @@ LONGEST_S = 86_400.0
 class Selector(Section):
     """Which nodes: all, unless one of these says otherwise.
 
-    `ids`; a `fraction` of all, or `random` so many of them, drawn from the run's seed; those whose first position
-    is in the `disc` (x, y, radius in m) or the `polygon` (corners in m); those with so many others in range
-    (`degree`, least and most).
+    `ids`; a `fraction` of all, or `random` so many of them, drawn from the run's seed; those whose position is in
+    the `disc` (x, y, radius in m) or the `polygon` (corners in m); those with so many others in range (`degree`,
+    least and most). Where vehicles stand their first position counts; where they move docs/motion.md says which.
     """
 
     ids: tuple[str, ...] | None = None
@@ -33,6 +33,11 @@ class Selector(Section):
     disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
     polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
     degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
+
+    @property
+    def by_place(self) -> bool:
+        """Whether it depends on where vehicles are."""
+        return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
 
     @model_validator(mode="after")
     def _at_most_one(self) -> Selector:

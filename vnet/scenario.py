@@ -20,6 +20,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from vnet.errors import ScenarioError, printable, shown
 from vnet.faults import Fault
 from vnet.sections import Section, first_problem
+from vnet.sumo import input_files
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
 
 NS_PER_S = 1_000_000_000
@@ -277,8 +278,10 @@ def dump_scenario(scenario: Scenario) -> str:
 
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path."""
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
     paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
+    if scenario.network.kind == "sumo" and scenario.network.path is not None:
+        paths += input_files(scenario.network.path)
     return {str(path): _sha256(path) for path in paths}
 
 

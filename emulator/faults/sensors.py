@@ -36,12 +36,14 @@ class BentGnss:
         self._seed = seed
 
     def fix(self, period: int, number: int) -> Fix | None:
-        """The fix of vehicle `number` at the start of `period`; None in an outage."""
+        """The fix of vehicle `number` at the start of `period`; None in an outage, or if there is none to repeat."""
         time_ns = period * self._world.period_ns
         acting = [
             planned
             for planned in self._faults
-            if planned.acts_at(time_ns) and isinstance(planned.fault, GnssFault) and planned.nodes[number]
+            if planned.acts_at(time_ns)
+            and isinstance(planned.fault, GnssFault)
+            and planned.placed(time_ns).nodes[number]
         ]
         fix = self._world.fix(period, number)
         if not acting:
@@ -51,7 +53,7 @@ class BentGnss:
         position_m = self._start(acting, fix, number)
         for planned in acting:
             position_m = self._moved(planned, position_m, time_ns, period, number)
-        return replace(fix, position_m=position_m)
+        return replace(fix, position_m=position_m) if np.isfinite(position_m).all() else None
 
     def at(self, period: int) -> Instant:
         """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""

@@ -59,7 +59,8 @@ class PeriodFigures:
     """One row of the metrics. Lengths in metres; None where no node reported what is needed.
 
     `common_error_rmse_m` is √(mean‖x_i − c‖²), `deviation_m` √(mean‖x_i − x̄‖²) and `bias_m` ‖x̄ − c‖ over the
-    network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component;
+    network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component
+    (where vehicles move, those of the period, in the order of their first vehicles);
     `consensus_error_m` is √(mean‖m_i − x̄‖²) with x̄ of the node's component; ANEES are means of
     εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
     """
@@ -83,7 +84,7 @@ class PeriodFigures:
 
 
 class Metrics:
-    """Collects reports and truth. `component` (N,) labels each node's connected component."""
+    """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if it is not there."""
 
     def __init__(self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int) -> None:
         self._number = {node: number for number, node in enumerate(node_ids)}
@@ -94,8 +95,15 @@ class Metrics:
         self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
         self._packed: list[pa.Table] = []
 
-    def record(self, instant: Instant, reports: Sequence[Report]) -> PeriodFigures:
-        """Take the last report of each node in one period; returns the period's figures."""
+    def record(
+        self, instant: Instant, reports: Sequence[Report], component: NDArray[np.intp] | None = None
+    ) -> PeriodFigures:
+        """Take the last report of each node in one period; returns the period's figures.
+
+        Where vehicles move, `component` is that of the period.
+        """
+        if component is not None:
+            self._component = component
         last = {report.node: report for report in reports}
         estimate = collect(self._number, last, lambda r: r.estimate_m, 2)
         covariance = collect(self._number, last, lambda r: r.covariance_m2, 4)
