@@ -79,7 +79,9 @@ class Network(Section):
     start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
     max_vehicles: int | None = Field(None, ge=1, le=10_000)
     disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
-    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = None
+    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
+        None
+    )
     fastest_mps: float | None = Field(None, gt=0, le=1000)
     longest_gap_s: float | None = Field(None, gt=0, le=DAY_S)
 

@@ -19,7 +19,9 @@ def input_files(path: Path) -> list[Path]:
     Raises ScenarioError if it is no configuration.
     """
     values = _values(path)
-    named = [name for key, value in values.items() if key.endswith(("-file", "-files")) for name in value.split(",")]
+    named = [
+        name for key, value in values.items() if key.endswith(("-file", "-files")) for name in value.split(",")
+    ]
     files = [path.parent / name.strip() for name in named if name.strip()]
     return sorted({file.resolve() for file in files if file.is_file()})
 
@@ -41,7 +43,9 @@ def _values(path: Path) -> dict[str, str]:
 
     def start(name: str, attributes: dict[str, str]) -> None:
         if not sections and name not in ("configuration", "sumoConfiguration"):
-            raise ScenarioError(f"{path}: line {parser.CurrentLineNumber}: element {name!r} is no configuration of SUMO")
+            raise ScenarioError(
+                f"{path}: line {parser.CurrentLineNumber}: element {name!r} is no configuration of SUMO"
+            )
         if "output" not in sections:
             values[name] = attributes.get("value", attributes.get("v", ""))
         sections.append(name)

@@ -80,9 +80,7 @@ class FaultPlan:
     `nodes_at` tells where the nodes are in a period, if they move; else they are where `nodes` says.
     """
 
-    def __init__(
-        self, scenario: Scenario, nodes: Nodes, nodes_at: Callable[[int], Nodes] | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, nodes: Nodes, nodes_at: Callable[[int], Nodes] | None = None) -> None:
         self._seed = scenario.run.seed
         self._healed_ns = round(scenario.healed_s * NS_PER_S)
         self._period_ns = scenario.period_ns

@@ -36,7 +36,7 @@ class BentGnss:
         self._seed = seed
 
     def fix(self, period: int, number: int) -> Fix | None:
-        """The fix of vehicle `number` at the start of `period`; None in an outage, or if there is none to repeat."""
+        """The fix of vehicle `number` at the start of `period`; None in an outage."""
         time_ns = period * self._world.period_ns
         acting = [
             planned
@@ -53,23 +53,26 @@ class BentGnss:
         position_m = self._start(acting, fix, number)
         for planned in acting:
             position_m = self._moved(planned, position_m, time_ns, period, number)
-        return replace(fix, position_m=position_m) if np.isfinite(position_m).all() else None
+        return replace(fix, position_m=position_m)
 
     def at(self, period: int) -> Instant:
         """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""
         instant = self._world.at(period)
         if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
             return instant
-        fixes = [self.fix(period, number) for number in range(len(self._world.node_ids))]
         nothing = np.full(2, np.nan)
+        there = instant.present.tolist()
+        fixes = [self.fix(period, number) if here else None for number, here in enumerate(there)]
         return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
 
     def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
-        """The position that frozen receivers repeat: their last before the earliest freeze."""
+        """The position that frozen receivers repeat: their last before the earliest freeze, or first since."""
         frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
         if not frozen:
             return fix.position_m
         last = max(0, math.ceil(min(frozen) / self._world.period_ns) - 1)
+        while not self._world.present(last)[number]:
+            last += 1
         return self._world.fix(last, number).position_m
 
     def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:

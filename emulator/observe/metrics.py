@@ -84,7 +84,7 @@ class PeriodFigures:
 
 
 class Metrics:
-    """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if it is not there."""
+    """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if not there."""
 
     def __init__(self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int) -> None:
         self._number = {node: number for number, node in enumerate(node_ids)}

@@ -42,8 +42,8 @@ class PeriodView:
 class ProcessActions:
     """What processes suffer from an instant on.
 
-    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start (anew); `paused`: all
-    that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
+    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start (anew); `paused`:
+    all that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
     """
 
     stop: dict[str, bool]

@@ -134,7 +134,8 @@ class LiveRun:
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
         self._realtime = emulation.scenario.run.pacing == "realtime"
-        self._members = Membership(emulation.world.node_ids)
+        later = [node for node, up in emulation.up.items() if not up]
+        self._members = Membership(emulation.world.node_ids, later, emulation.world.has_traffic)
         self._pacing: Lockstep | RealTime | None = None
         self._origin_ns = 0
         self._incoming: deque[tuple[str, bytes | bool | zenoh.Query]] = deque()
@@ -142,7 +143,8 @@ class LiveRun:
         self._over = False
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
-        self._returning: set[str] = set()  # nodes whose processes faults have ended
+        self._returning: set[str] = set()  # nodes whose processes faults have ended, or who have left
+        self._going: set[asyncio.Task[None]] = set()  # what sees them off (real time)
         self._expected: set[str] = set()  # leads of processes that were started anew (real time)
         self._paused: set[str] = set()
         self._restarting = False
@@ -280,6 +282,9 @@ class LiveRun:
             self._process_dead(name, how=how.how, log_tail=how.log_tail)
 
     def _token_lost(self, node: str) -> None:
+        if node in self._members.later:
+            self._members.expect([node])
+            return
         away = self._restarting or node in self._returning
         if away or node not in self._members.joined or node in self._launcher.pids:
             return
@@ -335,6 +340,7 @@ class LiveRun:
         run = self._emulation.scenario.run
         node_ids = self._emulation.world.node_ids
         groups = split_into_processes(node_ids, run.nodes_per_process)
+        groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
         endpoint = self._link.endpoint
         deadline = time.monotonic() + run.join_timeout_s
         if self._options.record is not None:
@@ -344,7 +350,7 @@ class LiveRun:
             for nodes in groups:
                 self._launch(nodes)
         else:
-            on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
+            on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
         while self._members.missing or not self._recorder_listens():
             if self._join_failure is not None:
                 raise self._join_failure
@@ -454,11 +460,20 @@ class LiveRun:
         self._stand_still(self._paused - {lead})  # or it could not go
         self._link.send(lead, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
         if self._options.launch:
-            await asyncio.to_thread(self._launcher.see_off, lead, FAREWELL_S)
+            going = asyncio.create_task(asyncio.to_thread(self._launcher.let_go(lead), FAREWELL_S))
+            if self._realtime:  # nobody waits for it
+                self._going.add(going)
+                going.add_done_callback(self._going.discard)
+            else:
+                await going
 
     def _begin_process(self, lead: str) -> None:
         nodes = self._members.nodes_with(lead)
-        self._members.expect(nodes)
+        if lead in self._members.later:
+            if self._members.enter(lead):
+                return
+        else:
+            self._members.expect(nodes)
         if self._options.launch:
             self._launch(nodes)
 
@@ -569,6 +584,7 @@ class LiveRun:
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
+            await asyncio.gather(*self._going)
         self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)

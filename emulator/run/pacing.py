@@ -256,8 +256,8 @@ class RealTime:
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
-        self._present = set(self._nodes)
-        self._awaited = set(self._nodes)
+        self._present = {lead for lead, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)}
+        self._awaited = set(self._present)
         self._paused: set[str] = set()
         self._was_paused: set[str] = set()
         self._actions: list[ProcessActions] = []
@@ -270,9 +270,9 @@ class RealTime:
         self.gaps = 0
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
-        """The batches that start every process; time 0 is `origin_ns` on the machine's monotonic clock."""
+        """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
         self._origin_ns = origin_ns
-        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes}
+        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes if lead in self._present}
 
     def next_time_ns(self) -> int | None:
         """When `due` must be called next: the next arrival, fix or fault."""

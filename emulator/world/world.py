@@ -76,51 +76,18 @@ class World:
         self._common_m = self._draw_common(scenario)
         self._noise_m, self._heading_noise = self._draw_noise(self._gnss, seed, count)
 
-    def present(self) -> NDArray[np.bool_]:
-        """(N,), which vehicles are there."""
-        return np.isfinite(self.position_m[:, 0])
-
-
-class World:
-    """All that is true during a run: the `course` of each vehicle, and what its receiver makes of it.
-
-    `lane_map` is what vehicles may know; `lane_of` (N,) is the lane of each that stands on one, and their secret.
-    `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. `moves` says whether
-    vehicles drive, enter and leave. Raises ScenarioError if the scenario's links, exceptions or processes do not
-    fit the vehicles.
-    """
-
-    def __init__(self, scenario: Scenario, course: Course, lane_map: LaneMap, lane_of: NDArray[np.intp]) -> None:
-        seed = scenario.run.seed
-        count = len(course.node_ids)
-        self.node_ids = course.node_ids
-        self.moves = scenario.network.moves
-        self.links = load_links(scenario.radio, count)
-        self.period_ns = scenario.period_ns
-        self.periods = periods_of(scenario)
-        self.lane_map = lane_map
-        self.lane_of = lane_of
-        self._position_m, self._heading_rad = course.position_m, course.heading_rad
-        there = np.isfinite(course.position_m[: self.periods - 1, :, 0])
-        self._changes = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1  # periods
-        _check_exceptions(scenario, course.node_ids)
-        _check_processes(scenario, bool(there.all()))
-        self._gnss = scenario.world.gnss
-        self._common_m = self._draw_common(scenario)
-        self._noise_m, self._heading_noise = self._draw_noise(self._gnss, seed, count)
-
-    @property
-    def all_present(self) -> bool:
-        """Whether all vehicles are there from the beginning to the end."""
-        return bool(np.isfinite(self._position_m[: self.periods - 1]).all())
-
     def present(self, period: int) -> NDArray[np.bool_]:
         """(N,), which vehicles are there in `period`."""
         return np.isfinite(self._position_m[period, :, 0])
 
     def position_m(self, period: int) -> Array:
         """(N, 2), where vehicles are at the start of `period`; NaN where one is not there."""
-        return self._position_m[period]
+        return np.asarray(self._position_m[period])
+
+    @property
+    def has_traffic(self) -> bool:
+        """Whether vehicles enter or leave during the run."""
+        return len(self._changes) > 0
 
     def next_change_ns(self, after_ns: int) -> int | None:
         """When next, after this instant and during the run, a vehicle enters or leaves."""
@@ -225,8 +192,7 @@ def _check_processes(scenario: Scenario, all_present: bool) -> None:
     """Who shares a process starts and ends together."""
     if scenario.run.nodes_per_process > 1 and not all_present:
         raise ScenarioError(
-            f"run.nodes_per_process = {scenario.run.nodes_per_process}: vehicles enter and leave one by one in this "
-            "network: must be 1"
+            f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles enter or leave"
         )
 
 

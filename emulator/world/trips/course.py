@@ -1,4 +1,4 @@
-"""The true courses of all vehicles: where each is at the start of every period of a run, and whether it is there."""
+"""The true courses of all vehicles: where each is at the start of every period of a run, and when it is there."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ def courses(trips: list[Trip], frame: Frame, rules: Rules) -> Course:
     if not there:
         seconds = frame.periods * frame.period_ns / NS_PER_S
         where = " within the disc" if frame.disc else ""
-        raise ScenarioError(f"no vehicle is there{where} for {SHORTEST_STAY_S:g} s of {seconds:g} s from {frame.start_s:.10g} s")
+        raise ScenarioError(
+            f"no vehicle is there{where} for {SHORTEST_STAY_S:g} s of {seconds:g} s from {frame.start_s:.10g} s"
+        )
     if len(there) * frame.periods > MOST_STATES:
         raise ScenarioError(
             f"{len(there)} vehicles for {frame.periods} periods: at most {MOST_STATES:,} states; "

@@ -139,5 +139,7 @@ def _sumo(path: Path) -> str:
     home = os.environ.get("SUMO_HOME")
     found = shutil.which("sumo") or (home and shutil.which(str(Path(home) / "bin" / "sumo")))
     if not found:
-        raise ScenarioError(f"{path}: SUMO is not installed: pip install 'vnet-emulator[sumo]', or apt-get install sumo")
+        raise ScenarioError(
+            f"{path}: SUMO is not installed: pip install 'vnet-emulator[sumo]', or apt-get install sumo"
+        )
     return found

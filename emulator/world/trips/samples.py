@@ -119,7 +119,9 @@ class Samples:
         wrong = ours[same & ((step_s < 0) | ((step_s == 0) & moved))]
         if len(wrong):
             raise self._out_of_order(int(wrong.min()), len(before["code"]), both, order, place)
-        self._last = {name: values[np.append(~same, True) if len(order) else []] for name, values in _by(both, order)}
+        self._last = {
+            name: values[np.append(~same, True) if len(order) else []] for name, values in _by(both, order)
+        }
         new = np.ones(len(order), dtype=bool)
         new[ours[same & (step_s == 0)]] = False
         return new[len(before["code"]) :]
@@ -150,7 +152,9 @@ class Samples:
         if not self.taken:
             raise ScenarioError(f"{self._path}: no samples; at least one vehicle with two is needed")
         if not self._kept:
-            raise ScenarioError(f"{self._path}: none of its {self.taken:,} samples is in the run's time; set start_s")
+            raise ScenarioError(
+                f"{self._path}: none of its {self.taken:,} samples is in the run's time; set start_s"
+            )
         columns = {name: np.concatenate([part[name] for part in self._kept]) for name in self._kept[0]}
         self._kept = []
         position_m = self._positions_m(columns, origin_deg)
