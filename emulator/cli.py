@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -24,7 +24,9 @@ from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
 from emulator.observe.run_folder import RunFolder
+from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
+from emulator.playback_cli import play, render
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
@@ -35,6 +37,7 @@ from emulator.run.progress import ProgressLine
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
 from emulator.terminal import one_line_errors
+from emulator.viewing_cli import RerunBindOption, RerunPortOption, view
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.link.access import Access, Credentials, is_tls
@@ -51,6 +54,9 @@ app = typer.Typer(
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(fault_app, name="fault")
 app.command()(status)
+app.command()(view)
+app.command()(render)
+app.command()(play)
 
 
 class Pacing(StrEnum):
@@ -65,13 +71,6 @@ class RouterKind(StrEnum):
 
     EMBEDDED = "embedded"
     SEPARATE = "separate"
-
-
-class Rerun(StrEnum):
-    """What is done for the Rerun viewer."""
-
-    OFF = "off"
-    SAVE = "save"
 
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
@@ -92,7 +91,14 @@ TlsNameOption = Annotated[
         "--tls-name", metavar="NAME", help="A further name or address of the router, for its certificate."
     ),
 ]
-RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
+RerunOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WHAT",
+        help="save: recording.rrd in the run's folder. serve: to viewers and browsers as well. spawn: open a "
+        "viewer here as well. off. Several as serve,save.",
+    ),
+]
 DeterminismOption = Annotated[
     bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
 ]
@@ -107,7 +113,9 @@ def run(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
     check_determinism: DeterminismOption = False,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
@@ -119,6 +127,7 @@ def run(
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port)
         world = build_world(loaded)
         access = _create_access(loaded, world)
         with ExitStack() as stack:
@@ -126,8 +135,8 @@ def run(
             if router is RouterKind.SEPARATE:
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
-            options = LiveOptions(access, router=separate)
-            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, check_determinism)
+            options = LiveOptions(access, router=separate, record=sinks)
+            _run_live(loaded, world, RunFolder.create(out, loaded), options, check_determinism)
 
 
 @app.command()
@@ -138,31 +147,36 @@ def simulate(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
     check_determinism: DeterminismOption = False,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
     with one_line_errors():
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        sinks = choose_sinks(rerun or ())
+        if sinks is not None and sinks.serve is not None:
+            raise VnetError("--rerun: a simulation is over before one can look: save it, and look with vnet view")
         sys.path.append(str(Path.cwd()))
         emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
         with ExitStack() as stack:
-            if rerun is Rerun.SAVE:
-                _record_here(emulation, stack)
+            if sinks is not None:
+                _record_here(emulation, sinks, stack)
             stack.enter_context(ProgressLine(emulation))
             wall_s, interrupted = run_simulation(emulation)
         _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
 
 
-def _record_here(emulation: Emulation, stack: ExitStack) -> None:
+def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
     """Record a simulation from within its own process."""
     from emulator.observe.recorder import Recorder  # Rerun is slow to import, and only recordings need it
 
-    recorder = stack.enter_context(Recorder(emulation.folder.path / "recording.rrd"))
+    name = emulation.scenario.run.name
+    recorder = stack.enter_context(Recorder(sinks.inside(emulation.folder.path), name))
     messages = Messages(emulation)
-    recorder.scene(messages.scene())
-    emulation.watch(lambda view: recorder.period(messages.period(view)))
+    recorder.take("scene", messages.scene())
+    emulation.watch(lambda view: recorder.take("period", messages.period(view)))
+    stack.callback(lambda: recorder.take("end", messages.end()))
 
 
 @app.command()
@@ -183,7 +197,9 @@ def emulator(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
     with one_line_errors():
@@ -191,14 +207,15 @@ def emulator(
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         _check_restarts(loaded, own_router=False)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port)
         world = build_world(loaded)
         folder = RunFolder.create(out, loaded)
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
-        options = LiveOptions(users, listen, connect, launch=False)
-        _run_live(loaded, world, folder, rerun, options)
+        options = LiveOptions(users, listen, connect, launch=False, record=sinks)
+        _run_live(loaded, world, folder, options)
 
 
 @app.command("access")
@@ -280,12 +297,21 @@ def record(
     run: Annotated[str, typer.Option(help="The name of the run.")],
     out: Annotated[Path, typer.Option(help="The recording to write.")] = Path("recording.rrd"),
     credentials: Annotated[Path | None, typer.Option(help="The observer's credentials file.")] = None,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
 ) -> None:
     """Watch a run from outside and write a Rerun recording of it."""
     from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it
 
     with one_line_errors():
-        record_run(connect, run, None if credentials is None else Credentials.load(credentials), out)
+        login = None if credentials is None else Credentials.load(credentials)
+        sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port)
+        if sinks is None:
+            raise VnetError("--rerun off: there is nothing to do")
+        if sinks.serve is not None:
+            print(sinks.serve.told(), file=sys.stderr, flush=True)
+        record_run(connect, run, login, replace(sinks, save=out))
 
 
 def _load(
@@ -333,15 +359,16 @@ def _run_live(
     scenario: Scenario,
     world: World,
     folder: RunFolder,
-    rerun: Rerun,
     options: LiveOptions,
     check_determinism: bool = False,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
-    if rerun is Rerun.SAVE:
-        options = replace(options, record=folder.path / "recording.rrd")
+    if options.record is not None:
+        options = replace(options, record=options.record.inside(folder.path))
+        if options.record.serve is not None:
+            print(options.record.serve.told(), file=sys.stderr)
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
     _finish(emulation, wall_s, interrupted, "run", check_determinism)

@@ -89,6 +89,7 @@ class Beliefs:
 def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
     """The last report of each node; `number` gives each node's."""
     last = {report.node: report for report in reports}
+    weighed = {WEIGHT + node: place for node, place in number.items()}
 
     def named(name: str, size: int) -> Array:
         return collect(number, last, lambda report: report.values.get(name), size)
@@ -99,7 +100,7 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
         named("common_error_m", 2),
         named("common_error_covariance_m2", 4),
         {n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))},
-        {n: w for n, r in last.items() if (w := _weights(number, r)) is not None},
+        {n: w for n, r in last.items() if (w := _weights(weighed, r)) is not None},
     )
 
 
@@ -108,17 +109,15 @@ def is_cloud(count: int) -> bool:
     return count % 2 == 0
 
 
-def _weights(number: Mapping[str, int], report: Report) -> Array | None:
-    """The weights (n,) that a node reported, 0 where none; None if it reported none at all."""
+def _weights(place: Mapping[str, int], report: Report) -> Array | None:
+    """The weights (n,) that a node reported, 0 where none; None if it reported none at all. `place` is by name."""
     weights = None
-    for name, value in report.values.items():
-        if not name.startswith(WEIGHT):
-            continue
-        other = number.get(name.removeprefix(WEIGHT))
+    for name in report.values.keys() & place.keys():
+        value = report.values[name]
         one = value if isinstance(value, list) else [value]
-        if other is not None and len(one) == 1:
-            weights = np.zeros(len(number)) if weights is None else weights
-            weights[other] = one[0]
+        if len(one) == 1:
+            weights = np.zeros(len(place)) if weights is None else weights
+            weights[place[name]] = one[0]
     return weights
 
 

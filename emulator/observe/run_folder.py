@@ -69,8 +69,12 @@ class RunFolder:
         """Have `write` make a file beside its place, then move it there in one step."""
         part = self.path / f".{name}.part"
         with _disk(self.path):
-            write(part)
-            part.replace(self.path / name)
+            try:
+                write(part)
+                part.replace(self.path / name)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
 
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""

@@ -16,11 +16,11 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import ExitStack, asynccontextmanager
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from emulator.observe.sinks import Sinks
 from emulator.run.attachment import Attachment, LiveOptions
 from emulator.run.control import answer, way_in
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
@@ -111,7 +111,7 @@ async def run_live(
                 options.router.start(launcher)
             run = LiveRun(emulation, options, launcher, gate)
             stack.callback(run.close)
-            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access))
+            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access, options.record))
             return await run.run(on_state)
 
 
@@ -363,9 +363,9 @@ class LiveRun:
         nice = REALTIME_AGENT_NICE if self._realtime else 0
         self._launcher.start_agent(self._link.endpoint, self._options.access, nodes, nice)
 
-    def _start_recorder(self, endpoint: str, path: Path) -> None:
+    def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
-        arguments += ["--out", str(path)]
+        arguments += ["--out", str(sinks.save), *sinks.arguments]
         self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
 
     def _recorder_listens(self) -> bool:

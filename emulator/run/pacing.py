@@ -18,6 +18,9 @@ from vnet.errors import VnetError
 from vnet.link import wire
 from vnet.link.node import INBOX_LIMIT, Packet
 
+WORST_PROCESSES = 8
+"""How many are named of those to which deliveries came late."""
+
 
 class ProtocolError(VnetError):
     """A message that does not fit what its process was told, or speaks for others."""
@@ -404,15 +407,20 @@ class RealTime:
             self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
-            self._emulation.folder.event(
-                self._emulation.duration_ns, "late_deliveries", None, **lateness_figures(counts)
-            )
+            figures = lateness_figures(counts)
+            worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
+            figures["worst"] = {f"{lead}.{start}": _late(self._lateness[lead, start]) for lead, start in worst}
+            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
+
+
+def _late(counts: Sequence[int]) -> int:
+    """How many deliveries of a lateness histogram are over the limit."""
+    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
     """Figures of a lateness histogram: deliveries, how many over the limit, percentiles in ms."""
     total = sum(counts)
-    limit_bin = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
     cumulative = list(accumulate(counts))
 
     def percentile_ms(share: float) -> float:
@@ -425,7 +433,7 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
 
     return {
         "total": total,
-        "count": sum(counts[limit_bin:]),
+        "count": _late(counts),
         "p50_ms": percentile_ms(0.5),
         "p99_ms": percentile_ms(0.99),
         "max_ms": percentile_ms(1.0),

@@ -240,3 +240,11 @@ def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
     )
     emptied = watch(scenario, tmp_path / "run")
     assert [stream for stream, _ in messages(emptied.folder)] == ["scene", "end"]
+
+
+def test_the_documentation_names_every_field_and_outcome(watched: Watched) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "messages.md").read_text()
+    scene, period = watched.told[0][1], watched.periods[0]
+    assert [field for field in [*scene, *period] if f"`{field}`" not in text] == []
+    numbered = [outcome for outcome in Outcome if outcome not in (Outcome.pending, Outcome.out_of_range)]
+    assert [o for o in numbered if f"{o.value} `{o.name}`" not in " ".join(text.split())] == []

@@ -14,7 +14,7 @@ from emulator.observe.checks.latency import bounds
 from emulator.observe.checks.places import Mask
 from emulator.observe.checks.senders import is_noise
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault
+from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault, SenderFault
 
 IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate")
 DELAYING = ("delay", "jitter", "reorder", "throttle")
@@ -30,6 +30,8 @@ def check_bits(evidence: Evidence) -> Iterator[Finding]:
             yield NotExercised(name, "it was healed before it began")
         elif planned.start_ns >= evidence.closed_ns:
             yield unknown(name, "the run ended before it began")
+        elif isinstance(planned.fault, SenderFault) and _held_down(evidence, planned):
+            yield NotExercised(name, "other faults kept its vehicles from sending all the while")
         else:
             yield _bit(evidence, planned, name)
 
@@ -54,6 +56,22 @@ def _bit(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:
         return _clocks(evidence, planned, name)
     assert isinstance(planned.fault, Infrastructure), planned.fault
     return _restarts(evidence, planned, name)
+
+
+def _held_down(evidence: Evidence, planned: PlannedFault) -> bool:
+    """Whether each of a fault's nodes was down or stood still, by other faults, from its start to its end."""
+    spans = [(span.node, span.start_ns, span.end_ns) for span in evidence.down if span.planned]
+    for pause in evidence.plan:
+        if pause.fault.kind == "pause":
+            spans += [(node, pause.start_ns, pause.end_ns) for node in np.flatnonzero(pause.nodes).tolist()]
+    for node in np.flatnonzero(planned.nodes).tolist():
+        free_ns = planned.start_ns
+        for _, start_ns, end_ns in sorted(span for span in spans if span[0] == node):
+            if start_ns <= free_ns:
+                free_ns = max(free_ns, end_ns)
+        if free_ns < planned.end_ns:
+            return False
+    return True
 
 
 def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
