@@ -33,7 +33,7 @@ WILD_M = 1e5
 MANY = 1_000_000_000
 FAR_S = 1e11
 """Times of files, which may be seconds since 1970, are within ± three thousand years."""
-OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg", "fastest_mps", "longest_gap_s")
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
 
@@ -82,8 +82,8 @@ class Network(Section):
     origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
         None
     )
-    fastest_mps: float | None = Field(None, gt=0, le=1000)
-    longest_gap_s: float | None = Field(None, gt=0, le=DAY_S)
+    fastest_mps: float = Field(70.0, gt=0, le=1000)
+    longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
 
     @property
     def moves(self) -> bool:

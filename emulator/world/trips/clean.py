@@ -19,8 +19,6 @@ from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import Array
 
-FASTEST_MPS = 70.0
-LONGEST_GAP_S = 10.0
 HARDEST_MPS2 = 10.0
 """No vehicle starts harder."""
 MOST_JUMPS = 0.1
@@ -36,8 +34,8 @@ Rows = NDArray[np.intp]
 class Rules:
     """What no vehicle does, and for how long it may be out of sight."""
 
-    fastest_mps: float = FASTEST_MPS
-    longest_gap_s: float = LONGEST_GAP_S
+    fastest_mps: float
+    longest_gap_s: float
 
 
 def clean(trip: Trip, rules: Rules) -> list[Rows]:

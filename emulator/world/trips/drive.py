@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from emulator.world.trips.clean import FASTEST_MPS, LONGEST_GAP_S, Rules
+from emulator.world.trips.clean import Rules
 from emulator.world.trips.course import Course, Frame, courses
 from emulator.world.trips.fcd import drive_sumo, read_fcd
 from emulator.world.trips.matrices import read_npz
@@ -22,7 +22,7 @@ def drive(network: Network, periods: int, period_ns: int) -> Course:
     """The courses of a network of trips over so many periods. Raises ScenarioError, naming file and place."""
     path = network.path
     assert path is not None
-    rules = Rules(network.fastest_mps or FASTEST_MPS, network.longest_gap_s or LONGEST_GAP_S)
+    rules = Rules(network.fastest_mps, network.longest_gap_s)
     duration_s = (periods - 1) * period_ns / NS_PER_S
     start_s = network.start_s
     if network.kind == "sumo":
