@@ -53,8 +53,8 @@ class World:
 
     `lane_map` is what vehicles may know; `lane_of` (N,) is the lane of each that stands on one, and their secret.
     `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. `moves` says whether
-    vehicles drive, enter and leave. Raises ScenarioError if the scenario's links, exceptions or processes do not
-    fit the vehicles.
+    vehicles drive, enter and leave, `course_m` (K, N, 2) where they are at the start of each period (NaN: not there).
+    Raises ScenarioError if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 
     def __init__(self, scenario: Scenario, course: Course, lane_map: LaneMap, lane_of: NDArray[np.intp]) -> None:
@@ -67,7 +67,7 @@ class World:
         self.periods = periods_of(scenario)
         self.lane_map = lane_map
         self.lane_of = lane_of
-        self._position_m, self._heading_rad = course.position_m, course.heading_rad
+        self.course_m, self._heading_rad = course.position_m, course.heading_rad
         there = np.isfinite(course.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, course.node_ids)
@@ -78,11 +78,11 @@ class World:
 
     def present(self, period: int) -> NDArray[np.bool_]:
         """(N,), which vehicles are there in `period`."""
-        return np.isfinite(self._position_m[period, :, 0])
+        return np.isfinite(self.course_m[period, :, 0])
 
     def position_m(self, period: int) -> Array:
         """(N, 2), where vehicles are at the start of `period`; NaN where one is not there."""
-        return np.asarray(self._position_m[period])
+        return np.asarray(self.course_m[period])
 
     @property
     def has_traffic(self) -> bool:
@@ -114,7 +114,7 @@ class World:
     def at(self, period: int) -> Instant:
         """The truth at the start of `period`, 0 ≤ period < `periods`."""
         assert 0 <= period < self.periods, period
-        position_m, heading_rad = self._position_m[period], self._heading_rad[period]
+        position_m, heading_rad = self.course_m[period], self._heading_rad[period]
         common_m = self._common_m[period]
         if self._gnss.heading:
             fix_heading = np.mod(heading_rad + self._heading_noise[period], 2 * np.pi)
@@ -132,7 +132,7 @@ class World:
 
     def fix(self, period: int, node: int) -> Fix:
         """What the receiver of vehicle number `node` says at the start of `period`, if it is there."""
-        fix_m = self._position_m[period, node] + self._common_m[period] + self._noise_m[period, node]
+        fix_m = self.course_m[period, node] + self._common_m[period] + self._noise_m[period, node]
         heading = None
         if self._gnss.heading and not np.isnan(self._heading_rad[period, node]):
             noisy = self._heading_rad[period, node] + self._heading_noise[period, node]
