@@ -59,7 +59,7 @@ def courses(trips: list[Trip], frame: Frame, rules: Rules) -> Course:
     there.sort(key=lambda entry: entry[0])
     there = there[: frame.most]
     if not there:
-        seconds = frame.periods * frame.period_ns / NS_PER_S
+        seconds = (frame.periods - 1) * frame.period_ns / NS_PER_S
         where = " within the disc" if frame.disc else ""
         raise ScenarioError(
             f"no vehicle is there{where} for {SHORTEST_STAY_S:g} s of {seconds:g} s from {frame.start_s:.10g} s"
