@@ -53,7 +53,7 @@ class World:
 
     `lane_map` is what vehicles may know; `lane_of` (N,) is the lane of each that stands on one, and their secret.
     `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. `moves` says whether
-    vehicles drive, enter and leave, `course_m` (K, N, 2) where they are at the start of each period (NaN: not there).
+    vehicles drive, enter and leave, `course_m` (K, N, 2) where they are at each period's start (NaN: not there).
     Raises ScenarioError if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 

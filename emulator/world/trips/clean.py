@@ -9,7 +9,6 @@ sample to the next; after more it has left, and enters anew. docs/motion.md has 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +25,8 @@ MOST_JUMPS = 0.1
 FEW_JUMPS = 10
 FARTHEST_RUNS = 50
 """A chain leaves out so many runs of samples at most."""
+FARTHEST_EXIT = 5
+"""And so many samples before a jump: what a filter in a receiver makes of one."""
 
 Rows = NDArray[np.intp]
 
@@ -67,8 +68,9 @@ def _fresh(trip: Trip, rules: Rules) -> Rows:
 def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
     """Which of these rows belong to the largest set in which no step is a jump.
 
-    Between two jumps there is a run of samples. A chain goes from the end of a run into a later one, at the first
-    sample there that can be reached; the chain with most samples wins, the earlier of two equal ones.
+    Between two jumps there is a run of samples. A chain leaves a run at its end, or a few samples before, and goes
+    on in a later one, at the first sample there that can be reached, or comes after the longest gap. The chain with
+    most samples wins.
     """
     time_s, position_m = trip.time_s[rows], trip.position_m[rows]
     step_m = np.hypot(*np.diff(position_m, axis=0).T)
@@ -78,31 +80,45 @@ def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
             f"{trip.node_id}: {len(jumps)} of {len(rows) - 1} steps are faster than {rules.fastest_mps:g} m/s: "
             "wrong units, degrees or metres, or several vehicles under one id?"
         )
-    starts, ends = np.append(0, jumps + 1), np.append(jumps + 1, len(rows))
-    before, entry = _best_chain(time_s, position_m, starts, ends, rules)
+    runs = [_Run(start, end) for start, end in zip([0, *(jumps + 1)], [*(jumps + 1), len(rows)], strict=True)]
+    for number, run in enumerate(runs):
+        for earlier in runs[max(0, number - FARTHEST_RUNS) : number]:
+            for last in range(earlier.end - 1, max(earlier.entry, earlier.end - 1 - FARTHEST_EXIT) - 1, -1):
+                run.follow(earlier, last, time_s, position_m, rules)
     kept = np.zeros(len(rows), dtype=bool)
-    run = before[-1]
-    while run >= 0:
-        kept[entry[run] : ends[run]] = True
-        run = before[run]
+    best: _Run | None = max(runs, key=lambda run: run.length)
+    end = best.end
+    while best is not None:
+        kept[best.entry : end] = True
+        best, end = best.before, best.left + 1
     return kept
 
 
-def _best_chain(
-    time_s: Array, position_m: Array, starts: Rows, ends: Rows, rules: Rules
-) -> tuple[Sequence[int], Sequence[int]]:
-    """For each run the run before it in its best chain, or -1, and the row at which it is entered.
+@dataclass(eq=False)
+class _Run:
+    """Samples [start, end) without a jump, and the best chain so far that goes on to their end.
 
-    One more entry at the end of the former names the run with which the best of all chains ends.
+    The chain has `length` samples; it enters here at `entry`, having left the run `before` after its sample `left`.
     """
-    length, before, entry = [0] * len(starts), [-1] * len(starts), starts.tolist()
-    for run, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
-        length[run] = end - start
-        for earlier in range(max(0, run - FARTHEST_RUNS), run):
-            last = ends[earlier] - 1
-            away_m = np.hypot(*(position_m[start:end] - position_m[last]).T)
-            reached = np.flatnonzero(away_m <= rules.fastest_mps * (time_s[start:end] - time_s[last]))
-            if len(reached) and length[earlier] + (end - start - reached[0]) > length[run]:
-                length[run] = length[earlier] + end - start - int(reached[0])
-                before[run], entry[run] = earlier, start + int(reached[0])
-    return [*before, int(np.argmax(length))], entry
+
+    start: int
+    end: int
+    length: int = 0
+    entry: int = 0
+    before: _Run | None = None
+    left: int = 0
+
+    def __post_init__(self) -> None:
+        self.length, self.entry = self.end - self.start, self.start
+
+    def follow(self, earlier: _Run, last: int, time_s: Array, position_m: Array, rules: Rules) -> None:
+        """Come from an earlier run's sample `last`, if that is better."""
+        later_s = time_s[self.start : self.end] - time_s[last]
+        away_m = np.hypot(*(position_m[self.start : self.end] - position_m[last]).T)
+        reached = np.flatnonzero((away_m <= rules.fastest_mps * later_s) | (later_s > rules.longest_gap_s))
+        if not len(reached):
+            return
+        length = earlier.length - (earlier.end - 1 - last) + self.end - self.start - int(reached[0])
+        if length > self.length:
+            self.length, self.entry = length, self.start + int(reached[0])
+            self.before, self.left = earlier, last

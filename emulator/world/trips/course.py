@@ -82,20 +82,27 @@ def _drive(trip: Trip, frame: Frame, rules: Rules) -> Array | None:
     if frame.disc is not None:
         x, y, radius_m = frame.disc
         inside = np.hypot(driven[:, 0] - x, driven[:, 1] - y) <= radius_m
-        excursions = _short_runs(~inside & there, math.ceil(rules.longest_gap_s * NS_PER_S / frame.period_ns))
-        there &= inside | excursions
-    there &= ~_short_runs(there, min(math.ceil(SHORTEST_STAY_S * NS_PER_S / frame.period_ns), frame.periods) - 1)
+        there = _without_excursions(inside, there, math.ceil(rules.longest_gap_s * NS_PER_S / frame.period_ns))
+    shortest = min(math.ceil(SHORTEST_STAY_S * NS_PER_S / frame.period_ns), frame.periods)
+    for begin, end in _rows_of(there):
+        there[begin:end] = end - begin >= shortest
     driven[~there] = np.nan
     return driven if there[: frame.periods - 1].any() else None
 
 
-def _short_runs(mask: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
-    """The entries of a mask (K,) that stand in rows of at most `longest`."""
+def _without_excursions(inside: NDArray[np.bool_], there: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """Who is inside (K,), or was and will be again within so many periods, having been there all the time."""
+    stays = inside.copy()
+    for begin, end in _rows_of(there & ~inside):
+        back = begin > 0 and end < len(inside) and inside[begin - 1] and inside[end]
+        stays[begin:end] = back and end - begin <= longest
+    return stays
+
+
+def _rows_of(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Where entries of a mask (K,) stand in a row, as [begin, end)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]])))
-    short = np.zeros(len(mask), dtype=bool)
-    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        short[begin:end] = end - begin <= longest
-    return short
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _resample(driven: Array, trip: Trip, rows: NDArray[np.intp], frame: Frame) -> None:
