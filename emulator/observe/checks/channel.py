@@ -108,14 +108,20 @@ def _mistimed(evidence: Evidence) -> Mask:
 
 
 def _missing_numbers(evidence: Evidence) -> int:
-    """How many numbers are missing below the last: of each sender's frames, and of each frame's copies."""
+    """How many numbers are missing below the last: of each sender's frames, and of each frame's copies.
+
+    What a vehicle sends while nobody is near has no rows, so that its numbers may be missing.
+    """
     first = np.unique(evidence.emission, return_index=True)[1]
     originals = first[evidence.copy[first] == 0]
     missing = 0
-    for sender in np.unique(evidence.sender[originals]):
-        seqs = evidence.seq[originals[evidence.sender[originals] == sender]]
-        missing += int(seqs.max()) + 1 - len(seqs)
+    for sender in np.unique(evidence.sender[originals]).tolist():
+        rows = originals[evidence.sender[originals] == sender]
+        seqs = np.concatenate([[-1], evidence.seq[rows]])
+        lonely = evidence.places.was_lonely(sender, np.concatenate([[0], evidence.sent_ns[rows]]))
+        missing += int((np.diff(seqs) - 1)[~lonely].sum())
     copies = first[evidence.copy[first] > 0]
+    copies = copies[~evidence.places.ever_lonely[evidence.sender[copies]]]
     frame, place = np.unique(evidence.frame[copies], return_inverse=True)
     last = np.zeros(len(frame), dtype=np.int64)
     np.maximum.at(last, place, evidence.copy[copies])

@@ -93,3 +93,15 @@ class Places:
     def most_in_range(self) -> int:
         """How many senders any receiver ever had in range."""
         return int(self._degrees[1].max(initial=0))
+
+    @cached_property
+    def ever_lonely(self) -> Mask:
+        """(N,), who had nobody in range, or was not there itself, at some time, and somebody at another."""
+        lonely = self._degrees[0] == 0
+        return np.asarray(lonely.any(axis=0) & ~lonely.all(axis=0))
+
+    def was_lonely(self, sender: int, time_ns: Whole) -> Mask:
+        """(n - 1,), whether a sender had nobody in range at some time between one of n instants and the next."""
+        lonely = np.concatenate([[0], np.cumsum(self._degrees[0][:, sender] == 0)])
+        index = np.minimum(self.index(time_ns), len(self._position_m) - 1)
+        return np.asarray(lonely[index[1:] + 1] > lonely[index[:-1]])

@@ -20,10 +20,10 @@ from vnet.roads.lanes import Array
 
 HARDEST_MPS2 = 10.0
 """No vehicle starts harder."""
-MOST_JUMPS = 0.1
+MOST_JUMPS = 0.05
 """A trip with a larger share of jumps is no trip: units, projection or ids are wrong."""
 FEW_JUMPS = 10
-FARTHEST_RUNS = 50
+FARTHEST_RUNS = 20
 """A chain leaves out so many runs of samples at most."""
 FARTHEST_EXIT = 5
 """And so many samples before a jump: what a filter in a receiver makes of one."""
