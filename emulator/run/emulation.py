@@ -239,6 +239,10 @@ class Emulation:
             self._outside.discard(node)
             self.folder.event(time_ns, kind, node, incarnation=self.incarnation[node])
 
+    def has_left(self, node: str) -> bool:
+        """Whether a vehicle is not in the network, as events tell it."""
+        return node in self._outside
+
     def _log_departures(self, time_ns: int, absent: set[str]) -> None:
         for node in self.world.node_ids:
             if node in absent and node not in self._outside:

@@ -458,7 +458,8 @@ class LiveRun:
             self._launcher.kill(lead)
             return
         self._stand_still(self._paused - {lead})  # or it could not go
-        self._link.send(lead, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
+        reason = "it has left" if self._emulation.has_left(lead) else "restarted by a fault"
+        self._link.send(lead, wire.End(None, "killed by a fault" if killed else reason))
         if self._options.launch:
             going = asyncio.create_task(asyncio.to_thread(self._launcher.let_go(lead), FAREWELL_S))
             if self._realtime:  # nobody waits for it
