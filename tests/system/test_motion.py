@@ -54,8 +54,9 @@ def test_processes_that_come_and_go_do_the_same_as_their_simulation(vnet: Vnet, 
 
 
 def test_with_faults_as_well(vnet: Vnet, scenario: str) -> None:
-    kill = '[{kind = "kill", at_s = 0.9, duration_s = 0.7, nodes = {ids = ["v4", "v2"]}}]'
-    live, simulated = (vnet(command, scenario, "--set", f"fault={kill}") for command in ("run", "simulate"))
+    kill = '[[fault]]\nkind = "kill"\nat_s = 0.9\nduration_s = 0.7\nnodes = { ids = ["v4", "v2"] }\n'
+    Path(scenario).write_text(Path(scenario).read_text() + kill)
+    live, simulated = (vnet(command, scenario) for command in ("run", "simulate"))
     assert live.status == simulated.status == 0, live.stderr + live.stdout
     assert live.fingerprint == simulated.fingerprint
     assert ("entered", "v4", 1_600_000_000) in comings_and_goings(live)
@@ -82,18 +83,9 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
         found = next(filter(None, (re.search(r"at (tcp\S+); waiting for 4", line) for line in emulator.stderr)))
         agents = {}
         for node in VEHICLES:
-            credentials = str(folder / "access" / "credentials" / f"{node}.json")
-            agent = [
-                *AGENT,
-                "--connect",
-                found[1],
-                "--run",
-                "driving",
-                "--node",
-                node,
-                "--credentials",
-                credentials,
-            ]
+            credentials = folder / "access" / "credentials" / f"{node}.json"
+            agent = [*AGENT, "--connect", found[1], "--run", "driving", "--node", node]
+            agent += ["--credentials", str(credentials)]
             agents[node] = stack.enter_context(subprocess.Popen(agent, cwd=ROOT))
         stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
         by_hand = Finished(emulator.returncode, stdout, stderr, folder)
