@@ -6,7 +6,6 @@ It is conformal, so that headings are kept, and within 50 km of its origin true 
 from __future__ import annotations
 
 import numpy as np
-from pyproj import Transformer
 
 from vnet.roads.lanes import Array
 
@@ -20,6 +19,8 @@ def middle_deg(latitude_deg: Array, longitude_deg: Array) -> tuple[float, float]
 
 def to_local_m(latitude_deg: Array, longitude_deg: Array, origin_deg: tuple[float, float]) -> Array:
     """Points (n,) in degrees as (n, 2) metres east and north of the origin (latitude, longitude)."""
+    from pyproj import Transformer  # slow to import, and only points in degrees need it
+
     latitude, longitude = origin_deg
     plane = f"+proj=tmerc +lat_0={latitude!r} +lon_0={longitude!r} +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m"
     transformer = Transformer.from_crs("EPSG:4326", plane, always_xy=True)

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.parsers import expat
@@ -127,7 +128,8 @@ def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
             raise ScenarioError(f"{path}: cannot start {command[0]}: {error.strerror}") from None
         if done.returncode or not output.exists():
             lines = [line for line in done.stderr.splitlines() if line.startswith("Error")] or [done.stderr.strip()]
-            raise ScenarioError(f"{path}: SUMO failed: {' '.join(lines[:_EXPLAIN_LINES])}")
+            said = " ".join(lines[:_EXPLAIN_LINES])
+            raise ScenarioError(f"{path}: SUMO failed (exit status {done.returncode}): {said}")
         try:
             return read_fcd(output, None)
         except ScenarioError as error:
@@ -135,10 +137,12 @@ def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
 
 
 def _sumo(path: Path) -> str:
-    """The program: on the PATH, in SUMO_HOME, or from the extra `sumo`."""
-    home = os.environ.get("SUMO_HOME")
-    found = shutil.which("sumo") or (home and shutil.which(str(Path(home) / "bin" / "sumo")))
-    if not found:
+    """The program: on the PATH, beside this Python (as the extra `sumo` puts it), or in SUMO_HOME."""
+    folders = [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
+    if home := os.environ.get("SUMO_HOME"):
+        folders.append(str(Path(home) / "bin"))
+    found = shutil.which("sumo", path=os.pathsep.join(folders))
+    if found is None:
         raise ScenarioError(
             f"{path}: SUMO is not installed: pip install 'vnet-emulator[sumo]', or apt-get install sumo"
         )
