@@ -108,7 +108,7 @@ def test_what_sumo_reads_belongs_to_the_run(tmp_path: Path, sumo: Path) -> None:
             None,
             "Loading\nError: No such file 'a.net.xml'.\nQuitting (on error).",
             1,
-            "SUMO failed: Error: No such file",
+            "status 1): Error: No such file",
         ),
         (None, "", 0, "SUMO failed (exit status 0)"),
         (FCD[:300], "", 0, "what SUMO drove: "),
