@@ -37,7 +37,7 @@ from emulator.run.progress import ProgressLine
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
 from emulator.terminal import one_line_errors
-from emulator.viewing_cli import RerunBindOption, RerunPortOption, view
+from emulator.viewing_cli import RerunBindOption, RerunPortOption, RerunVehicleOption, view
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.link.access import Access, Credentials, is_tls
@@ -116,6 +116,7 @@ def run(
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
@@ -127,8 +128,9 @@ def run(
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
-        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
+        _check_vehicle(sinks, world)
         access = _create_access(loaded, world)
         with ExitStack() as stack:
             separate = None
@@ -148,17 +150,18 @@ def simulate(
     out: OutOption = None,
     overrides: SetOption = None,
     rerun: RerunOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
     with one_line_errors():
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
-        sinks = choose_sinks(rerun or ())
-        if sinks is not None and sinks.serve is not None:
-            raise VnetError("--rerun: a simulation is over before one can look: save it, and look with vnet view")
+        sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+        world = build_world(loaded)
+        _check_vehicle(sinks, world)
         sys.path.append(str(Path.cwd()))
-        emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
+        emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
         with ExitStack() as stack:
             if sinks is not None:
                 _record_here(emulation, sinks, stack)
@@ -200,6 +203,7 @@ def emulator(
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
     with one_line_errors():
@@ -207,8 +211,9 @@ def emulator(
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         _check_restarts(loaded, own_router=False)
-        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
+        _check_vehicle(sinks, world)
         folder = RunFolder.create(out, loaded)
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
@@ -300,13 +305,14 @@ def record(
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Watch a run from outside and write a Rerun recording of it."""
     from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it
 
     with one_line_errors():
         login = None if credentials is None else Credentials.load(credentials)
-        sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port)
+        sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port, rerun_vehicle)
         if sinks is None:
             raise VnetError("--rerun off: there is nothing to do")
         if sinks.serve is not None:
@@ -366,12 +372,19 @@ def _run_live(
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
     if options.record is not None:
-        options = replace(options, record=options.record.inside(folder.path))
-        if options.record.serve is not None:
-            print(options.record.serve.told(), file=sys.stderr)
+        sinks = options.record.inside(folder.path)
+        options = replace(options, record=sinks)
+        if sinks.serve is not None:
+            print(sinks.serve.told(), file=sys.stderr)
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
     _finish(emulation, wall_s, interrupted, "run", check_determinism)
+
+
+def _check_vehicle(sinks: Sinks | None, world: World) -> None:
+    """The vehicle to be looked at closely must be there."""
+    if sinks is not None and sinks.vehicle is not None and sinks.vehicle not in world.node_ids:
+        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no vehicle is called so")
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:

@@ -18,7 +18,7 @@ from emulator.observe.playback import Message, messages
 from emulator.observe.run_folder import RunFolder
 from emulator.observe.sinks import RECORDING, Sinks, has_display, place_to_serve
 from emulator.terminal import one_line_errors
-from emulator.viewing_cli import LATEST, RerunBindOption, RerunPortOption, RunArgument
+from emulator.viewing_cli import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
 from vnet.errors import VnetError
 from vnet.scenario import NS_PER_S
 
@@ -31,6 +31,7 @@ def render(
     out: Annotated[
         Path | None, typer.Option(help=f"The recording to write; the default is RUN/{RECORDING}.")
     ] = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Make a run's recording anew, from its files alone."""
     with one_line_errors():
@@ -38,13 +39,15 @@ def render(
         recording = out or run / RECORDING
         if not recording.parent.is_dir():
             raise VnetError(f"{recording}: there is no folder {recording.parent}")
-        RunFolder(recording.parent).put(recording.name, lambda part: _write_recording(played, part))
+        RunFolder(recording.parent).put(
+            recording.name, lambda part: _write_recording(played, Sinks(part, vehicle=rerun_vehicle))
+        )
         print(recording)
 
 
-def _write_recording(played: Iterator[Message], path: Path) -> None:
+def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:
     stream, scene = next(played)
-    with _recorder(Sinks(save=path), scene["name"]) as recorder:
+    with _recorder(sinks, scene["name"]) as recorder:
         recorder.take(stream, scene)
         console = Console(stderr=True)
         total = scene["duration_ns"] / scene["period_ns"]
@@ -56,12 +59,13 @@ def _write_recording(played: Iterator[Message], path: Path) -> None:
 
 def play(
     run: RunArgument = LATEST,
-    speed: Annotated[float, typer.Option(help="Emulated seconds a second.")] = 1.0,
+    speed: Annotated[float, typer.Option(help="How many times as fast as real time.")] = 1.0,
     start: Annotated[float, typer.Option("--from", min=0.0, help="Emulated second to begin at.")] = 0.0,
     end: Annotated[float | None, typer.Option("--to", help="Emulated second to stop at.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Play a run into a viewer here, or serve it as it plays, until Ctrl-C."""
     with one_line_errors():
@@ -74,12 +78,12 @@ def play(
         if start >= (over_s := scene["duration_ns"] / NS_PER_S):
             raise VnetError(f"--from {start:g}: the run is over at {over_s:g} s")
         scheduled = schedule(played, speed, round(start * NS_PER_S), None if end is None else round(end * NS_PER_S))
-        sinks = Sinks(serve=place_to_serve(rerun_bind, rerun_port), spawn=has_display() and not serve)
+        place = place_to_serve(rerun_bind, rerun_port)
+        sinks = Sinks(serve=place, spawn=has_display() and not serve, vehicle=rerun_vehicle)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
             recorder.take(stream, scene)
-            assert sinks.serve is not None
-            print(f"playing {run} at {speed:g}× real time\n{sinks.serve.told()}", flush=True)
+            print(f"playing {run} at {speed:g}× real time\n{place.told()}", flush=True)
             if play_scheduled(scheduled, lambda message: recorder.take(*message)) == 0:
                 raise VnetError(f"{run}: there is nothing to play from {start:g} s on")
             print("played; it can be looked at until Ctrl-C", flush=True)

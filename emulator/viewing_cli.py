@@ -22,6 +22,9 @@ RerunBindOption = Annotated[
 RerunPortOption = Annotated[
     int | None, typer.Option(help="Viewers connect here, browsers to the next port; by default 9876, if free.")
 ]
+RerunVehicleOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="The vehicle that has a tab of its own; by default the first.")
+]
 LATEST = Path("runs/latest")
 
 

@@ -39,51 +39,59 @@ NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then
 
 
 class Run(Section):
-    """`[run]`: what the run is called, how long it takes and how patient it is.
-
-    Where there are faults, all have healed `settle_s` before the end, so that the network is judged at rest.
-    """
+    """`[run]`: what the run is called, how long it takes and how patient it is."""
 
     name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    """Names the run's folder, and its keys on Zenoh."""
     seed: int = Field(1, ge=0, lt=2**63)
+    """All that is drawn in the run comes from it: the same seed, the same run."""
     duration_s: float = Field(30.0, gt=0, le=DAY_S)
+    """Length of the run, in emulated time."""
     settle_s: float = Field(5.0, ge=0, le=DAY_S)
+    """All faults have healed so long before the end (emulated time), so that the network is judged at rest."""
     pacing: Literal["lockstep", "realtime"] = "lockstep"
+    """`lockstep` is virtual time, `realtime` the wall clock."""
     nodes_per_process: int = Field(1, ge=1, le=1000)
+    """How many vehicles share an agent process; they start, pause and die together."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
+    """How long the emulator waits for its agents to join, or to come back after a fault (wall clock)."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
+    """A process that does not yield for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
+    """An agent that has lost its emulator for so long (wall clock) ends."""
     spin_limit: int = Field(100_000, ge=100, le=MANY)
+    """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
 
 
 class Network(Section):
-    """`[network]`: which vehicles there are and where they are, or drive.
-
-    `file` reads `path` (columns id, x_m, y_m, heading_rad; relative to the scenario file). `generated` draws
-    `vehicles` of them: `layout = "urban"` has the degree histogram and components of the published networks,
-    `layout = "dense"` packs them so that degrees exceed 30. `seed` draws the network, and not the run.
-
-    `trips` reads how vehicles drive (NPZ, CSV, Parquet, or what SUMO writes with `--fcd-output`), and `sumo` has
-    SUMO drive the configuration `path`, with `seed`; docs/motion.md. For these two: `start_s` is the time of the
-    file at which the run begins, its first sample's if left out; at most `max_vehicles` take part, those that
-    come first; only within the `disc` (x, y, radius in m). `origin_deg` (latitude, longitude) is the zero of
-    metres for files in degrees, the middle of the trips if left out. What would take a vehicle more than
-    `fastest_mps` is a jump; up to `longest_gap_s` without a sample are bridged, after that a vehicle has left.
-    """
+    """`[network]`: which vehicles there are and where they are, or how they drive."""
 
     kind: Literal["generated", "file", "trips", "sumo"] = "generated"
+    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive, and
+    `sumo` has SUMO drive."""
     path: Path | None = None
+    """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
+    CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
     vehicles: int = Field(38, ge=1, le=10_000)
+    """How many are generated; they are called v01, v02, …"""
     layout: Literal["urban", "dense"] = "urban"
+    """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
     seed: int = Field(1, ge=0, lt=2**63)
+    """Draws the generated network, or SUMO's traffic, and nothing of the run."""
     start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
     max_vehicles: int | None = Field(None, ge=1, le=10_000)
+    """Trips: no more than so many vehicles, those that enter first."""
     disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
+    """Trips: vehicles are there only within this disc, x, y, radius in m."""
     origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
         None
     )
+    """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
     fastest_mps: float = Field(70.0, gt=0, le=1000)
+    """Trips: what is faster is a jump."""
     longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
+    """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
 
     @property
     def moves(self) -> bool:
@@ -101,27 +109,36 @@ class Network(Section):
 
 
 class CommonError(Section):
-    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process (MODEL 1)."""
+    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process."""
 
     sigma_m: float = Field(3.0, ge=0, le=WILD_M)
+    """Its standard deviation in each axis."""
     tau_s: float = Field(600.0, gt=0)
+    """Its correlation time."""
 
 
 class Gnss(Section):
     """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
 
     rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
+    """Fixes a second. The time between two is the period by which states and metrics are recorded."""
     sigma_m: float = Field(1.0, ge=0, le=WILD_M)
+    """Standard deviation of the receiver's noise in each axis."""
     heading: bool = True
+    """Whether fixes bear a heading."""
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)
+    """Standard deviation of that heading."""
 
 
 class Lateral(Section):
     """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
 
     half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    """How far it strays at most; the map tells programs."""
     sigma_m: float = Field(0.4, ge=0, le=WILD_M)
+    """Standard deviation of the offset, before it is reflected at the half-width."""
     tau_s: float = Field(20.0, gt=0)
+    """Correlation time of the offset."""
 
 
 class WorldSection(Section):
@@ -133,24 +150,32 @@ class WorldSection(Section):
 
 
 class Radio(Section):
-    """`[radio]`: what stands between one vehicle's broadcast and another's reception.
-
-    All within `range_m` hear each other, unless `links` says who hears whom: a matrix of 0 and 1, or a CSV file of
-    one without a header (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in
-    the order of the network's vehicles; the diagonal means nothing.
-    """
+    """`[radio]`: what stands between one vehicle's broadcast and another's reception."""
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
+    """All within it hear each other, unless there are `links`."""
     links: Path | tuple[tuple[int, ...], ...] | None = None
+    """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
+    (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
+    network's vehicles; the diagonal means nothing."""
     max_peers: int = Field(30, ge=1, le=MANY)
+    """Each receiver hears so many senders at most: the nearest that are up."""
     loss: float = Field(0.0, ge=0, le=1)
+    """Probability that a frame is lost, drawn for each receiver by itself."""
     latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
+    """Least time from the end of the transmission to the arrival."""
     jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Added to the latency: uniform up to so much, drawn for each receiver."""
     access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Wait before the transmission: uniform up to so much, drawn for each frame."""
     delivery_tick_us: int = Field(0, ge=0, le=MANY)
+    """Arrivals are rounded up to a multiple of it; 0 rounds nothing."""
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
+    """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
+    """A frame takes its payload's bits over this to send; each sender sends one at a time."""
     queue_frames: int = Field(64, ge=1, le=MANY)
+    """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
 
     @field_validator("links", mode="before")
     @classmethod
@@ -172,7 +197,9 @@ class OneProgram(Section):
     """A program as `package.module:function`, and the options it is given."""
 
     entry: str = "agents.beacon:main"
+    """An async function of one argument, the `Node`."""
     options: dict[str, Any] = Field(default_factory=dict)
+    """Given to the program as `node.options`; what is allowed is its own business."""
 
     @field_validator("entry")
     @classmethod
@@ -183,15 +210,17 @@ class OneProgram(Section):
 
 
 class ProgramException(OneProgram):
-    """`[[program.exceptions]]`: `nodes` (ids) that run another program than all others, with options of its own."""
+    """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
 
     nodes: tuple[str, ...] = Field(min_length=1)
+    """Their ids."""
 
 
 class Program(OneProgram):
     """`[program]`: what every vehicle runs, but for the `exceptions`."""
 
     exceptions: tuple[ProgramException, ...] = ()
+    """Those that run something else."""
 
     @model_validator(mode="after")
     def _one_program_a_node(self) -> Program:
@@ -214,6 +243,7 @@ class Scenario(Section):
     radio: Radio = Radio()
     program: Program = Program()
     fault: tuple[Fault, ...] = ()
+    """What breaks, and when."""
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:

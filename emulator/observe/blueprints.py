@@ -50,7 +50,7 @@ def overview() -> rrb.Vertical:
             _events(),
             column_shares=[2, 3, 4],
         ),
-        row_shares=[1.1, 7, 2.8],
+        row_shares=[1.25, 7, 2.8],
         name="Overview",
     )
 

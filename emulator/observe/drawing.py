@@ -111,9 +111,14 @@ class Period:
         return np.frombuffer(self.message["up"], dtype=np.uint8).astype(bool)
 
     @cached_property
+    def down(self) -> list[str]:
+        """The vehicles that are not."""
+        return [node for node, up in zip(self.node_ids, self.up, strict=True) if not up]
+
+    @cached_property
     def truth_m(self) -> Floats:
         """The true common error, (2,)."""
-        return self.points("common_error_m")[0]
+        return np.asarray(self.points("common_error_m")[0])
 
     @cached_property
     def pairs(self) -> NDArray[np.int32]:
@@ -194,19 +199,21 @@ class Canvas:
     def point_style(
         self,
         entity: str,
-        colours: Colour | ArrayLike,
+        colours: Colour | ArrayLike | None,
         radius: float,
         labels: Sequence[str] | None = None,
         show_labels: bool = False,
         order: float | None = None,
     ) -> None:
-        """How the points of an entity look from now on: `radius` on the screen, one colour or one each."""
-        one = isinstance(colours, tuple)
+        """How the points of an entity look at all times: `radius` on the screen, one colour or one each.
+
+        None for colours that change: what is always there would hide what comes with a time.
+        """
         style = rr.Points2D.from_fields(
-            colors=[colours] if one else colours,
+            colors=[colours] if isinstance(colours, tuple) else colours,
             radii=rr.Radius.ui_points(radius),
             labels=labels,
-            show_labels=show_labels,
+            show_labels=None if labels is None else show_labels,
             draw_order=order,
         )
         self.log(entity, style, static=True)
@@ -225,9 +232,13 @@ class Canvas:
         self.point_style(entity, colours, 0.1, labels, show_labels=True)
         self.points(entity, position_m, static=True)
 
-    def strip_style(self, entity: str, colour: Colour, width: float, order: float | None = None) -> None:
-        """How the lines of an entity look from now on: `width` on the screen."""
-        style = rr.LineStrips2D.from_fields(colors=[colour], radii=rr.Radius.ui_points(width / 2), draw_order=order)
+    def strip_style(self, entity: str, colour: Colour | None, width: float, order: float | None = None) -> None:
+        """How the lines of an entity look at all times: `width` on the screen; None for a colour that changes."""
+        style = rr.LineStrips2D.from_fields(
+            colors=None if colour is None else [colour],
+            radii=rr.Radius.ui_points(width / 2),
+            draw_order=order,
+        )
         self.log(entity, style, static=True)
 
     def strips(

@@ -58,29 +58,50 @@ _SIZES = {"common_error_m": 2, "common_error_covariance_m2": 4, "mean_m": 2, "st
 class PeriodFigures:
     """One row of the metrics. Lengths in metres; None where no node reported what is needed.
 
-    `common_error_rmse_m` is √(mean‖x_i − c‖²), `deviation_m` √(mean‖x_i − x̄‖²) and `bias_m` ‖x̄ − c‖ over the
-    network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component
-    (where vehicles move, those of the period, in the order of their first vehicles);
-    `consensus_error_m` is √(mean‖m_i − x̄‖²) with x̄ of the node's component; ANEES are means of
-    εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+    <<<<<<< HEAD
+        `common_error_rmse_m` is √(mean‖x_i − c‖²), `deviation_m` √(mean‖x_i − x̄‖²) and `bias_m` ‖x̄ − c‖ over the
+        network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component
+        (where vehicles move, those of the period, in the order of their first vehicles);
+        `consensus_error_m` is √(mean‖m_i − x̄‖²) with x̄ of the node's component; ANEES are means of
+        εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+    =======
+        x_i is vehicle i's estimate of the common error c, x̄ the mean of all x_i, m_i what vehicle i takes for the mean.
+        ANEES are means of εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+    >>>>>>> main
     """
 
     period: int
+    """Counts from 0."""
     time_ns: int
+    """Its start."""
     reporting: int
+    """How many vehicles reported in it."""
     common_error_rmse_m: float | None
+    """√(mean‖x_i − c‖²) over the network."""
     deviation_m: float | None
+    """√(mean‖x_i − x̄‖²): how far the vehicles are from agreeing."""
     bias_m: float | None
+    """‖x̄ − c‖."""
     stacked_rmse_m: float | None
+    """As `common_error_rmse_m`, right after fusion, before the map."""
     stacked_deviation_m: float | None
+    """As `deviation_m`, right after fusion, before the map."""
     component_rmse_m: list[float | None]
+    """`common_error_rmse_m` of each connected component of the network."""
     component_deviation_m: list[float | None]
+    """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
+    """Of the vehicles' estimates of their positions."""
     fix_rmse_m: float | None
+    """Of the raw fixes."""
     consensus_error_m: float | None
+    """√(mean‖m_i − x̄‖²), with x̄ of the vehicle's component."""
     common_error_anees: float | None
+    """Of the common error."""
     position_anees: float | None
+    """Of the positions."""
     not_finite: int
+    """How many reports held NaN or infinity."""
 
 
 class Metrics:

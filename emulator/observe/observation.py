@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -154,7 +154,7 @@ def period_message(
         "common_error_covariance_m2": pack(beliefs.common_error_covariance_m2),
         "clouds": {node: pack(cloud) for node, cloud in beliefs.clouds.items()},
         "weights": {node: pack(weights) for node, weights in beliefs.weights.items()},
-        "figures": asdict(figures),
+        "figures": dict(vars(figures)),
         "up": np.asarray(up, dtype=np.uint8).tobytes(),
         "faults": list(faults),
         "events": list(map(event_message, events)),

@@ -58,7 +58,7 @@ class OverviewScene:
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
-        self._down: list[str] = []
+        self._down: list[str] | None = None
         self._clouds: dict[str, Floats] = {}  # each vehicle's latest
         self._trusted = False  # whether any weights have been reported
         self._next_ellipses_s = self._next_clouds_s = self._next_weights_s = 0.0
@@ -89,8 +89,8 @@ class OverviewScene:
 
     def _set_styles(self) -> None:
         canvas = self._canvas
-        canvas.strip_style("map/links", GREEN, 1.0, -10.0)
-        canvas.point_style("map/true", SKY, 5.0, self._node_ids)
+        canvas.strip_style("map/links", None, 1.0, -10.0)
+        canvas.point_style("map/true", None, 5.0, self._node_ids)
         canvas.point_style("map/fix", GREY, 2.0)
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
         canvas.point_style("position/fix", GREY, 3.0, self._node_ids)
@@ -127,6 +127,8 @@ class OverviewScene:
         common = period.points("common_error_estimate_m") - truth
         canvas.points("common/estimates", common)
         self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
+        for node in period.down:
+            self._clouds.pop(node, None)
         if period.time_s >= self._next_ellipses_s:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
             outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
@@ -151,6 +153,7 @@ class OverviewScene:
         for node, row in period.weights().items():
             self._weights[self._node_ids.index(node)] = row
             self._trusted = True
+        self._weights[~period.up] = np.nan
         if not self._trusted or period.time_s < self._next_weights_s or len(self._node_ids) > LARGEST_MATRIX:
             return
         self._next_weights_s = period.time_s + CLOUDS_EVERY_S
@@ -163,12 +166,13 @@ class OverviewScene:
             state = "acting" if label in acting else ""  # an empty state ends the one before
             self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
         self._faults = acting
-        down = [node for node, up in zip(self._node_ids, period.up, strict=True) if not up]
+        down = period.down
         if down != self._down:
             colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
             self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
             shown = ", ".join(down[:NAMED_DOWN]) + (" …" if len(down) > NAMED_DOWN else "")
-            self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else ""))
+            if down or self._down:
+                self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else ""))
             self._down = down
 
     def events(self, events: Iterable[Mapping[str, Any]]) -> None:
@@ -228,4 +232,4 @@ def describe(scene: Mapping[str, Any]) -> str:
         f"{reach}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
         f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
     ]
-    return f"## {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"
+    return f"### {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"

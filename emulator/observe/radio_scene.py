@@ -52,7 +52,7 @@ class Window:
     @property
     def total(self) -> NDArray[Any]:
         """The sum."""
-        return np.sum(self._kept, axis=0)
+        return np.asarray(np.sum(self._kept, axis=0))
 
 
 class RadioScene:

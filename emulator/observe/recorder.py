@@ -29,15 +29,15 @@ NAMED = 8
 class Recorder:
     """Writes into `sinks` as a context manager; `take` messages in order.
 
-    `vehicle` (an id, by default the first) is the one that is looked at closely. `missed` counts the periods that
-    never came. Raises VnetError if the file cannot be written, or nobody is called `vehicle`.
+    `missed` counts the periods that never came. Raises VnetError if the file cannot be written, or nobody is called
+    as the vehicle that `sinks` want to be looked at closely.
     """
 
-    def __init__(self, sinks: Sinks, name: str, vehicle: str | None = None) -> None:
+    def __init__(self, sinks: Sinks, name: str) -> None:
         self._stack = ExitStack()
         self._recording = self._stack.enter_context(open_recording(sinks, name))
         self._canvas = Canvas(self._recording)
-        self._vehicle = vehicle
+        self._vehicle = sinks.vehicle
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._node_ids: list[str] = []

@@ -86,12 +86,13 @@ class ServeAt:
 class Sinks:
     """Where a recording goes: `save` into a file, `serve` to viewers, `spawn` a viewer on this machine.
 
-    A spawned viewer looks at what is served.
+    A spawned viewer looks at what is served. `vehicle` is the one that is looked at closely, by default the first.
     """
 
     save: Path | None = None
     serve: ServeAt | None = None
     spawn: bool = False
+    vehicle: str | None = None
 
     def inside(self, folder: Path) -> Sinks:
         """The same, saved in a run's folder."""
@@ -100,35 +101,56 @@ class Sinks:
     @property
     def arguments(self) -> list[str]:
         """These sinks as options of `vnet record`."""
-        if self.serve is None:
-            return []
-        words = ["--rerun", "spawn" if self.spawn else "serve"]
-        return [*words, "--rerun-bind", self.serve.address, "--rerun-port", str(self.serve.port)]
+        words = [] if self.vehicle is None else ["--rerun-vehicle", self.vehicle]
+        if self.serve is not None:
+            words += ["--rerun", "spawn" if self.spawn else "serve"]
+            words += ["--rerun-bind", self.serve.address, "--rerun-port", str(self.serve.port)]
+        return words
 
 
-def choose_sinks(words: Sequence[str], address: str | None = None, port: int | None = None) -> Sinks | None:
-    """What `--rerun`, `--rerun-bind` and `--rerun-port` ask for; None for nothing. Saved as `recording.rrd`.
+def choose_sinks(
+    words: Sequence[str],
+    address: str | None = None,
+    port: int | None = None,
+    vehicle: str | None = None,
+    live: bool = True,
+) -> Sinks | None:
+    """What `--rerun` and its companions ask for; None for nothing. Saved as `recording.rrd`.
 
-    Raises VnetError for what is not among the choices, where there is no display for `spawn`, and where `address`
-    and `port` cannot be listened at; without `port` the first that is free is taken.
+    Raises VnetError for what is not among the choices (or cannot be had of what is not `live`), where there is no
+    display for `spawn`, and where `address` and `port` cannot be listened at; without `port` the first that is
+    free is taken.
     """
-    chosen = [word.strip() for words_at_once in words for word in words_at_once.split(",")]
-    for word in chosen:
-        if word not in CHOICES:
-            raise VnetError(f"--rerun {word}: one or more of {', '.join(CHOICES)} are allowed")
-    if "off" in chosen and set(chosen) != {"off"}:
-        raise VnetError(f"--rerun {','.join(chosen)}: off excludes the others")
+    chosen = _chosen(words)
+    served = "serve" in chosen or "spawn" in chosen
+    if served and not live:
+        raise VnetError(
+            f"--rerun {','.join(chosen)}: a simulation is not watched: save it, and look at it with vnet view"
+        )
     if "spawn" in chosen and not has_display():
         raise VnetError(
             "--rerun spawn: there is no display here (neither DISPLAY nor WAYLAND_DISPLAY is set); "
             "use --rerun serve, and look from a browser"
         )
-    if not chosen or chosen == ["off"]:
-        return None
-    served = "serve" in chosen or "spawn" in chosen
     if not served and (address is not None or port is not None):
         raise VnetError("--rerun-bind and --rerun-port are for --rerun serve")
-    return Sinks(Path(RECORDING), place_to_serve(address, port) if served else None, "spawn" in chosen)
+    if not chosen:
+        return None
+    place = place_to_serve(address, port) if served else None
+    return Sinks(Path(RECORDING), place, "spawn" in chosen, vehicle)
+
+
+def _chosen(words: Sequence[str]) -> list[str]:
+    """What is written once or several times, one or several separated by commas; none for `off`."""
+    chosen = [word.strip() for several in words for word in several.split(",")]
+    for word in chosen:
+        if word not in CHOICES:
+            raise VnetError(f"--rerun {word}: one or more of {', '.join(CHOICES)} are allowed")
+    if "off" not in chosen:
+        return chosen
+    if set(chosen) != {"off"}:
+        raise VnetError(f"--rerun {','.join(chosen)}: off excludes the others")
+    return []
 
 
 def place_to_serve(address: str | None = None, port: int | None = None) -> ServeAt:

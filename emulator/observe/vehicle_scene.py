@@ -59,7 +59,7 @@ class VehicleScene:
         self._frames(period)
         weights = period.weights().get(self._vehicle)
         if weights is not None:
-            self._weights = weights
+            self._weights = weights.copy()
         if period.time_s >= self._next_s:
             self._next_s = period.time_s + EVERY_S
             self._table(period)
@@ -71,8 +71,8 @@ class VehicleScene:
             canvas.point_style(f"vehicle/{view}/estimate", SKY, 6.0)
             canvas.strip_style(f"vehicle/{view}/ellipse", SKY, 2.0)
         canvas.point_style("vehicle/common/particles", GREY, 1.5)
-        canvas.strip_style("vehicle/hears/links", GREEN, 2.0)
-        canvas.point_style("vehicle/hears/neighbours", GREEN, 5.0)
+        canvas.strip_style("vehicle/hears/links", None, 2.0)
+        canvas.point_style("vehicle/hears/neighbours", None, 5.0)
         canvas.point_style("vehicle/hears/self", SKY, 7.0, [self._vehicle], show_labels=True)
         canvas.points("vehicle/hears/self", [[0.0, 0.0]], static=True)
 
@@ -86,6 +86,9 @@ class VehicleScene:
         canvas.points("vehicle/position/estimate", estimate)
         canvas.points("vehicle/common/estimate", common)
         cloud = period.clouds().get(self._vehicle)
+        if not period.up[self._number]:
+            cloud = np.empty((0, 2), dtype=np.float32)
+            self._weights[:] = np.nan
         if cloud is not None:
             canvas.points("vehicle/common/particles", cloud - period.truth_m)
         canvas.plot("vehicle/errors", *(float(np.hypot(*error[0])) for error in (estimate, fix, common)))
