@@ -20,16 +20,10 @@ LONGEST_S = 86_400.0
 
 
 class Selector(Section):
-<<<<<<< HEAD
     """Which nodes: all, unless one of these says otherwise.
 
-    `ids`; a `fraction` of all, or `random` so many of them, drawn from the run's seed; those whose position is in
-    the `disc` (x, y, radius in m) or the `polygon` (corners in m); those with so many others in range (`degree`,
-    least and most). Where vehicles stand their first position counts; where they move docs/motion.md says which.
+    Where vehicles stand their first position counts; where they move, docs/motion.md says which.
     """
-=======
-    """Which nodes: all, unless one of these says otherwise."""
->>>>>>> main
 
     ids: tuple[str, ...] | None = None
     """Those with these names."""
@@ -38,9 +32,9 @@ class Selector(Section):
     random: Annotated[int, Field(ge=1)] | None = None
     """So many of all, drawn from the run's seed."""
     disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
-    """Those whose first position is in a disc: x, y and radius in m."""
+    """Those whose position is in a disc: x, y and radius in m."""
     polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
-    """Those whose first position is in a polygon: its corners, [x, y] in m."""
+    """Those whose position is in a polygon: its corners, [x, y] in m."""
     degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
     """Those with so many others in range: least and most."""
 

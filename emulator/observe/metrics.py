@@ -58,16 +58,8 @@ _SIZES = {"common_error_m": 2, "common_error_covariance_m2": 4, "mean_m": 2, "st
 class PeriodFigures:
     """One row of the metrics. Lengths in metres; None where no node reported what is needed.
 
-    <<<<<<< HEAD
-        `common_error_rmse_m` is √(mean‖x_i − c‖²), `deviation_m` √(mean‖x_i − x̄‖²) and `bias_m` ‖x̄ − c‖ over the
-        network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component
-        (where vehicles move, those of the period, in the order of their first vehicles);
-        `consensus_error_m` is √(mean‖m_i − x̄‖²) with x̄ of the node's component; ANEES are means of
-        εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
-    =======
-        x_i is vehicle i's estimate of the common error c, x̄ the mean of all x_i, m_i what vehicle i takes for the mean.
-        ANEES are means of εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
-    >>>>>>> main
+    x_i is vehicle i's estimate of the common error c, x̄ the mean of all x_i, m_i what vehicle i takes for the mean.
+    ANEES are means of εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
     """
 
     period: int
@@ -87,7 +79,7 @@ class PeriodFigures:
     stacked_deviation_m: float | None
     """As `deviation_m`, right after fusion, before the map."""
     component_rmse_m: list[float | None]
-    """`common_error_rmse_m` of each connected component of the network."""
+    """`common_error_rmse_m` of each connected component of the network: where vehicles move, of the period's."""
     component_deviation_m: list[float | None]
     """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
