@@ -235,9 +235,11 @@ class Emulation:
         for node in [node for node in nodes if node not in self._ended]:
             self.up[node] = True
             self.engine.set_up(self.number[node], True)
-            kind = "entered" if node in self._outside else "restarted"
-            self._outside.discard(node)
-            self.folder.event(time_ns, kind, node, incarnation=self.incarnation[node])
+            if node in self._outside:
+                self._outside.discard(node)
+                self.folder.event(time_ns, "entered", node, incarnation=self.incarnation[node])
+            else:
+                self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
 
     def has_left(self, node: str) -> bool:
         """Whether a vehicle is not in the network, as events tell it."""

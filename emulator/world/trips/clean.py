@@ -86,11 +86,11 @@ def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
             for last in range(earlier.end - 1, max(earlier.entry, earlier.end - 1 - FARTHEST_EXIT) - 1, -1):
                 run.follow(earlier, last, time_s, position_m, rules)
     kept = np.zeros(len(rows), dtype=bool)
-    best: _Run | None = max(runs, key=lambda run: run.length)
-    end = best.end
-    while best is not None:
-        kept[best.entry : end] = True
-        best, end = best.before, best.left + 1
+    best = max(runs, key=lambda run: run.length)
+    kept[best.entry : best.end] = True
+    while best.before is not None:
+        kept[best.before.entry : best.left + 1] = True
+        best = best.before
     return kept
 
 
