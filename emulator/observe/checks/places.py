@@ -55,19 +55,23 @@ class Places:
         np.fill_diagonal(in_range, False)
         return np.asarray(in_range)
 
-    def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Mask:
-        """Which pairs of vehicles are in range at these instants; none where that is not known."""
+    def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Array:
+        """How far the two of each pair (n,) are apart at these instants; NaN where that is not known."""
         there = self.known(time_ns)
         index, sender, receiver = self.index(time_ns)[there], sender[there], receiver[there]
         offset = self._position_m[index, sender] - self._position_m[index, receiver]
-        distance_m = np.hypot(offset[:, 0], offset[:, 1])
+        distance_m = np.full(len(there), np.nan)
+        distance_m[there] = np.hypot(offset[:, 0], offset[:, 1])
+        return distance_m
+
+    def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Mask:
+        """Which pairs of vehicles are in range at these instants; none where that is not known."""
+        distance_m = self.pair_distances_m(sender, receiver, time_ns)
         if self._links is None:
             near = distance_m <= self._range_m
         else:
             near = self._links[receiver, sender] & np.isfinite(distance_m)
-        pairs = np.zeros(len(there), dtype=bool)
-        pairs[there] = near & (sender != receiver)
-        return pairs
+        return np.asarray(near & (sender != receiver))
 
     @cached_property
     def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
