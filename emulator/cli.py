@@ -20,6 +20,7 @@ import typer
 from rich.console import Console
 
 from emulator.experiments.cli import app as experiment_app
+from emulator.export_cli import export, radio
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
@@ -57,6 +58,8 @@ app.command()(status)
 app.command()(view)
 app.command()(render)
 app.command()(play)
+app.command()(radio)
+app.command()(export)
 
 
 class Pacing(StrEnum):
