@@ -175,6 +175,13 @@ def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Fi
     return {"step_us": statistics.median(times_s) * 1e6}
 
 
+def bench_dashboard() -> Figures:
+    """What the picture of a run with 50 vehicles costs: taking a snapshot, and a redraw at 100 × 30."""
+    from benchmarks import dashboard
+
+    return dashboard.measure()
+
+
 def bench_estimators() -> Figures:
     """The RBPF step against the same with a covariance a particle, and against Stone Soup and filterpy."""
     from benchmarks import estimators  # needs the extra `bench`
@@ -191,6 +198,7 @@ def bench_quadratic_programs() -> Figures:
 
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
+    "dashboard": bench_dashboard,
     "estimators": bench_estimators,
     "quadratic_programs": bench_quadratic_programs,
     "simulate": bench_simulate,

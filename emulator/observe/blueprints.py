@@ -38,7 +38,10 @@ def overview() -> rrb.Vertical:
             ),
             rrb.Vertical(
                 _against_time("figures/common", "Common error (m)"),
-                _against_time("figures/consensus", "Consensus (m)"),
+                rrb.Tabs(
+                    _against_time("figures/consensus", "Consensus (m)"),
+                    _against_time("figures/position", "RMSE of position (m)"),
+                ),
                 _against_time("radio/frames", "Frames a period by outcome, stacked"),
                 row_shares=[4, 2, 3],
             ),
@@ -50,7 +53,7 @@ def overview() -> rrb.Vertical:
             _events(),
             column_shares=[2, 3, 4],
         ),
-        row_shares=[1.25, 7, 2.8],
+        row_shares=[1.4, 7, 2.8],
         name="Overview",
     )
 

@@ -267,6 +267,11 @@ class Canvas:
         lines = rr.SeriesLines(names=names, colors=colours, widths=widths)
         self.log(entity, lines, static=True)
 
+    def states(self, entity: str, colours: Mapping[str, Colour]) -> None:
+        """Announce states of a timeline, and their colours; others have colours of Rerun's choice."""
+        style = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
+        self.log(entity, style, static=True)
+
     def plot(self, entity: str, *values: float) -> None:
         """One more value of each line of an entity, NaN for none; shown with the next `send_lines`."""
         times, rows = self._lines.setdefault(entity, ([], []))

@@ -12,10 +12,12 @@ import rerun as rr
 from emulator.observe.drawing import (
     BLUE,
     COMMON_RINGS_M,
+    DARK,
     GREEN,
     GREY,
     OUTCOME_COLOURS,
     POSITION_RINGS_M,
+    PURPLE,
     RED,
     SKY,
     Canvas,
@@ -43,6 +45,8 @@ LIMIT_VEHICLES = 200
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60
 NAMED_DOWN = 6
+ACTING, NOBODY = "acting", "none"
+"""States of faults, and of those who are down."""
 LEGEND_STEP = 3.1
 """From one name of the legend to the next; its rows are 1 apart."""
 
@@ -58,6 +62,7 @@ class OverviewScene:
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
+        self._known_faults: set[str] = set()
         self._down: list[str] | None = None
         self._clouds: dict[str, Floats] = {}  # each vehicle's latest
         self._trusted = False  # whether any weights have been reported
@@ -83,6 +88,7 @@ class OverviewScene:
         if self._paper is not None:
             common.append((self._paper[0], GREY, 1.5))
         canvas.series("figures/common", common)
+        canvas.states("faults/down", {NOBODY: DARK})
         consensus = [("consensus error", BLUE, 2.0), ("error of the network's mean", GREEN, 1.5)]
         canvas.series("figures/consensus", consensus)
         canvas.series("figures/position", [("estimate", SKY, 2.0), ("raw fix", GREY, 1.0)])
@@ -163,7 +169,10 @@ class OverviewScene:
     def _faults_and_downs(self, period: Period) -> None:
         acting = set(period.message["faults"])
         for label in sorted(acting ^ self._faults):
-            state = "acting" if label in acting else ""  # an empty state ends the one before
+            if label not in self._known_faults:
+                self._known_faults.add(label)
+                self._canvas.states(f"faults/{label}", {ACTING: PURPLE})
+            state = ACTING if label in acting else ""  # an empty state ends the one before
             self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
         self._faults = acting
         down = period.down
@@ -171,8 +180,7 @@ class OverviewScene:
             colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
             self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
             shown = ", ".join(down[:NAMED_DOWN]) + (" …" if len(down) > NAMED_DOWN else "")
-            if down or self._down:
-                self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else ""))
+            self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else NOBODY))
             self._down = down
 
     def events(self, events: Iterable[Mapping[str, Any]]) -> None:

@@ -29,7 +29,7 @@ WINDOW_S = 5.0
 """Shares, histograms and loads are those of so many last seconds."""
 EVERY_S = 1.0
 DISTANCE_BINS = 20
-STROKES = 4
+STROKES = 8
 """The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
 LEAST_LATENCY_BINS = 8
 LARGEST_MATRIX = 400

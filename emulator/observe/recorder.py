@@ -18,7 +18,7 @@ from emulator.observe.blueprints import blueprint
 from emulator.observe.drawing import Canvas, Period
 from emulator.observe.overview_scene import OverviewScene
 from emulator.observe.radio_scene import RadioScene
-from emulator.observe.sinks import Sinks, open_recording
+from emulator.observe.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.observe.vehicle_scene import VehicleScene
 from vnet.errors import VnetError
 
@@ -76,6 +76,7 @@ class Recorder:
             VehicleScene(self._canvas, scene, vehicle),
         ]
         self._recording.send_blueprint(blueprint(vehicle))
+        self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
 
     def _period(self, period: Period) -> None:
         self._canvas.at(period.time_s)

@@ -32,6 +32,9 @@ ONLY_PARSED = {
     "vnet fault": "needs a run that is on",
     "vnet status": "needs a run that is on",
     "vnet experiment": "takes minutes to hours",
+    "vnet view": "needs a screen, or somebody who looks",
+    "vnet play": "needs a screen, or somebody who looks",
+    "vnet render": "needs a run that the page has not made",
 }
 """Why these are parsed, and not run."""
 NOT_RUN = {

@@ -18,6 +18,7 @@ import numpy as np
 from agents import cooperative_frame
 from emulator.observe.run_folder import RunFolder
 from emulator.run.control import answer
+from emulator.run.course import Course
 from emulator.run.emulation import Emulation
 from emulator.world.links import load_links
 from emulator.world.networks import load_network
@@ -313,18 +314,21 @@ _JSON_WORDS = (
 
 
 @functools.cache
-def _small_emulation() -> Emulation:
+def _small_run() -> tuple[Emulation, Course]:
     scenario = Scenario.model_validate({"network": {"vehicles": 3}})
     folder = RunFolder.create(Path(tempfile.mkdtemp(prefix="vnet-fuzz-")) / "run", scenario)
-    return Emulation(scenario, build_world(scenario), folder)
+    emulation = Emulation(scenario, build_world(scenario), folder)
+    return emulation, Course(emulation)
 
 
 def _read_query(data: bytes) -> None:
     """A query of an operator: its verb, a line, and its payload."""
     verb, _, payload = data.partition(b"\n")
-    emulation = _small_emulation()
+    emulation, course = _small_run()
     try:
-        json.dumps(answer(emulation, verb.decode(errors="replace"), payload, 1_000_000_000, own_router=False))
+        json.dumps(
+            answer(emulation, course, verb.decode(errors="replace"), payload, 1_000_000_000, own_router=False)
+        )
     finally:
         emulation.faults.faults.clear()
 
