@@ -133,8 +133,9 @@ class OverviewScene:
         common = period.points("common_error_estimate_m") - truth
         canvas.points("common/estimates", common)
         self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
-        for node in period.down:
-            self._clouds.pop(node, None)
+        for node, up in zip(self._node_ids, period.up, strict=True):
+            if not up:
+                self._clouds.pop(node, None)
         if period.time_s >= self._next_ellipses_s:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
             outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
