@@ -47,12 +47,11 @@ class Snapshot:
     """How a run gets on.
 
     `phase` is "starting", "joining" (`missing` are the vehicles that are awaited, `join_timeout_s` how long),
-    "running" or "judging"; `absent` are those that have not entered yet, or have left. Seconds are emulated ones, but
-    for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and `join_timeout_s`,
-    which are of wall clock. `frames_by_outcome` counts
-    pairs of a frame and a receiver so far, `frames_per_s` those of the last emulated second. Figures are those of
-    the last period, and None where programs report nothing of the kind; `over_time` has their means in `BINS` equal
-    parts of the run.
+    "running" or "judging"; `absent` are those that have not entered yet, or have left. Seconds are emulated ones,
+    but for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and
+    `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts pairs of a frame and a receiver so far,
+    `frames_per_s` those of the last emulated second. Figures are those of the last period, and None where programs
+    report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run.
     """
 
     run: str

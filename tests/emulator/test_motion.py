@@ -19,7 +19,7 @@ from emulator.world.world import build_world, components
 from tests.emulator.apart import emulation_of, run_apart, run_together
 from tests.emulator.motion import along, scenario_of_trips, still, write_trips
 from tests.emulator.test_checks import result, run_scenario, verdict
-from tests.emulator.test_dashboard import row
+from tests.emulator.test_dashboard import row as row_of
 from vnet.errors import ScenarioError
 from vnet.scenario import Scenario, load_scenario
 
@@ -369,5 +369,5 @@ def test_who_watches_is_told_who_is_not_there_and_none_of_them_is_down(tmp_path:
     simulate(emulation)
     assert {shot.down for shot in shots.values()} == {()}
     assert shots[0].absent == ("v3",) and shots[12].absent == ("v5", "v3") and shots[35].absent == ("v4",)
-    text = row(shots[12], "vehicles")
+    text = row_of(shots[12], "vehicles")
     assert "3 up" in text and "2 not there" in text and "down" not in text
