@@ -196,6 +196,13 @@ def bench_quadratic_programs() -> Figures:
     return quadratic_programs.compare()
 
 
+def bench_observer() -> Figures:
+    """The observer of 50 vehicles at 10 Hz in real time: its share of a core, and what it writes."""
+    from benchmarks import observer
+
+    return observer.measure()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
     "dashboard": bench_dashboard,
@@ -206,6 +213,7 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "demo": bench_demo,
     "realtime": bench_realtime,
     "awaiting": bench_awaiting,
+    "observer": bench_observer,
 }
 
 

@@ -36,6 +36,8 @@ VEHICLE = "v08"
 AT_S = 12.0
 TABS = ("overview", "radio", "vehicle")
 DESK, PHONE = (1600, 900), (390, 844)
+MENU = 36
+"""The height of the viewer's own menu, which says nothing about the run."""
 LARGEST_BYTES = 300_000
 START_TIMEOUT_S = 60.0
 SETTLE_S = 4.0
@@ -82,7 +84,7 @@ def native_pictures(recording: Path, scratch: Path, out: Path) -> None:
             time.sleep(SETTLE_S)
             client.set_time("emulated time", duration=AT_S, play_state="paused")
             time.sleep(SETTLE_S)
-            put(client.take_screenshot(), out / f"{name}.png")
+            put(client.take_screenshot(), out / f"{name}.png", MENU)
 
 
 def web_picture(run: Path, out: Path) -> None:
@@ -93,7 +95,7 @@ def web_picture(run: Path, out: Path) -> None:
         until(lambda: urllib.request.urlopen(place.web_url).read())
         browser.look(place.web_url, DESK, dark=True)
         time.sleep(WEB_SETTLE_S)
-        put(browser.picture(), out / "web.png")
+        put(browser.picture(), out / "web.png", MENU)
 
 
 def page_pictures(page: Path, out: Path) -> None:
@@ -186,9 +188,10 @@ def until(ask: Callable[[], Any]) -> Any:
             time.sleep(0.3)
 
 
-def put(png: bytes, path: Path) -> None:
-    """Keep a picture, with fewer colours if it is large."""
+def put(png: bytes, path: Path, top: int = 0) -> None:
+    """Keep a picture without its upper `top` pixels, with fewer colours if it is large."""
     picture = Image.open(BytesIO(png)).convert("RGB")
+    picture = picture.crop((0, top, picture.width, picture.height))
     picture.save(path, optimize=True)
     colours = 256
     while path.stat().st_size > LARGEST_BYTES and colours >= 16:

@@ -26,7 +26,7 @@ def overview() -> rrb.Vertical:
                 origin="legend",
                 name="Legend",
                 titlebar=False,
-                visual_bounds=rrb.VisualBounds2D(x_range=(-1.6, 24.0), y_range=(-0.6, 2.0)),
+                visual_bounds=rrb.VisualBounds2D(x_range=(-1.2, 26.6), y_range=(-0.6, 2.0)),
             ),
             column_shares=[4, 5],
         ),
@@ -96,7 +96,7 @@ def one_vehicle(vehicle: str) -> rrb.Vertical:
             rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears and weighs"),
             column_shares=[2, 1],
         ),
-        row_shares=[5, 4],
+        row_shares=[4, 4],
         name=f"Vehicle {vehicle}",
     )
 

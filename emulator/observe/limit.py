@@ -14,7 +14,7 @@ import numpy as np
 
 from emulator.observe.observation import unpack
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
-from vnet.roads.lanes import LaneMap
+from vnet.roads.lanes import Array, LaneMap
 from vnet.scenario import Scenario
 
 PARTICLES = 500
@@ -56,8 +56,8 @@ class Limit:
         None where nothing was reported of a common error: then there is nothing to compare with. Periods that
         were left out are bridged.
         """
-        fix_m = unpack(period["fix_m"], 2)
-        heading_rad = unpack(period["heading_rad"])[:, 0]
+        fix_m = unpack(period["fix_m"], 2).astype(float)
+        heading_rad = unpack(period["heading_rad"])[:, 0].tolist()
         up = np.frombuffer(period["up"], dtype=np.uint8).astype(bool)
         seen = up & np.isfinite(fix_m).all(axis=1)
         time_ns = int(period["time_ns"])
@@ -75,6 +75,5 @@ class Limit:
         reporting = np.isfinite(unpack(period["common_error_estimate_m"], 2)).all(axis=1)
         return float(np.sqrt(squares[reporting].mean())) if reporting.any() else None
 
-    def _see(self, fix_m: Any, heading_rad: float) -> Observation:
-        heading = float(heading_rad) if self._knows_heading else None
-        return Observation(fix_m.astype(float), self._covariance_m2, heading)
+    def _see(self, fix_m: Array, heading_rad: float) -> Observation:
+        return Observation(fix_m, self._covariance_m2, heading_rad if self._knows_heading else None)

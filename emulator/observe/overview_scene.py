@@ -40,7 +40,7 @@ ELLIPSES_EVERY_S = 0.5
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-LIMIT_VEHICLES = 200
+LIMIT_VEHICLES = 100
 """The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60
@@ -95,7 +95,7 @@ class OverviewScene:
 
     def _set_styles(self) -> None:
         canvas = self._canvas
-        canvas.strip_style("map/links", None, 1.0, -10.0)
+        canvas.strip_style("map/links", None, 1.8, -10.0)
         canvas.point_style("map/true", None, 5.0, self._node_ids)
         canvas.point_style("map/fix", GREY, 2.0)
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
@@ -103,7 +103,7 @@ class OverviewScene:
         canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
         canvas.point_style("common/particles", GREY, 1.0)
         canvas.point_style("common/estimates", SKY, 4.0, self._node_ids)
-        canvas.strip_style("common/ellipses", (*SKY, 110), 1.0)
+        canvas.strip_style("common/ellipses", (*SKY, 130), 1.2)
 
     def period(self, period: Period) -> None:
         """Draw a period."""
@@ -113,7 +113,7 @@ class OverviewScene:
         self._trust(period)
         self._faults_and_downs(period)
         self.events(period.message["events"])
-        self._canvas.at(period.time_s)
+        self._canvas.at(period.time_ns)
 
     def _map(self, period: Period) -> None:
         canvas, position = self._canvas, period.points("position_m")
@@ -187,7 +187,7 @@ class OverviewScene:
     def events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Write down what happened, each event at its own time."""
         for event in events:
-            self._canvas.at(event["time_ns"] / 1e9)
+            self._canvas.at(event["time_ns"])
             level = "WARN" if event["kind"] in WARNINGS else "INFO"
             self._canvas.log("events", rr.TextLog(in_words(event), level=level))
 
@@ -221,7 +221,8 @@ def draw_legend(canvas: Canvas) -> None:
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     links = [(outcome_title(outcome), colour) for outcome, colour in OUTCOME_COLOURS.items()]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
-        place = [[LEGEND_STEP * number, row] for number in range(len(items))]
+        place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
+        canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
         colours = [list(colour) for _, colour in items]
         canvas.point_style(f"legend/{entity}", colours, 5.0, [label for label, _ in items], show_labels=True)
         canvas.points(f"legend/{entity}", place, static=True)

@@ -37,22 +37,22 @@ LARGEST_MATRIX = 400
 
 
 class Window:
-    """Sums of arrays over the last periods."""
+    """Sums of arrays of whole numbers over the last periods."""
 
     def __init__(self, periods: int) -> None:
-        self._kept: deque[NDArray[Any]] = deque(maxlen=max(1, periods))
+        self._kept: deque[NDArray[Any]] = deque()
+        self._periods = max(1, periods)
+        self.total: NDArray[Any] = np.zeros(1)
 
     def add(self, array: NDArray[Any]) -> None:
         """Take one period's."""
         self._kept.append(array)
+        self.total = self.total + array
+        if len(self._kept) > self._periods:
+            self.total -= self._kept.popleft()
 
     def __len__(self) -> int:
         return len(self._kept)
-
-    @property
-    def total(self) -> NDArray[Any]:
-        """The sum."""
-        return np.asarray(np.sum(self._kept, axis=0))
 
 
 class RadioScene:
@@ -61,7 +61,8 @@ class RadioScene:
     def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
         self._canvas = canvas
         self._count = len(scene["node_ids"])
-        self._period_s = scene["period_ns"] / 1e9
+        self._period_ns: int = scene["period_ns"]
+        self._period_s = self._period_ns / 1e9
         self._range_m: float | None = scene["range_m"]
         periods = round(WINDOW_S / self._period_s)
         self._tried, self._delivered = Window(periods), Window(periods)
@@ -80,15 +81,15 @@ class RadioScene:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
-        self._sent.add(period.numbers("sent_bytes"))
-        self._received.add(period.numbers("received_bytes"))
+        self._sent.add(period.numbers("sent_bytes").astype(float))
+        self._received.add(period.numbers("received_bytes").astype(float))
         if period.time_s >= self._next_s:
             self._next_s = period.time_s + EVERY_S
             self._charts(period)
 
     def _stack(self, period: Period) -> None:
         """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back."""
-        times = period.time_s + self._period_s * np.arange(2 * STROKES) / (2 * STROKES)
+        times_ns = (period.time_ns + self._period_ns * np.arange(2 * STROKES) // (2 * STROKES)).tolist()
         lower = 0.0
         for outcome, colour in OUTCOME_COLOURS.items():
             count = period.message["outcomes"].get(outcome.name, 0)
@@ -101,7 +102,7 @@ class RadioScene:
                 self._canvas.log(entity, style, static=True)
             if entity in self._announced:
                 layer = [lower, lower + count] * STROKES if count else [np.nan]
-                self._canvas.plot_at(entity, times[: len(layer)].tolist(), layer)
+                self._canvas.plot_at(entity, times_ns[: len(layer)], layer)
             lower += count
 
     def _load(self, period: Period) -> None:

@@ -45,6 +45,7 @@ NOT_RUN = {
     "pip": "needs the network",
     "rerun": "needs a screen",
     "scp": "needs another host",
+    "ssh": "needs another host",
     "source": "the shell's own",
     "tshark": "a program of its own",
     "zenohd": "a program of its own",

@@ -402,7 +402,7 @@ def test_the_papers_value_only_where_it_applies(
 def test_nothing_plotted_sends_nothing(tmp_path: Path) -> None:
     recording = rr.RecordingStream("empty")
     recording.set_sinks(rr.FileSink(str(tmp_path / "x.rrd")))
-    Canvas(recording).send_lines()
+    Canvas(recording).send()
     recording.disconnect()
     assert [name for name in read_back(tmp_path / "x.rrd") if not name.startswith("/__")] == []
 

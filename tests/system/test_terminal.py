@@ -9,7 +9,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import termios
 from collections.abc import Callable
 from dataclasses import fields
@@ -148,28 +147,6 @@ def test_the_docs_name_every_field(tmp_path: Path) -> None:
     assert progress.keys() - in_status == {"kind", "vehicles", "faults_acting"}
     kinds = {line["kind"] for line in lines} | {"error"}
     assert kinds <= fields_in_the_docs("## JSON for machines")
-
-
-def test_the_mistakes_of_the_docs_are_answered_so(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(ROOT)
-    examples = re.findall(r"^\$ vnet (.*)\n(vnet: .*\n)", DOCS, re.MULTILINE)
-    assert len(examples) == 2
-    for command, said in examples:
-        assert run_app(app, command.split()) == 2
-        assert capsys.readouterr().err == said
-
-
-def test_the_shell_command_of_the_docs_works(tmp_path: Path) -> None:
-    (code,) = re.findall(r"```sh\n(.*?)```", DOCS, re.DOTALL)
-    (tmp_path / "vnet").write_text(f'#!/bin/sh\nexec {sys.executable} -P -m emulator.cli "$@"\n')
-    (tmp_path / "vnet").chmod(0o755)
-    (tmp_path / "scenarios").symlink_to(ROOT / "scenarios")
-    environment = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-    told = subprocess.run(["sh", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert re.fullmatch(r"valid \d+\n", told.stdout), told.stderr
-    assert json.loads((tmp_path / "progress.jsonl").read_text().splitlines()[-1])["kind"] == "ended"
 
 
 def test_json_of_a_run_that_is_had_twice_is_that_of_one(vnet: Vnet) -> None:
