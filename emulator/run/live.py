@@ -146,6 +146,7 @@ class LiveRun:
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
         self._returning: set[str] = set()  # nodes whose processes faults have ended, or who have left
+        self._connected: set[str] = set()  # nodes whose processes are connected
         self._going: set[asyncio.Task[None]] = set()  # what sees them off (real time)
         self._expected: set[str] = set()  # leads of processes that were started anew (real time)
         self._paused: set[str] = set()
@@ -187,8 +188,12 @@ class LiveRun:
         while self._incoming and not self._over:
             node, item = self._incoming.popleft()
             if isinstance(item, bool):
-                if not item:
+                if item:
+                    self._connected.add(node)
+                else:
+                    self._connected.discard(node)
                     self._token_lost(node)
+                    self._changed.set()
                 continue
             if isinstance(item, zenoh.Query):
                 self._answer(node, item)
@@ -595,12 +600,15 @@ class LiveRun:
         """Tell everybody that it is over, hear last words, and see every process off."""
         for node in self._members.joined:
             self._link.send(node, wire.End(None, "the run is over"))
+        deadline = time.monotonic() + FAREWELL_S
         if isinstance(self._pacing, RealTime):
-            deadline = time.monotonic() + FAREWELL_S
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
             await asyncio.gather(*self._going)
+        if not self._options.launch:  # who closes at once may take the last words along
+            while self._connected and await self._change(deadline - time.monotonic()):
+                pass
         self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
