@@ -155,13 +155,19 @@ def link_states(period: Period) -> tuple[NDArray[np.intp], NDArray[np.intp], NDA
     A link is `delivered` if a frame got through; else its state is what befell most of them.
     """
     pairs = period.pairs
-    rank = np.where(pairs[:, 2] == Outcome.delivered, np.iinfo(np.int32).max, pairs[:, 3])
-    order = np.lexsort((-rank, pairs[:, 1], pairs[:, 0]))
-    pairs = pairs[order]
-    first = np.ones(len(pairs), dtype=bool)
-    first[1:] = (pairs[1:, :2] != pairs[:-1, :2]).any(axis=1)
-    chosen = pairs[first]
-    return chosen[:, 0].astype(np.intp), chosen[:, 1].astype(np.intp), chosen[:, 2]
+    if not len(pairs):
+        return np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.int32)
+    link = pairs[:, 0].astype(np.intp) * len(period.node_ids) + pairs[:, 1]
+    order = np.argsort(link, kind="stable")  # as a rule they come so
+    pairs, link = pairs[order], link[order]
+    rank = np.where(pairs[:, 2] == Outcome.delivered, _FIRST, pairs[:, 3])
+    starts = np.flatnonzero(np.diff(link, prepend=-1))
+    best = np.maximum.reduceat(rank * len(Outcome) + pairs[:, 2], starts)
+    return link[starts] // len(period.node_ids), link[starts] % len(period.node_ids), best % len(Outcome)
+
+
+_FIRST = np.int64(1) << 40
+"""More than there are frames."""
 
 
 def ellipses(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Floats:
@@ -217,6 +223,7 @@ class Canvas:
         self._points: dict[str, _Rows] = defaultdict(_Rows)
         self._strips: dict[str, _Rows] = defaultdict(_Rows)
         self._plots: dict[str, tuple[list[int], list[float]]] = {}
+        self._bars: dict[str, Floats] = {}
 
     def at(self, time_ns: int) -> None:
         """What is drawn from now on belongs to this emulated time."""
@@ -317,6 +324,17 @@ class Canvas:
         times.extend(times_ns)
         numbers.extend(values)
 
+    def bars(self, entity: str, values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> None:
+        """A bar chart with bars of `width` around `middles`, which are only told when they change."""
+        where, heights = np.asarray(middles, dtype=np.float32), np.asarray(values, dtype=np.float32)
+        told = self._bars.get(entity)
+        if told is None or not np.array_equal(told, where):
+            self._bars[entity] = where
+            widths = np.full(len(where), width, dtype=np.float32)
+            self.log(entity, rr.BarChart(heights, color=colour, abscissa=where, widths=widths))
+        else:
+            self.log(entity, rr.BarChart.from_fields(values=heights))
+
     def send(self) -> None:
         """Send what has been kept."""
         for entity, rows in self._points.items():
@@ -365,14 +383,3 @@ def in_length(length_m: float) -> str:
 def flipped(position: ArrayLike) -> Floats:
     """East, north as Rerun's x right, y down."""
     return np.asarray(position, dtype=np.float32) * np.array([1, -1], dtype=np.float32)
-
-
-def bars(values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> rr.BarChart:
-    """A bar chart with bars of `width` around `middles`."""
-    heights = np.asarray(values, dtype=np.float32)
-    return rr.BarChart(
-        heights,
-        color=colour,
-        abscissa=np.asarray(middles, dtype=np.float32),
-        widths=np.full(len(heights), width, dtype=np.float32),
-    )

@@ -36,7 +36,7 @@ from emulator.observe.observation import unpack
 from emulator.observe.paper_values import paper_rmse
 
 LANE_HALF_LENGTH_M = 250.0
-ELLIPSES_EVERY_S = 0.5
+ELLIPSES_EVERY_S = 1.0
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""

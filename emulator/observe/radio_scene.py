@@ -20,7 +20,6 @@ from emulator.observe.drawing import (
     Canvas,
     Floats,
     Period,
-    bars,
     outcome_title,
 )
 from emulator.observe.observation import LATENCY_BIN_NS
@@ -114,10 +113,10 @@ class RadioScene:
         latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
         self._latency_bins = max(self._latency_bins, int(np.flatnonzero(latency).max(initial=0)) + 2)
         latency = latency[: self._latency_bins]
-        canvas.log("radio/latency", bars(latency, (np.arange(len(latency)) + 0.5) * width_ms, width_ms, SKY))
+        canvas.bars("radio/latency", latency, (np.arange(len(latency)) + 0.5) * width_ms, width_ms, SKY)
         for side, name, window, colour in ((-1, "sent", self._sent, SKY), (1, "received", self._received, GREEN)):
             rate = window.total / span_s / 1e3
-            canvas.log(f"radio/bytes/{name}", bars(rate, np.arange(self._count) + 0.2 * side, 0.4, colour))
+            canvas.bars(f"radio/bytes/{name}", rate, np.arange(self._count) + 0.2 * side, 0.4, colour)
         if self._count <= LARGEST_MATRIX:
             self._links(period)
 
@@ -133,8 +132,7 @@ class RadioScene:
         distance_m = np.nan_to_num(distance_m)
         farthest_m = self._range_m or float(distance_m[tried > 0].max(initial=1.0))
         shares, middles_m, width_m = delivery_by_distance(distance_m, tried, delivered, farthest_m)
-        chart = bars(100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
-        self._canvas.log("radio/distance", chart)
+        self._canvas.bars("radio/distance", 100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
 
 
 def delivery_by_distance(

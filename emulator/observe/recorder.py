@@ -1,8 +1,8 @@
 """A Rerun recording of a run, from what the emulator tells observers.
 
-Few batched entities: one for all vehicles, one for all links, one for all particles. Clouds and matrices come once
-a second, lines against time twice. `blueprints` says how it is laid out; lengths are in metres, times in emulated
-seconds, east is right and north is up.
+Few batched entities: one for all vehicles, one for all links, one for all particles. What is drawn is sent once a
+second. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
+north is up.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from emulator.observe.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.observe.vehicle_scene import VehicleScene
 from vnet.errors import VnetError
 
-DRAWN_EVERY_S = 0.5
-"""Periods are drawn some at a time: five take hardly longer than two that come apart."""
+DRAWN_EVERY_S = 1.0
+"""Periods are drawn some at a time: ten take hardly longer than three that come apart."""
 NAMED = 8
 
 

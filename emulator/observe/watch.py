@@ -8,6 +8,7 @@ the file is closed cleanly.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import sys
@@ -111,6 +112,7 @@ def _record_all(inbox: Inbox, recorder: Recorder) -> None:
             recorder.take(stream, message)
             if stream == "scene":
                 patience_s = _patience_s(message)
+                gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         if recorder.missed > said:
             _say(f"{recorder.missed - said} periods were left out: the recording could not keep up")
             said = recorder.missed
