@@ -24,7 +24,7 @@ class Places:
         self._moves = moves
         self._period_ns = period_ns
         self._range_m = range_m
-        self._links = links
+        self.links = links
 
     def index(self, time_ns: Whole) -> Whole:
         """Which of the K positions count at these instants."""
@@ -51,7 +51,7 @@ class Places:
     def in_range(self, index: int) -> Mask:
         """(N, N), rows are senders: who is in range of whom."""
         distance_m = self.distance_m(index)
-        in_range = distance_m <= self._range_m if self._links is None else self._links.T & np.isfinite(distance_m)
+        in_range = distance_m <= self._range_m if self.links is None else self.links.T & np.isfinite(distance_m)
         np.fill_diagonal(in_range, False)
         return np.asarray(in_range)
 
@@ -67,10 +67,10 @@ class Places:
     def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Mask:
         """Which pairs of vehicles are in range at these instants; none where that is not known."""
         distance_m = self.pair_distances_m(sender, receiver, time_ns)
-        if self._links is None:
+        if self.links is None:
             near = distance_m <= self._range_m
         else:
-            near = self._links[receiver, sender] & np.isfinite(distance_m)
+            near = self.links[receiver, sender] & np.isfinite(distance_m)
         return np.asarray(near & (sender != receiver))
 
     @cached_property
@@ -92,6 +92,11 @@ class Places:
     def senders_in_range(self, index: int) -> NDArray[np.intp]:
         """(N,), how many each receiver has in range."""
         return np.asarray(self._degrees[1][min(index, len(self._position_m) - 1)])
+
+    def mean_senders_in_range(self) -> Array:
+        """(N,), how many each receiver has in range, in the mean over the time in which it is there."""
+        there = self.present().sum(axis=0)
+        return np.asarray(self._degrees[1].sum(axis=0) / np.maximum(there, 1))
 
     @property
     def most_in_range(self) -> int:

@@ -27,33 +27,33 @@ def check_replay(folder: Path) -> Finding:
     if not (again / "verdict.json").exists():
         return ONCE
     try:
-        tables = [(name, _read(folder, name), _read(again, name)) for name in TABLES]
+        return compare(read_tables(folder, again))
     except (OSError, pa.ArrowInvalid) as error:
         raise VnetError(f"{again}: not the folder of a finished run: {error}") from None
-    return compare(tables)
 
 
-def _read(folder: Path, name: str) -> pa.Table:
-    return pq.read_table(folder / f"{name}.parquet")
+def read_tables(first: Path, second: Path) -> list[tuple[str, pa.Table, pa.Table]]:
+    """The tables (name, first, second) of two runs. Raises OSError and ArrowException."""
+    return [(name, *(pq.read_table(folder / f"{name}.parquet") for folder in (first, second))) for name in TABLES]
 
 
-def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
-    """Compare tables (name, first, second) of two runs; the first difference is shown."""
+def compare(tables: list[tuple[str, pa.Table, pa.Table]], names: tuple[str, str] = ("first", "again")) -> Finding:
+    """Compare tables (name, first, second) of two runs; the first difference is shown, with the runs' `names`."""
     for name, first, second in tables:
         place = first_difference(first, second)
         if place is not None:
-            return _difference(name, first, second, place)
+            return _difference(name, first, second, place, names)
     text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
     return result("replay", 0, text, "", rows_each=len(tables[0][1]))
 
 
-def _difference(name: str, first: pa.Table, second: pa.Table, place: int) -> Finding:
+def _difference(name: str, first: pa.Table, second: pa.Table, place: int, names: tuple[str, str]) -> Finding:
     ours, theirs = _row(first, place), _row(second, place)
     differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
     how = ", ".join(differing) if ours and theirs else "one has no such row"
     shown = [
         {"run": run, "row": place, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
-        for run, row in (("first", ours), ("again", theirs))
+        for run, row in zip(names, (ours, theirs), strict=True)
     ]
     text = f"two runs differ, first in row {place} of the {name}: {how}"
     return result("replay", 1, "", text, shown, table=name, row=place, differing=differing)
