@@ -22,6 +22,7 @@ import typer
 from rich.console import Console
 
 from emulator.experiments.cli import app as experiment_app
+from emulator.export_cli import export, radio
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
@@ -70,6 +71,8 @@ app.add_typer(fault_app, name="fault", rich_help_panel=Panel.LIVE)
 app.command(rich_help_panel=Panel.AFTER)(view)
 app.command(rich_help_panel=Panel.AFTER)(render)
 app.command(rich_help_panel=Panel.AFTER)(play)
+app.command(rich_help_panel=Panel.AFTER)(radio)
+app.command(rich_help_panel=Panel.AFTER)(export)
 app.command(rich_help_panel=Panel.AFTER)(report)
 app.command(rich_help_panel=Panel.AFTER)(compare)
 

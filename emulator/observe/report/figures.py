@@ -268,7 +268,10 @@ def links(source: Source) -> Drawing:
     used = np.flatnonzero(rows)
     delivered = np.bincount(link, weights=evidence.outcome_is("delivered"), minlength=count * count)
     share = 100 * delivered[used] / rows[used]
-    distance_km = evidence.distance_m.reshape(-1)[used] / 1000
+    apart_m = evidence.places.pair_distances_m(evidence.sender, evidence.receiver, evidence.sent_ns)
+    known = np.isfinite(apart_m)
+    total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
+    distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
     made = canvas("distance (km)", "delivered (%)", legend_rows=1)
     if len(used) <= MOST_LINKS:
         dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
@@ -336,7 +339,7 @@ def degrees(source: Source) -> Drawing:
     evidence = source.evidence
     if not evidence.node_ids:
         raise VnetError("no period was completed, so nobody's position is known")
-    degree = evidence.in_range.sum(axis=0)
+    degree = evidence.places.mean_senders_in_range()
     step = int(np.ceil((degree.max() + 1) / 40))
     edges = np.arange(0, degree.max() + step + 1, step) - 0.5
     counts, _ = np.histogram(degree, edges)
@@ -351,8 +354,12 @@ def degrees(source: Source) -> Drawing:
     whole_numbers(made.axes)
     legend(made)
     radio = source.scenario.radio
-    parts = int(components(evidence.positions(), radio.range_m, evidence.links).max()) + 1
     how = f"within {radio.range_m / 1000:g} km" if radio.links is None else "by the scenario's links"
+    if evidence.moves:
+        return Drawing(
+            made, f"How many vehicles each can hear, {how}, in the mean over the time in which it is there."
+        )
+    parts = int(components(evidence.places.position_m(0), radio.range_m, evidence.places.links).max()) + 1
     network = "one connected network" if parts == 1 else f"{parts} networks that do not hear each other"
     return Drawing(made, f"How many vehicles each can hear, {how}: {network}.")
 
