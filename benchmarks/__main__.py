@@ -27,7 +27,18 @@ def vnet(command: str, scenario: str, *options: str, watch: Callable[[int], None
     """Run a vnet command; returns its verdict and events, and the whole wall-clock time as `total_s`."""
     with tempfile.TemporaryDirectory(prefix="vnet-bench-") as folder:
         out = Path(folder) / "run"
-        arguments = [sys.executable, "-P", "-m", "emulator.cli", command, scenario, "--out", str(out), *options]
+        arguments = [
+            sys.executable,
+            "-P",
+            "-m",
+            "emulator.cli",
+            command,
+            scenario,
+            "--out",
+            str(out),
+            "--no-report",
+            *options,
+        ]
         started = time.monotonic()
         process = subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         watcher = threading.Thread(target=watch or (lambda pid: None), args=(process.pid,))

@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, report, compare and others.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -22,6 +22,7 @@ import typer
 from rich.console import Console
 
 from emulator.experiments.cli import app as experiment_app
+from emulator.export_cli import export, radio
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
@@ -29,6 +30,7 @@ from emulator.observe.run_folder import RunFolder
 from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
 from emulator.playback_cli import play, render
+from emulator.report_cli import ReportOption, compare, report, report_at_end
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
@@ -69,6 +71,10 @@ app.add_typer(fault_app, name="fault", rich_help_panel=Panel.LIVE)
 app.command(rich_help_panel=Panel.AFTER)(view)
 app.command(rich_help_panel=Panel.AFTER)(render)
 app.command(rich_help_panel=Panel.AFTER)(play)
+app.command(rich_help_panel=Panel.AFTER)(radio)
+app.command(rich_help_panel=Panel.AFTER)(export)
+app.command(rich_help_panel=Panel.AFTER)(report)
+app.command(rich_help_panel=Panel.AFTER)(compare)
 
 
 class Pacing(StrEnum):
@@ -140,6 +146,7 @@ class Asked:
     log_format: LogFormat
     quiet: bool
     check_determinism: bool = False
+    report: bool = True
 
 
 @app.command(rich_help_panel=Panel.RUNS)
@@ -156,6 +163,7 @@ def run(
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    report: ReportOption = True,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
@@ -178,7 +186,7 @@ def run(
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
-            asked = Asked(log_format, quiet, check_determinism)
+            asked = Asked(log_format, quiet, check_determinism, report)
             _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
 
 
@@ -195,6 +203,7 @@ def simulate(
     check_determinism: DeterminismOption = False,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
@@ -210,7 +219,7 @@ def simulate(
                 if sinks is not None:
                     _record_here(emulation, sinks, stack)
                 wall_s, interrupted = run_simulation(emulation)
-            asked = Asked(log_format, quiet, check_determinism)
+            asked = Asked(log_format, quiet, check_determinism, report)
             _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
 
 
@@ -257,6 +266,7 @@ def emulator(
     rerun_vehicle: RerunVehicleOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
     with one_line_errors(log_format):
@@ -273,7 +283,7 @@ def emulator(
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         options = LiveOptions(users, listen, connect, launch=False, record=sinks)
         where = f"credentials of the agents: {access}/credentials/NODE.json"
-        _run_live(loaded, world, folder, options, Asked(log_format, quiet), where)
+        _run_live(loaded, world, folder, options, Asked(log_format, quiet, report=report), where)
 
 
 app.command(rich_help_panel=Panel.LIVE)(status)
@@ -487,7 +497,9 @@ def _finish(
     elif asked.quiet:
         print(f"verdict: {judgement.verdict}  {folder}")
     else:
-        print_summary(judgement, verdict, folder, Console())
+        print_summary(judgement, verdict, folder, Console(), asked.report)
+    if asked.report:
+        report_at_end(folder)
     raise typer.Exit(status)
 
 

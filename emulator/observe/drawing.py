@@ -118,8 +118,9 @@ class Period:
 
     @cached_property
     def down(self) -> list[str]:
-        """The vehicles that are not."""
-        return [node for node, up in zip(self.node_ids, self.up, strict=True) if not up]
+        """The vehicles that are not, though they are in the network."""
+        there = np.isfinite(self.points("position_m")[:, 0])
+        return [node for node, down in zip(self.node_ids, there & ~self.up, strict=True) if down]
 
     @cached_property
     def truth_m(self) -> Floats:

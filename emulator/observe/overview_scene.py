@@ -57,7 +57,8 @@ class OverviewScene:
     def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
         self._canvas = canvas
         self._node_ids: list[str] = scene["node_ids"]
-        self._limit = Limit(scene) if len(self._node_ids) <= LIMIT_VEHICLES else None
+        few, lanes = len(self._node_ids) <= LIMIT_VEHICLES, len(scene["lane_heading_rad"]) > 0
+        self._limit = Limit(scene) if few and lanes and not scene["moves"] else None
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
@@ -77,7 +78,7 @@ class OverviewScene:
         canvas.strip_style("map/lanes", (*GREY, 120), 1.0, -30.0)
         canvas.strips("map/lanes", lanes, static=True)
         self._set_styles()
-        draw_scale(canvas, point)
+        draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas)
         canvas.rings("common", COMMON_RINGS_M)
         canvas.rings("position", POSITION_RINGS_M)
@@ -132,8 +133,9 @@ class OverviewScene:
         common = period.points("common_error_estimate_m") - truth
         canvas.points("common/estimates", common)
         self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
-        for node in period.down:
-            self._clouds.pop(node, None)
+        for node, up in zip(self._node_ids, period.up, strict=True):
+            if not up:
+                self._clouds.pop(node, None)
         if period.time_s >= self._next_ellipses_s:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
             outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
@@ -233,8 +235,9 @@ def describe(scene: Mapping[str, Any]) -> str:
     count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
     fusion = program["options"].get("fusion")
     reach = "radio by given links" if scene["range_m"] is None else f"radio {scene['range_m']:g} m"
+    at_first = " at first" if scene["moves"] else ""
     parts = [
-        f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}",
+        f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}{at_first}",
         program["entry"].removesuffix(":main") + (f" ({fusion})" if fusion else ""),
         f"{reach}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
         f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",

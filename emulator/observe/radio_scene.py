@@ -128,6 +128,8 @@ class RadioScene:
         self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))
         position = period.points("position_m").astype(float)
         distance_m = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
+        tried = np.where(np.isfinite(distance_m), tried, 0)  # who has left is nowhere
+        distance_m = np.nan_to_num(distance_m)
         farthest_m = self._range_m or float(distance_m[tried > 0].max(initial=1.0))
         shares, middles_m, width_m = delivery_by_distance(distance_m, tried, delivered, farthest_m)
         self._canvas.bars("radio/distance", 100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)

@@ -85,7 +85,7 @@ def run_again(
     Returns the new contents of verdict.json.
     """
     path = emulation.folder.path
-    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN), *options]
+    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN), "--no-report", *options]
     # A process of its own: nothing that a program has left in this one may help it to agree with itself.
     done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
     finding: Finding = check_replay(path)

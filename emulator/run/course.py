@@ -47,11 +47,11 @@ class Snapshot:
     """How a run gets on.
 
     `phase` is "starting", "joining" (`missing` are the vehicles that are awaited, `join_timeout_s` how long),
-    "running" or "judging". Seconds are emulated ones, but for `remaining_s`, `idle_s` (since a period last ended),
-    `wall_s` (since the command began) and `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts
-    pairs of a frame and a receiver so far, `frames_per_s` those of the last emulated second. Figures are those of
-    the last period, and None where programs report nothing of the kind; `over_time` has their means in `BINS` equal
-    parts of the run.
+    "running" or "judging"; `absent` are those that have not entered yet, or have left. Seconds are emulated ones,
+    but for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and
+    `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts pairs of a frame and a receiver so far,
+    `frames_per_s` those of the last emulated second. Figures are those of the last period, and None where programs
+    report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run.
     """
 
     run: str
@@ -78,6 +78,7 @@ class Snapshot:
     faults: tuple[FaultState, ...]
     events: tuple[Event, ...]
     emulator_memory_mb: float | None
+    absent: tuple[str, ...] = ()
 
     def never_reported(self, figure: str) -> bool:
         """Whether no program has reported anything of this kind yet."""
@@ -146,7 +147,8 @@ class Course:
             node_ids=emulation.world.node_ids,
             phase=self._phase,
             missing=self._missing,
-            down=tuple(node for node, up in emulation.up.items() if not up),
+            down=tuple(node for node, up in emulation.up.items() if not up and not emulation.has_left(node)),
+            absent=tuple(node for node in emulation.world.node_ids if emulation.has_left(node)),
             emulated_s=now_ns / NS_PER_S,
             duration_s=emulation.duration_ns / NS_PER_S,
             join_timeout_s=run.join_timeout_s,

@@ -184,13 +184,15 @@ class _Rows:
         return [[Segment("missing".ljust(self._label), DIM), Segment(named)]]
 
     def vehicles(self, rows: int) -> list[Line]:
-        """A dot a vehicle, and the names of those who are down."""
+        """A dot a vehicle, fainter for those that are not there, and the names of those who are down."""
         shot = self._shot
         away = shot.missing or shot.down
         strip = self._strip(shot.node_ids, set(away))
         if shot.phase == "joining":
             return [self._row("vehicles", strip, [])]
-        words = [Segment(f"{len(shot.node_ids) - len(away)} up", BOLD)]
+        words = [Segment(f"{len(shot.node_ids) - len(away) - len(shot.absent)} up", BOLD)]
+        if shot.absent:
+            words.append(Segment(f"  {len(shot.absent)} not there", DIM))
         if away:
             words.append(Segment(f"  {len(away)} down: ", BAD))
             room = self._width - self._label - self._axis - 2 - sum(segment.cell_length for segment in words)
@@ -201,8 +203,16 @@ class _Rows:
         """Where there are more vehicles than room, one dot stands for several, and is hollow if any is away."""
         dots = min(len(node_ids), self._axis)
         hollow = DIM if self._shot.phase == "joining" else RED
+        absent = set(self._shot.absent)
         parts = (node_ids[n * len(node_ids) // dots : (n + 1) * len(node_ids) // dots] for n in range(dots))
-        return _joined(("○", hollow) if any(node in away for node in part) else ("●", GREEN) for part in parts)
+        return _joined(
+            ("○", hollow)
+            if any(node in away for node in part)
+            else ("·", DIM)
+            if all(node in absent for node in part)
+            else ("●", GREEN)
+            for part in parts
+        )
 
     def common_error(self, rows: int) -> list[Line]:
         """RMSE of the common error."""

@@ -136,7 +136,8 @@ class LiveRun:
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
         self._realtime = emulation.scenario.run.pacing == "realtime"
-        self._members = Membership(emulation.world.node_ids)
+        later = [node for node, up in emulation.up.items() if not up]
+        self._members = Membership(emulation.world.node_ids, later, emulation.world.has_traffic)
         self._pacing: Lockstep | RealTime | None = None
         self._origin_ns = 0
         self._incoming: deque[tuple[str, bytes | bool | zenoh.Query]] = deque()
@@ -144,7 +145,9 @@ class LiveRun:
         self._over = False
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
-        self._returning: set[str] = set()  # nodes whose processes faults have ended
+        self._returning: set[str] = set()  # nodes whose processes faults have ended, or who have left
+        self._connected: set[str] = set()  # nodes whose processes are connected
+        self._going: set[asyncio.Task[None]] = set()  # what sees them off (real time)
         self._expected: set[str] = set()  # leads of processes that were started anew (real time)
         self._paused: set[str] = set()
         self._restarting = False
@@ -185,8 +188,12 @@ class LiveRun:
         while self._incoming and not self._over:
             node, item = self._incoming.popleft()
             if isinstance(item, bool):
-                if not item:
+                if item:
+                    self._connected.add(node)
+                else:
+                    self._connected.discard(node)
                     self._token_lost(node)
+                    self._changed.set()
                 continue
             if isinstance(item, zenoh.Query):
                 self._answer(node, item)
@@ -283,6 +290,9 @@ class LiveRun:
             self._process_dead(name, how=how.how, log_tail=how.log_tail)
 
     def _token_lost(self, node: str) -> None:
+        if node in self._members.later:
+            self._members.expect([node])
+            return
         away = self._restarting or node in self._returning
         if away or node not in self._members.joined or node in self._launcher.pids:
             return
@@ -340,6 +350,7 @@ class LiveRun:
         run = self._emulation.scenario.run
         node_ids = self._emulation.world.node_ids
         groups = split_into_processes(node_ids, run.nodes_per_process)
+        groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
         endpoint = self._link.endpoint
         deadline = time.monotonic() + run.join_timeout_s
         if self._options.record is not None:
@@ -349,7 +360,7 @@ class LiveRun:
             for nodes in groups:
                 self._launch(nodes)
         else:
-            on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
+            on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
         missing: list[str] = []
         while self._members.missing or not self._recorder_listens():
             if missing != self._members.missing:
@@ -467,13 +478,23 @@ class LiveRun:
             self._launcher.kill(lead)
             return
         self._stand_still(self._paused - {lead})  # or it could not go
-        self._link.send(lead, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
+        reason = "it has left" if self._emulation.has_left(lead) else "restarted by a fault"
+        self._link.send(lead, wire.End(None, "killed by a fault" if killed else reason))
         if self._options.launch:
-            await asyncio.to_thread(self._launcher.see_off, lead, FAREWELL_S)
+            going = asyncio.create_task(asyncio.to_thread(self._launcher.let_go(lead), FAREWELL_S))
+            if self._realtime:  # nobody waits for it
+                self._going.add(going)
+                going.add_done_callback(self._going.discard)
+            else:
+                await going
 
     def _begin_process(self, lead: str) -> None:
         nodes = self._members.nodes_with(lead)
-        self._members.expect(nodes)
+        if lead in self._members.later:
+            if self._members.enter(lead):
+                return
+        else:
+            self._members.expect(nodes)
         if self._options.launch:
             self._launch(nodes)
 
@@ -579,11 +600,15 @@ class LiveRun:
         """Tell everybody that it is over, hear last words, and see every process off."""
         for node in self._members.joined:
             self._link.send(node, wire.End(None, "the run is over"))
+        deadline = time.monotonic() + FAREWELL_S
         if isinstance(self._pacing, RealTime):
-            deadline = time.monotonic() + FAREWELL_S
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
+            await asyncio.gather(*self._going)
+        if not self._options.launch:  # who closes at once may take the last words along
+            while self._connected and await self._change(deadline - time.monotonic()):
+                pass
         self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from msgspec.structs import replace
+
 from emulator.run.emulation import Emulation, ProcessActions
 from emulator.run.pacing import Lockstep
 from vnet.link import wire
@@ -78,6 +80,7 @@ class _Simulation:
         self._seq = 0
         self.interrupted = False
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
+        welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._host = Host(welcomes, lambda: self.loop.now_ns)

@@ -19,7 +19,7 @@ import emulator.cli
 from tests.docs.markdown import ROOT
 
 APPS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "run", "check", "analyze", "access")
+HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
 APART = ("campaign",)
 """Commands of vnet that are run in a process of their own, as they start some themselves."""
@@ -47,6 +47,7 @@ NOT_RUN = {
     "scp": "needs another host",
     "ssh": "needs another host",
     "source": "the shell's own",
+    "tshark": "a program of its own",
     "zenohd": "a program of its own",
 }
 """Why these other programs are not run."""
