@@ -20,7 +20,10 @@ LONGEST_S = 86_400.0
 
 
 class Selector(Section):
-    """Which nodes: all, unless one of these says otherwise."""
+    """Which nodes: all, unless one of these says otherwise.
+
+    Where vehicles stand their first position counts; where they move, docs/motion.md says which.
+    """
 
     ids: tuple[str, ...] | None = None
     """Those with these names."""
@@ -29,11 +32,16 @@ class Selector(Section):
     random: Annotated[int, Field(ge=1)] | None = None
     """So many of all, drawn from the run's seed."""
     disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
-    """Those whose first position is in a disc: x, y and radius in m."""
+    """Those whose position is in a disc: x, y and radius in m."""
     polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
-    """Those whose first position is in a polygon: its corners, [x, y] in m."""
+    """Those whose position is in a polygon: its corners, [x, y] in m."""
     degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
     """Those with so many others in range: least and most."""
+
+    @property
+    def by_place(self) -> bool:
+        """Whether it depends on where vehicles are."""
+        return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
 
     @model_validator(mode="after")
     def _at_most_one(self) -> Selector:

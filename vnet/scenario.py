@@ -12,14 +12,15 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import ScenarioError, did_you_mean, printable, shown
 from vnet.faults import Fault
 from vnet.sections import Section, first_problem
+from vnet.sumo import input_files
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
 
 NS_PER_S = 1_000_000_000
@@ -30,6 +31,13 @@ FAR_M = 1e9
 WILD_M = 1e5
 """No standard deviation is larger, so that fixes stay near enough for frames to say."""
 MANY = 1_000_000_000
+FAR_S = 1e11
+"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
+"""Keys of `[network]` for vehicles that move."""
+NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
+MOST_NAMED = 8
+"""Files that a message names."""
 
 
 class Run(Section):
@@ -58,23 +66,47 @@ class Run(Section):
 
 
 class Network(Section):
-    """`[network]`: which vehicles there are and where, either generated or from a CSV file."""
+    """`[network]`: which vehicles there are and where they are, or how they drive."""
 
-    kind: Literal["generated", "file"] = "generated"
-    """`file` reads `path`; `generated` draws `vehicles` in a `layout`."""
+    kind: Literal["generated", "file", "trips", "sumo"] = "generated"
+    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive, and
+    `sumo` has SUMO drive."""
     path: Path | None = None
-    """CSV file with the columns id, x_m, y_m (east, north), heading_rad; relative to the scenario file."""
+    """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
+    CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
     vehicles: int = Field(38, ge=1, le=10_000)
     """How many are generated; they are called v01, v02, …"""
     layout: Literal["urban", "dense"] = "urban"
     """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
     seed: int = Field(1, ge=0, lt=2**63)
-    """Draws the generated network, and nothing of the run."""
+    """Draws the generated network, or SUMO's traffic, and nothing of the run."""
+    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
+    max_vehicles: int | None = Field(None, ge=1, le=10_000)
+    """Trips: no more than so many vehicles, those that enter first."""
+    disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
+    """Trips: vehicles are there only within this disc, x, y, radius in m."""
+    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
+        None
+    )
+    """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
+    fastest_mps: float = Field(70.0, gt=0, le=1000)
+    """Trips: what is faster is a jump."""
+    longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
+    """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave."""
+        return self.kind in ("trips", "sumo")
 
     @model_validator(mode="after")
-    def _path_goes_with_file(self) -> Network:
-        if (self.kind == "file") != (self.path is not None):
-            raise ValueError('path is required with kind = "file", and only then')
+    def _keys_go_with_their_kind(self) -> Network:
+        if (self.kind != "generated") != (self.path is not None):
+            raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
+        given = [name for name in OF_TRIPS if getattr(self, name) is not None]
+        if given and not self.moves:
+            raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         return self
 
 
@@ -250,7 +282,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     try:
         data = read_toml(path)
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
     recorded_digests = data.pop("inputs", {})
@@ -272,6 +304,17 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     return scenario
 
 
+def _instead(path: Path) -> str:
+    """What may have been meant by a path that is no file."""
+    try:
+        inside = sorted(each.name for each in path.glob("*.toml"))
+        if inside:
+            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+        return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
+    except (OSError, ValueError):
+        return ""
+
+
 def dump_scenario(scenario: Scenario) -> str:
     """The scenario as TOML with every default spelled out and the digests of its input files."""
     data = scenario.model_dump(mode="json", exclude_none=True)
@@ -280,8 +323,10 @@ def dump_scenario(scenario: Scenario) -> str:
 
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path."""
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
     paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
+    if scenario.network.kind == "sumo" and scenario.network.path is not None:
+        paths += input_files(scenario.network.path)
     return {str(path): _sha256(path) for path in paths}
 
 

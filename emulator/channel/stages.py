@@ -77,8 +77,9 @@ Stage = Callable[[Frame, Pairs], None]
 class Topology:
     """Who is in range of whom, and whom each receiver's peer cap admits; rows are senders.
 
-    Recomputed only when vehicles move or go up or down. Positions are (N, 2) in metres. `links` (N, N), whose rows
-    are receivers, says who is in range of whom in place of `range_m`; distances then only rank the peers.
+    Recomputed only when vehicles move or go up or down. Positions are (N, 2) in metres; NaN where a vehicle is not
+    there. `links` (N, N), whose rows are receivers, says who is in range of whom in place of `range_m`; distances
+    then only rank the peers.
     """
 
     def __init__(
@@ -98,7 +99,10 @@ class Topology:
         """Take new positions."""
         offset_m = position_m[:, None, :] - position_m[None, :, :]
         self.distance_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
-        self.in_range = self.distance_m <= self._range_m if self._links is None else self._links.T.copy()
+        if self._links is None:
+            self.in_range = self.distance_m <= self._range_m
+        else:
+            self.in_range = self._links.T & np.isfinite(self.distance_m)
         np.fill_diagonal(self.in_range, False)
         self._rank()
 

@@ -49,13 +49,19 @@ class LinkFaults:
         """From now on, at `time_ns`, these act and no others."""
         self._cut = [(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None]
         self._short = [(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)]
-        random = {p.number: self._random.get(p.number) or self._begin(p) for p in active if p.links is not None}
+        random = {p.number: self._go_on(p) for p in active if p.links is not None}
         self._random = random
         self._losing = _of(random, Loss, BurstLoss)
         self._delaying = _of(random, Delay, Jitter, Reorder)
         self._copying = _of(random, Duplicate)
         self._corrupting = _of(random, Corrupt)
         self._queue.throttle(self._throttled(active))
+
+    def _go_on(self, planned: PlannedFault) -> _Random:
+        """What has been drawn for a fault so far, acting from now on where it says."""
+        one = self._random.get(planned.number) or self._begin(planned)
+        one.planned = planned
+        return one
 
     def _begin(self, planned: PlannedFault) -> _Random:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, BurstLoss) else (0, 0), dtype=bool)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from emulator.world.world import Instant
 from vnet.link.node import Report
@@ -79,7 +80,7 @@ class PeriodFigures:
     stacked_deviation_m: float | None
     """As `deviation_m`, right after fusion, before the map."""
     component_rmse_m: list[float | None]
-    """`common_error_rmse_m` of each connected component of the network."""
+    """`common_error_rmse_m` of each connected component of the network: where vehicles move, of the period's."""
     component_deviation_m: list[float | None]
     """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
@@ -97,7 +98,7 @@ class PeriodFigures:
 
 
 class Metrics:
-    """Collects reports and truth. `component` (N,) labels each node's connected component."""
+    """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if not there."""
 
     def __init__(self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int) -> None:
         self._number = {node: number for number, node in enumerate(node_ids)}
@@ -108,8 +109,15 @@ class Metrics:
         self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
         self._packed: list[pa.Table] = []
 
-    def record(self, instant: Instant, reports: Sequence[Report]) -> PeriodFigures:
-        """Take the last report of each node in one period; returns the period's figures."""
+    def record(
+        self, instant: Instant, reports: Sequence[Report], component: NDArray[np.intp] | None = None
+    ) -> PeriodFigures:
+        """Take the last report of each node in one period; returns the period's figures.
+
+        Where vehicles move, `component` is that of the period.
+        """
+        if component is not None:
+            self._component = component
         last = {report.node: report for report in reports}
         estimate = collect(self._number, last, lambda r: r.estimate_m, 2)
         covariance = collect(self._number, last, lambda r: r.covariance_m2, 4)
@@ -261,6 +269,12 @@ def _anees(error: Array, covariance: Array) -> float | None:
         return None
     error, matrix = error[regular], matrix[regular]
     return float(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(matrix), error)) / 2)
+
+
+def anees_band(samples: int) -> tuple[float, float]:
+    """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
+    low, high = chi2.ppf([0.025, 0.975], 2 * samples) / (2 * samples)
+    return float(low), float(high)
 
 
 def _is_not_finite(report: Report) -> bool:

@@ -53,8 +53,9 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
     """What does not change during a run, but for the faults in `scenario` that are planned while it is on.
 
     `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`), `range_m` (None where the scenario gives links, and the
-    range says nothing about who hears whom), `component` (int16, n) of the network that each vehicle belongs to,
-    and the resolved scenario as TOML.
+    range says nothing about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at
+    first (-1: it is not there yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during
+    the run, whether they move, and the resolved scenario as TOML.
     """
     start = world.at(0)
     label = components(start.position_m, scenario.radio.range_m, world.links)
@@ -66,6 +67,8 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
         "range_m": scenario.radio.range_m if scenario.radio.links is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),
+        "area_m": pack([np.nanmin(world.course_m, axis=(0, 1)), np.nanmax(world.course_m, axis=(0, 1))]),
+        "moves": world.moves,
         "period_ns": world.period_ns,
         "duration_ns": scenario.duration_ns,
         "scenario": dump_scenario(scenario),

@@ -67,9 +67,10 @@ class _Playback:
         yield "end", {"events": list(map(event_message, events[-1]))}
 
     def _periods(self, events: Sequence[Sequence[Event]]) -> Iterator[Message]:
-        # Who was up, and which faults there are, is told by the events and the first positions.
+        # Who was up, and which faults there are, is told by the events and the positions.
         nothing = pa.table({})
-        evidence = Evidence(self.scenario, nothing, self.states.first(), nothing, self.events)
+        course_m = self.world.course_m if self.world.moves else None
+        evidence = Evidence(self.scenario, nothing, self.states.first(), nothing, self.events, course_m)
         down = _Down(evidence)
         states = self.states.periods()
         for figures, happened in zip(self.figures, events, strict=False):

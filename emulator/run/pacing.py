@@ -75,7 +75,8 @@ class Lockstep:
         self._emulation = emulation
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
         self._lead = {node: nodes[0] for nodes in processes for node in nodes}
-        self._processes = {nodes[0]: _Process(nodes) for nodes in processes}
+        there = [nodes for nodes in processes if hosts_all or any(emulation.up[node] for node in nodes)]
+        self._processes = {nodes[0]: _Process(nodes) for nodes in there}
         self._hosts_all = hosts_all
         self._actions: list[ProcessActions] = []
         self._woken: set[str] = set()
@@ -86,7 +87,7 @@ class Lockstep:
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
-        if self._emulation.next_fault_ns() == 0:
+        if self._emulation.next_change_ns() == 0:
             self._act(0)
         if first := [lead for lead, process in self._processes.items() if process.running]:
             return self._grant(first)
@@ -133,12 +134,12 @@ class Lockstep:
         while True:
             wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
-            fault_ns = emulation.next_fault_ns()
-            if self._hold(next_ns if fault_ns is None else min(next_ns, fault_ns)):
+            change_ns = emulation.next_change_ns()
+            if self._hold(next_ns if change_ns is None else min(next_ns, change_ns)):
                 return {}
-            if fault_ns is None or fault_ns > next_ns or fault_ns >= emulation.duration_ns:
+            if change_ns is None or change_ns > next_ns or change_ns >= emulation.duration_ns:
                 break
-            self._act(fault_ns)
+            self._act(change_ns)
         if next_ns >= emulation.duration_ns:
             emulation.finish(emulation.duration_ns)
             return {}
@@ -258,8 +259,8 @@ class RealTime:
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
-        self._present = set(self._nodes)
-        self._awaited = set(self._nodes)
+        self._present = {lead for lead, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)}
+        self._awaited = set(self._present)
         self._paused: set[str] = set()
         self._was_paused: set[str] = set()
         self._actions: list[ProcessActions] = []
@@ -272,16 +273,16 @@ class RealTime:
         self.gaps = 0
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
-        """The batches that start every process; time 0 is `origin_ns` on the machine's monotonic clock."""
+        """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
         self._origin_ns = origin_ns
-        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes}
+        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes if lead in self._present}
 
     def next_time_ns(self) -> int | None:
         """When `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
             self._emulation.fix_time_ns(self._next_period),
-            self._emulation.next_fault_ns(),
+            self._emulation.next_change_ns(),
         ]
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return min(due) if due else None
@@ -320,9 +321,9 @@ class RealTime:
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """What has become due by `now_ns`, by process."""
-        while (fault_ns := self._emulation.next_fault_ns()) is not None and fault_ns <= now_ns:
-            self._collect(fault_ns - 1)
-            self._act(fault_ns)
+        while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
+            self._collect(change_ns - 1)
+            self._act(change_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
         return {
