@@ -65,6 +65,9 @@ class Run(Section):
     """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
 
 
+OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
+
+
 class Network(Section):
     """`[network]`: which vehicles there are and where they are, or how they drive."""
 
@@ -86,9 +89,7 @@ class Network(Section):
     """Trips: no more than so many vehicles, those that enter first."""
     disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
     """Trips: vehicles are there only within this disc, x, y, radius in m."""
-    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
-        None
-    )
+    origin_deg: OriginDeg | None = None
     """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
     fastest_mps: float = Field(70.0, gt=0, le=1000)
     """Trips: what is faster is a jump."""
@@ -108,6 +109,21 @@ class Network(Section):
         if given and not self.moves:
             raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         return self
+
+
+class Map(Section):
+    """`[map]`: the roads on which vehicles drive, as programs know them. Without it programs of trips know no road."""
+
+    path: Path
+    """Relative to the scenario file: OpenStreetMap's XML or PBF, SUMO's `.net.xml`, GeoJSON or NPZ."""
+    drive_on: Literal["right", "left"] = "right"
+    """On which side of the road people drive."""
+    origin_deg: OriginDeg | None = None
+    """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips' own."""
+    sigma_m: float = Field(0.0, ge=0, le=WILD_M)
+    """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
+    margin_m: float = Field(300.0, ge=0, le=FAR_M)
+    """Programs are given the roads within so much of the box in which vehicles drive."""
 
 
 class CommonError(Section):
@@ -241,6 +257,8 @@ class Scenario(Section):
 
     run: Run = Run()
     network: Network = Network()
+    map: Map | None = None
+    """The roads on which vehicles drive, if programs are to know them."""
     world: WorldSection = WorldSection()
     radio: Radio = Radio()
     program: Program = Program()
@@ -255,6 +273,12 @@ class Scenario(Section):
                     f"fault.{number}.at_s = {fault.at_s:g}: must be less than {self.healed_s:g}, which is "
                     "run.duration_s - run.settle_s"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _roads_are_for_those_who_drive(self) -> Scenario:
+        if self.map is not None and not self.network.moves:
+            raise ValueError(f'map goes with vehicles that drive, not with network.kind = "{self.network.kind}"')
         return self
 
     @property
@@ -324,7 +348,8 @@ def dump_scenario(scenario: Scenario) -> str:
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
     """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
-    paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
+    read = scenario.network.path, scenario.radio.links, scenario.map and scenario.map.path
+    paths = [path for path in read if isinstance(path, Path)]
     if scenario.network.kind == "sumo" and scenario.network.path is not None:
         paths += input_files(scenario.network.path)
     return {str(path): _sha256(path) for path in paths}
@@ -343,7 +368,10 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     if isinstance(radio.links, Path):
         path = _absolute(radio.links, "radio.links", scenario_path)
         radio = radio.model_copy(update={"links": path})
-    return scenario.model_copy(update={"network": network, "radio": radio})
+    roads = scenario.map
+    if roads is not None:
+        roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
+    return scenario.model_copy(update={"network": network, "radio": radio, "map": roads})
 
 
 def _absolute(given: Path, key: str, scenario_path: Path) -> Path:

@@ -52,7 +52,7 @@ def unpack_pairs(message: Mapping[str, Any]) -> NDArray[np.int32]:
 def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
     """What does not change during a run, but for the faults in `scenario` that are planned while it is on.
 
-    `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`), `range_m` (None where the scenario gives links, and the
+    `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`), `range_m` (None where the scenario gives links, and the
     range says nothing about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at
     first (-1: it is not there yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during
     the run, whether they move, and the resolved scenario as TOML.
@@ -64,6 +64,7 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
         "node_ids": list(world.node_ids),
         "lane_point_m": pack(world.lane_map.point_m),
         "lane_heading_rad": pack(world.lane_map.heading_rad),
+        "lane_length_m": pack(world.lane_map.length_m),
         "range_m": scenario.radio.range_m if scenario.radio.links is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),

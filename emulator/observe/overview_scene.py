@@ -73,8 +73,11 @@ class OverviewScene:
         canvas = self._canvas
         canvas.log("about", rr.TextDocument(describe(scene), media_type=rr.MediaType.MARKDOWN), static=True)
         point, heading = unpack(scene["lane_point_m"], 2), unpack(scene["lane_heading_rad"])[:, 0]
-        along = LANE_HALF_LENGTH_M * np.column_stack([np.cos(heading), np.sin(heading)])
-        lanes = np.stack([point - along, point + along], axis=1)
+        length = unpack(scene["lane_length_m"])[:, 0]
+        endless = np.isinf(length)
+        ahead, behind = np.where(endless, LANE_HALF_LENGTH_M, length), np.where(endless, LANE_HALF_LENGTH_M, 0)
+        along = np.column_stack([np.cos(heading), np.sin(heading)])
+        lanes = np.stack([point - behind[:, None] * along, point + ahead[:, None] * along], axis=1)
         canvas.strip_style("map/lanes", (*GREY, 120), 1.0, -30.0)
         canvas.strips("map/lanes", lanes, static=True)
         self._set_styles()

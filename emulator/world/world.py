@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from emulator.world.links import load_links
+from emulator.world.maps.around import read_lanes
 from emulator.world.networks import Network, generate_network, load_network
 from emulator.world.trips.drive import drive
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
 from vnet.link.node import Fix
 from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.road_map import RoadMap
 from vnet.scenario import NS_PER_S, Gnss, Scenario
 
 
@@ -57,7 +59,9 @@ class World:
     Raises ScenarioError if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 
-    def __init__(self, scenario: Scenario, motion: Motion, lane_map: LaneMap, lane_of: NDArray[np.intp]) -> None:
+    def __init__(
+        self, scenario: Scenario, motion: Motion, lane_map: LaneMap | RoadMap, lane_of: NDArray[np.intp]
+    ) -> None:
         seed = scenario.run.seed
         count = len(motion.node_ids)
         self.node_ids = motion.node_ids
@@ -174,10 +178,12 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
 
 
 def _drive_trips(scenario: Scenario) -> World:
-    """A world in which vehicles drive their trips; where there are lanes, nobody says."""
+    """A world in which vehicles drive their trips; programs know the roads of `[map]`, if there is one."""
     motion = drive(scenario.network, periods_of(scenario), scenario.period_ns)
-    nowhere = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
-    return World(scenario, motion, nowhere, np.zeros(0, dtype=np.intp))
+    lanes: LaneMap | RoadMap = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
+    if scenario.map is not None:
+        lanes = read_lanes(scenario.map, motion.position_m, motion.origin_deg)
+    return World(scenario, motion, lanes, np.zeros(0, dtype=np.intp))
 
 
 def _check_exceptions(scenario: Scenario, node_ids: tuple[str, ...]) -> None:

@@ -8,15 +8,27 @@ with h the half-width left to a vehicle's centre. Near the lane Φ comes from a 
 fifth of the filter's time: log P is off by less than 2·10⁻⁶ for s up to 10 m, and mostly by 10⁻⁹. Far from the
 lane it is exact, in the log domain, so that it neither underflows nor cancels: a filter whose particles all score
 exactly 0 has lost its way for good.
+
+On the map of a city a vehicle has several candidates, `MOST_LANES` at most, which are sought anew as it drives: the
+lanes near where it is believed to be that fit its heading. They are hypotheses that exclude each other, so their
+probabilities add up; that it is off every road, on a parking lot or on a road that the map does not have, is one
+more:
+
+    L = log[ Σ P(on lane) + o / (1 − o) · Σ h / b ]
+
+with o the share of vehicles off the road, and those anywhere within ± b of a road, against ± h of a lane.
 """
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.road_map import RoadMap
 
 FAR_SIGMAS = 5.0
 """Beyond this many deviations outside the lane, the difference of two Φ would lose its digits."""
@@ -27,6 +39,11 @@ STEPS, REACH = 128, 9
 A table of finer steps drops out of the processor's cache between two steps of the filter, and is then no faster
 than the exact Φ.
 """
+
+MOST_LANES = 4
+"""A vehicle of a city has so many candidates at most: the nearest."""
+OFF_ROAD_WITHIN_M = 15.0
+"""Vehicles off the road are anywhere within this of one: parking lots are no deeper, as a rule."""
 
 OFF_MAP_M = 30.0
 """A vehicle further from every lane that fits is not on this map: its road says nothing about the common error."""
@@ -104,3 +121,122 @@ def candidate_lanes(
         return found
     nearest = int(np.argmin(np.where(fits, offset, np.inf)))
     return np.array([nearest] if offset[nearest] <= OFF_MAP_M else [], dtype=np.intp)
+
+
+Rows = NDArray[np.intp]
+
+
+class Matcher(Protocol):
+    """What a filter asks of a map: which lanes a vehicle may be on, and how likely it is to be on one.
+
+    `drives` says whether vehicles drive, so that their lanes are sought anew; `heading_rad` are the lanes'.
+    """
+
+    drives: bool
+    heading_rad: Array
+
+    def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
+        """Lanes within gates (m,) of (m, 2) that fit headings (m,), NaN if unknown: rows and lanes, by row."""
+        ...
+
+    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+        """log P(on a road) of `count` vehicles, (count, K); `row` (E,) and `lane` (E,) are their candidates, by row.
+
+        Positions (E, 2, K) and covariances (E, 2, 2) are the vehicles' of each candidate. Without a candidate: 0.
+        """
+        ...
+
+
+class StraightLanes:
+    """Matches vehicles that stand to straight lanes (`LaneMap`): each keeps the candidates of its first fix.
+
+    `one_sided` lanes are bounded on their right only; no lane says less than `least_log_road`.
+    """
+
+    drives = False
+
+    def __init__(self, lanes: LaneMap, one_sided: bool, least_log_road: float) -> None:
+        self.heading_rad = lanes.heading_rad
+        self._lanes = lanes
+        self._normal, self._offset_m = lanes.normal, lanes.offset_m
+        self._score = log_left_of_edge if one_sided else log_on_lane
+        self._least = least_log_road
+
+    def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
+        """See `Matcher`."""
+        headings = [None if np.isnan(heading) else heading for heading in heading_rad.tolist()]
+        found = [
+            candidate_lanes(self._lanes, *vehicle)
+            for vehicle in zip(position_m, headings, gate_m.tolist(), strict=True)
+        ]
+        row = np.repeat(np.arange(len(found)), [len(lanes) for lanes in found])
+        return row, np.concatenate([*found, np.empty(0, dtype=np.intp)])
+
+    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+        """See `Matcher`."""
+        offset_m, sigma_m = _across(self._normal[lane], self._offset_m[lane], position_m, covariance_m2)
+        score = self._score(offset_m, sigma_m, self._lanes.half_width_m)
+        if self._least > -np.inf:
+            np.maximum(score, self._least, out=score)
+        if len(row) == count and np.array_equal(row, np.arange(count)):
+            return score
+        return _by_row(np.logaddexp, score, row, count)
+
+
+class CityRoads:
+    """Matches vehicles that drive to the map of a city (`RoadMap`); `off_road` is the share of those on no road."""
+
+    drives = True
+
+    def __init__(self, roads: RoadMap, off_road: float) -> None:
+        self.heading_rad = roads.heading_rad
+        self._roads = roads
+        self._off_road = off_road / (1 - off_road) / OFF_ROAD_WITHIN_M
+
+    def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
+        """See `Matcher`; of each lane only its nearest segment, as if it went on."""
+        row, segment, _ = self._roads.near(position_m, heading_rad, gate_m)
+        number = row * len(self._roads) + self._roads.lane[segment]
+        _, first = np.unique(number, return_index=True)  # the nearest: they come by row, and then by distance
+        first.sort()
+        row, segment = row[first], segment[first]
+        place = np.arange(len(row)) - np.searchsorted(row, row)
+        return row[place < MOST_LANES], segment[place < MOST_LANES]
+
+    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+        """See `Matcher`."""
+        roads = self._roads
+        offset_m, sigma_m = _across(roads.normal[lane], roads.offset_m[lane], position_m, covariance_m2)
+        if roads.sigma_m:
+            sigma_m = np.hypot(sigma_m, roads.sigma_m)
+        half_width_m = roads.half_width_m[lane][:, None]
+        inside = normal_cdf((half_width_m - offset_m) / sigma_m)
+        inside -= normal_cdf((-half_width_m - offset_m) / sigma_m)
+        inside += self._off_road * half_width_m
+        np.maximum(inside, 1e-300, out=inside)
+        return np.log(_by_row(np.add, inside, row, count, 1.0))
+
+
+def matcher(lanes: LaneMap | RoadMap, one_sided: bool, least_log_road: float, off_road: float) -> Matcher:
+    """What matches vehicles to a map of this kind."""
+    if isinstance(lanes, RoadMap):
+        return CityRoads(lanes, off_road)
+    return StraightLanes(lanes, one_sided, least_log_road)
+
+
+def _across(normal: Array, offset_m: Array, position_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
+    """Signed offsets (E, K) from lanes with normals (E, 2) and n·p (E,), and their deviations (E, 1)."""
+    normal = normal[:, None, :]
+    offset = (normal @ position_m)[:, 0]
+    offset -= offset_m[:, None]
+    across = (normal @ covariance_m2 @ normal.transpose(0, 2, 1))[:, 0, 0]
+    return offset, np.sqrt(across)[:, None]
+
+
+def _by_row(add: np.ufunc, score: Array, row: Rows, count: int, nothing: float = 0.0) -> Array:
+    """Scores (E, K) added up by row (E,), (count, K); `nothing` where a row has none."""
+    result = np.full((count, score.shape[1]), nothing)
+    if len(row):
+        first = np.flatnonzero(np.diff(row, prepend=-1))  # entries of a row stand together
+        result[row[first]] = add.reduceat(score, first, axis=0)
+    return result

@@ -17,15 +17,16 @@ road is its *change*, log w += L_t − (1 − ρ) L_{t−1}: the latest look rep
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.map_matching import candidate_lanes, log_left_of_edge, log_on_lane
+from vnet.cmm.map_matching import matcher
 from vnet.errors import VnetError
 from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.road_map import RoadMap
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class RbpfConfig:
     cloud starts, else around 0 with `common_sigma_m`. The paper's: `one_sided` lanes are bounded on the right only;
     with `roads_apart` a step does not look at roads, `weigh_roads` does. `least_log_road`: no road says
     less of a vehicle, so that one whose fixes are false moves the cloud by no more (a truncated likelihood).
+
+    On the map of a city: `off_road` is the share of vehicles on no road, and vehicles drive, with accelerations of
+    `driving_m2_s4` along and across their heading, and `driving_m_s`, a deviation, when first seen. Their offset
+    in the lane changes not with time, `lateral_tau_s`, but over `lateral_m` of road.
     """
 
     particles: int = 200
@@ -56,6 +61,10 @@ class RbpfConfig:
     one_sided: bool = False
     roads_apart: bool = False
     least_log_road: float = -np.inf
+    off_road: float = 0.05
+    driving_m2_s4: tuple[float, float] = (16.0, 4.0)
+    driving_m_s: float = 15.0
+    lateral_m: float = 200.0
 
     def __post_init__(self) -> None:
         if self.particles < 1:
@@ -75,11 +84,12 @@ class Observation:
 class Rbpf:
     """The filter's state: hypotheses `common_m` (2, K), `log_weight` (K,), and the tracked vehicles."""
 
-    def __init__(self, config: RbpfConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
+    def __init__(self, config: RbpfConfig, lanes: LaneMap | RoadMap, rng: np.random.Generator) -> None:
         self.config = config
-        self._lanes = lanes
-        self._normal, self._offset_m = lanes.normal, lanes.offset_m
+        self._roads = matcher(lanes, config.one_sided, config.least_log_road, config.off_road)
         self._rng = rng
+        straight_m2_s4 = config.acceleration_m2_s4, 0.01 * config.acceleration_m2_s4
+        self._white_m2_s4 = config.driving_m2_s4 if self._roads.drives else straight_m2_s4
         self._starting_s = START_S if config.start_sigma_m is None else 0.0
         count = config.particles * (START_FACTOR if self._starting_s else 1)
         sigma_m = config.common_sigma_m if config.start_sigma_m is None else config.start_sigma_m
@@ -92,6 +102,9 @@ class Rbpf:
         self._age_s = np.empty(0)  # how far each vehicle's filter is behind
         self._unseen_s = np.empty(0)
         self._unlooked_s = np.empty(0)  # since a road was looked at for its sake; inf for never
+        self._heading_rad = np.empty(0)  # as each vehicle's latest fix says; NaN if it does not
+        self._anchor_m = np.empty((0, 2))  # where its lateral offset was new evidence the last time, and on a lane
+        self._anchor_rad = np.empty(0)  # of which heading
         self._lane_vehicle = np.empty(0, dtype=np.intp)  # one entry a (vehicle, candidate lane)
         self._lane = np.empty(0, dtype=np.intp)
         self._log_road = np.zeros((0, count))  # L at each vehicle's latest fix
@@ -186,6 +199,8 @@ class Rbpf:
         covariance -= gain @ gain.transpose(0, 2, 1)
         off = off.reshape(-1, off.shape[2])
         self.log_weight -= 0.5 * np.einsum("ik,ik->k", off, off)
+        if self._roads.drives:
+            self._turn(rows, fixes)
         if whole:
             self.mean = mean
         else:
@@ -193,6 +208,13 @@ class Rbpf:
         self.covariance[rows] = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         self._age_s[rows] = age_s
         self._unseen_s[rows[kept]] = age_s[kept]
+
+    def _turn(self, rows: NDArray[np.intp], fixes: Iterable[Observation]) -> None:
+        """Vehicles that drive accelerate along the heading of their latest fix."""
+        for row, fix in zip(rows.tolist(), fixes, strict=True):
+            if fix.heading_rad is not None:
+                self._heading_rad[row] = fix.heading_rad
+                self._acceleration[row] = np.tile(_acceleration(fix.heading_rad, self._white_m2_s4), (2, 2))
 
     def _common_at(self, age_s: Array) -> Array:
         """The particles' c of so long ago: (2, K) if that is now for all, else (m, 2, K)."""
@@ -222,22 +244,27 @@ class Rbpf:
         mean[0, :2] = observation.position_m[:, None] - self._common_at(np.array([observation.age_s]))
         covariance = np.zeros((1, 4, 4))
         covariance[0, :2, :2] = observation.covariance_m2
-        covariance[0, 2:, 2:] = np.eye(2) * REST_SPEED_M_S**2
+        speed_m_s = self.config.driving_m_s if self._roads.drives else REST_SPEED_M_S
+        covariance[0, 2:, 2:] = np.eye(2) * speed_m_s**2
         expected_m = observation.position_m - self.estimate_m
         gate_m = 3 * float(np.sqrt(np.trace(self.estimate_covariance_m2) + np.trace(observation.covariance_m2)))
-        lanes = candidate_lanes(self._lanes, expected_m, observation.heading_rad, gate_m)
         heading = observation.heading_rad
-        if heading is None and len(lanes):
-            heading = float(self._lanes.heading_rad[lanes[0]])
+        heading_rad = np.array([np.nan if heading is None else heading])
+        _, lanes = self._roads.seek(expected_m[None], heading_rad, np.array([gate_m]))
+        if heading is None and len(lanes) and not self._roads.drives:
+            heading = float(self._roads.heading_rad[lanes[0]])
         row = len(self.vehicles)
         self.vehicles.append(name)
         self.mean = np.concatenate([self.mean, mean])
         self.covariance = np.concatenate([self.covariance, covariance])
-        acceleration = _acceleration(heading, self.config.acceleration_m2_s4)
+        acceleration = _acceleration(heading, self._white_m2_s4)
         self._acceleration = np.concatenate([self._acceleration, np.tile(acceleration, (1, 2, 2))])
         self._age_s = np.append(self._age_s, observation.age_s)
         self._unseen_s = np.append(self._unseen_s, observation.age_s)
         self._unlooked_s = np.append(self._unlooked_s, np.inf)
+        self._heading_rad = np.append(self._heading_rad, heading_rad)
+        self._anchor_m = np.concatenate([self._anchor_m, [[np.nan, np.nan]]])
+        self._anchor_rad = np.append(self._anchor_rad, np.nan)
         self._lane_vehicle = np.append(self._lane_vehicle, np.full(len(lanes), row))
         self._lane = np.append(self._lane, lanes)
         self._log_road = np.concatenate([self._log_road, np.zeros((1, count))])
@@ -251,7 +278,8 @@ class Rbpf:
         self.mean, self.covariance = self.mean[kept], self.covariance[kept]
         self._acceleration = self._acceleration[kept]
         self._age_s, self._unseen_s = self._age_s[kept], self._unseen_s[kept]
-        self._unlooked_s = self._unlooked_s[kept]
+        self._unlooked_s, self._heading_rad = self._unlooked_s[kept], self._heading_rad[kept]
+        self._anchor_m, self._anchor_rad = self._anchor_m[kept], self._anchor_rad[kept]
         self._log_road = self._log_road[kept]
         new_row = np.cumsum(~gone) - 1
         still = ~gone[self._lane_vehicle]
@@ -262,16 +290,54 @@ class Rbpf:
         unlooked_s = self._unlooked_s[rows]
         due = unlooked_s > LOOK_S - SAME_TIME_S
         rows, unlooked_s = rows[due], unlooked_s[due]
+        stays = np.maximum(0.0, 1 - unlooked_s / self.config.lateral_tau_s)
+        if self._roads.drives and len(rows):
+            rows, unlooked_s, stays = self._find_lanes(rows, unlooked_s)
         if not len(rows) or not len(self._lane):
             return
         log_road = self.log_road(self.mean, self.covariance, rows)
-        stays = np.maximum(0.0, 1 - unlooked_s / self.config.lateral_tau_s)
         self._unlooked_s[rows] = LOOK_S / 2 * (np.isinf(unlooked_s) & (rows % 2 == 1))
         self.log_weight += log_road.sum(axis=0) - stays @ self._log_road[rows]
         self._log_road[rows] = log_road
 
+    def _find_lanes(self, rows: NDArray[np.intp], unlooked_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Seek anew the lanes on which vehicles that drive may be.
+
+        Returns the rows that have any, their `unlooked_s`, and how much of each one's evidence so far the new look
+        replaces: all of it where the vehicle stands, because its offset is what it was; less the further it has
+        driven; and nothing once it has turned, because another offset across another road says something else.
+        """
+        place_m = self.mean[rows, :2]
+        middle_m = place_m @ self.weight
+        spread_m = place_m - middle_m[..., None]
+        variance_m2 = ((spread_m * spread_m) @ self.weight).sum(axis=1) + self.covariance[rows, 0, 0]
+        gate_m = np.minimum(3 * np.sqrt(variance_m2 + self.covariance[rows, 1, 1]) + LEAST_GATE_M, MOST_GATE_M)
+        found, lane = self._roads.seek(middle_m, self._heading_rad[rows], gate_m)
+        others = np.ones(len(self.vehicles), dtype=np.bool_)
+        others[rows] = False
+        kept = others[self._lane_vehicle]
+        vehicle = np.concatenate([self._lane_vehicle[kept], rows[found]])
+        order = np.argsort(vehicle, kind="stable")
+        self._lane_vehicle = vehicle[order]
+        self._lane = np.concatenate([self._lane[kept], lane])[order]
+
+        first = np.flatnonzero(np.diff(found, prepend=-1))
+        some = found[first]
+        rows, middle_m = rows[some], middle_m[some]
+        along_rad = self._roads.heading_rad[lane[first]]
+        driven_m = np.hypot(*(middle_m - self._anchor_m[rows]).T)
+        turned = ~(np.cos(along_rad - self._anchor_rad[rows]) > np.cos(TURN_RAD))  # NaN: it is seen for the first time
+        new = np.where(driven_m > STAND_M, driven_m / self.config.lateral_m, 0.0)
+        new[turned] = 1.0
+        anew = rows[new > 0]
+        self._anchor_m[anew] = middle_m[new > 0]
+        self._anchor_rad[rows[turned]] = along_rad[turned]
+        return rows, unlooked_s[some], np.maximum(0.0, 1 - new)
+
     def weigh_roads(self) -> None:
         """Weigh the particles by the roads of all vehicles, and resample: the paper's order, after stacking."""
+        if self._roads.drives and self.vehicles:
+            self._find_lanes(np.arange(len(self.vehicles)), self._unlooked_s)
         self._log_road = self.log_road(self.mean, self.covariance)
         self.log_weight = self.log_weight + self._log_road.sum(axis=0)
         self.resample()
@@ -284,25 +350,9 @@ class Rbpf:
         if rows is None:
             rows = np.arange(len(self.vehicles))
         entry = self._lanes_of(rows)
-        row, lane = self._lane_vehicle[entry], self._lane[entry]
-        normal = self._normal[lane][:, None, :]
-        offset = (normal @ mean[row, :2])[:, 0]
-        offset -= self._offset_m[lane][:, None]
-        across = (normal @ covariance[row, :2, :2] @ normal.transpose(0, 2, 1))[:, 0, 0]
-        sigma_m = np.sqrt(across)[:, None]
-        if self.config.one_sided:
-            score = log_left_of_edge(offset, sigma_m, self._lanes.half_width_m)
-        else:
-            score = log_on_lane(offset, sigma_m, self._lanes.half_width_m)
-        if self.config.least_log_road > -np.inf:
-            np.maximum(score, self.config.least_log_road, out=score)
-        if np.array_equal(row, rows):
-            return score
-        result = np.zeros((len(rows), score.shape[1]))
-        first, end = np.searchsorted(row, rows), np.searchsorted(row, rows, side="right")
-        some = end > first  # entries of a vehicle stand together
-        result[some] = np.logaddexp.reduceat(score, first[some], axis=0)
-        return result
+        vehicle, lane = self._lane_vehicle[entry], self._lane[entry]
+        row = np.searchsorted(rows, vehicle)
+        return self._roads.log_road(mean[vehicle, :2], covariance[vehicle, :2, :2], row, lane, len(rows))
 
     def _lanes_of(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
         """Entries of `_lane` for the vehicles `rows`."""
@@ -454,6 +504,12 @@ START_FACTOR, START_S = 10, 0.45
 COLLAPSED_M2 = 1e-6
 LOOK_S = 0.2
 """How often a road is looked at for a vehicle's sake; which step it is depends on the vehicle."""
+TURN_RAD = 0.5
+"""Who has turned by so much since its offset was new evidence drives on another road."""
+STAND_M = 5.0
+"""Who has not driven so far since then stands, for all that its fixes can tell."""
+LEAST_GATE_M, MOST_GATE_M = 3.0, 25.0
+"""Lanes are sought no nearer, and no further."""
 SAME_TIME_S = 1e-7
 """Times closer than this are the same: they come from whole nanoseconds."""
 
@@ -465,13 +521,14 @@ def systematic(weight: Array, count: int, rng: np.random.Generator) -> NDArray[n
     return np.asarray(np.minimum(index, len(weight) - 1))
 
 
-def _acceleration(heading_rad: float | None, acceleration_m2_s4: float) -> Array:
-    """White acceleration (2, 2): along the lane, and a hundredth of it across."""
+def _acceleration(heading_rad: float | None, white_m2_s4: tuple[float, float]) -> Array:
+    """White acceleration (2, 2), along the heading and across; without a heading the larger in all directions."""
     if heading_rad is None:
-        return np.eye(2) * acceleration_m2_s4
+        return np.eye(2) * white_m2_s4[0]
     along = np.array([np.cos(heading_rad), np.sin(heading_rad)])
     across = np.array([-along[1], along[0]])
-    return np.asarray(acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across)))
+    share = white_m2_s4[1] / white_m2_s4[0]
+    return np.asarray(white_m2_s4[0] * (np.outer(along, along) + share * np.outer(across, across)))
 
 
 def _moving(elapsed_s: Array) -> Array:

@@ -30,6 +30,11 @@ class LaneMap:
         return len(self.heading_rad)
 
     @property
+    def length_m(self) -> Array:
+        """Lengths (L,): straight lanes have no end."""
+        return np.full(len(self), np.inf)
+
+    @property
     def normal(self) -> Array:
         """Unit normals (L, 2), to the right of the direction of travel: (sin θ, -cos θ)."""
         return np.column_stack([np.sin(self.heading_rad), -np.cos(self.heading_rad)])

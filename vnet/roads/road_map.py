@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.lanes import Array
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""
