@@ -21,7 +21,9 @@ def city(seed: int = 0) -> Roads:
     builder = RoadsBuilder("city")
     for street in range(0, steps, PIECES):
         for along in (lambda k, street=street: (k, street), lambda k, street=street: (street, k)):
-            points = [(cell := along(k), tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for k in range(steps)]
+            points = [
+                (cell := along(k), tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for k in range(steps)
+            ]
             builder.add(f"street {street}", points, NUMBER["residential"], (1, 1), 3.0)
     return builder.build(builder.places(), None)
 

@@ -88,7 +88,9 @@ def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
     east, north = report.size_km
     console = Console()
     print(f"{path.name}: {east:.1f} × {north:.1f} km, {report.roads:,} roads, {report.nodes:,} points")
-    print(f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane")
+    print(
+        f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane"
+    )
     if frame is None:
         print("it does not say where on the earth it is")
     else:

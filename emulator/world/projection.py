@@ -1,7 +1,7 @@
 """WGS-84 and the local east-north metres of runs and maps: a transverse Mercator whose zero is a stated origin.
 
-It is conformal, so that headings are kept, and within 50 km of its origin true to scale within 3 in 100 000. Maps in
-another projection (SUMO's) keep it, and say which one it is.
+It is conformal, so that headings are kept, and within 50 km of its origin true to scale within 3 in 100 000. Maps
+in another projection (SUMO's) keep it, and say which one it is.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _LONGEST_PROJ = 1000
 
 @dataclass(frozen=True)
 class Frame:
-    """Where metres are on the earth: they are what the projection `proj` (as PROJ writes it) gives, plus `offset_m`."""
+    """Where metres are on the earth: what the projection `proj` (as PROJ writes it) gives, plus `offset_m`."""
 
     proj: str
     offset_m: tuple[float, float] = (0.0, 0.0)

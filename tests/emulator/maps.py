@@ -1,7 +1,7 @@
 """A little town in every kind of map file, written by code.
 
-Metres are around `ORIGIN`: Main Street from (0, 0) by (200, 0) to (400, 0), primary, and from its middle Side Street,
-one way north to (200, 150), residential.
+Metres are around `ORIGIN`: Main Street from (0, 0) by (200, 0) to (400, 0), primary, and from its middle Side
+Street, one way north to (200, 150), residential.
 """
 
 import json

@@ -249,9 +249,7 @@ def test_no_edge_is_lost_and_none_is_added(tmp_path_factory: Any, edges: list[tu
     x, y = place % 8 * 100.0, place // 8 * 100.0
     np.savez(folder / "town.npz", node_x_m=x, node_y_m=y, edges=np.array(edges))
     roads = read_roads(folder / "town.npz")
-    wanted = {
-        ((int(10 * x[a]), int(10 * y[a])), (int(10 * x[b]), int(10 * y[b]))): 1 for a, b in edges if a != b
-    }
+    wanted = {((int(10 * x[a]), int(10 * y[a])), (int(10 * x[b]), int(10 * y[b]))): 1 for a, b in edges if a != b}
     assert directed(roads) == wanted
     write_roads(roads, folder / "again.npz")
     assert directed(read_roads(folder / "again.npz")) == wanted

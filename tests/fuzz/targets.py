@@ -425,7 +425,9 @@ TARGETS = (  # the slowest first
         (_npz(x_m=np.array([[0.0, 1, 2, 3]]), y_m=np.zeros((1, 4)), rate_hz=2.0),),
     ),
     Target("map OSM", partial(_read_map, "m.osm"), ScenarioError, (_OSM,), (*_XML_WORDS, b"lanes:forward", b"-1")),
-    Target("map SUMO", partial(_read_map, "m.net.xml"), ScenarioError, (_NET,), (*_XML_WORDS, b"1e308,", b"+proj=")),
+    Target(
+        "map SUMO", partial(_read_map, "m.net.xml"), ScenarioError, (_NET,), (*_XML_WORDS, b"1e308,", b"+proj=")
+    ),
     Target("map GeoJSON", partial(_read_map, "m.geojson"), ScenarioError, (_GEOJSON,), _JSON_WORDS),
     Target(
         "map NPZ",

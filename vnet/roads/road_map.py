@@ -121,7 +121,7 @@ class RoadMap:
         return row[new], segment[new], distance_m[new]
 
     def within(self, low_m: Array, high_m: Array) -> RoadMap:
-        """The segments that touch the box from `low_m` (2,) to `high_m` (2,); roads and lanes keep their numbers."""
+        """The segments that touch the box from `low_m` to `high_m` (2,); roads and lanes keep their numbers."""
         end_m = self.point_m + self.length_m[:, None] * self.direction
         kept = touch_box(self.point_m, end_m, low_m, high_m)
         columns: dict[str, Any] = {name: getattr(self, name)[kept] for name in _COLUMNS}
@@ -136,7 +136,7 @@ class RoadMap:
 
     @classmethod
     def from_wire(cls, data: object) -> RoadMap:
-        """Restore a map from `to_wire`, with arrays that cannot be written to. Raises ValueError on anything else."""
+        """Restore a map from `to_wire`; its arrays cannot be written to. Raises ValueError on anything else."""
         if not isinstance(data, dict) or data.keys() != {"tag", *(field.name for field in fields(cls))}:
             raise ValueError("no road map")
         classes, sigma_m = data["classes"], data["sigma_m"]
@@ -185,4 +185,6 @@ def touch_box(start_m: Array, end_m: Array, low_m: Array, high_m: Array) -> NDAr
     # Two convex shapes are apart only if they are along an axis of the box, or across the segment.
     along_axes = (np.abs(centre_m) <= half_m + np.abs(reach_m)).all(axis=1)
     across = np.abs(centre_m[:, 0] * reach_m[:, 1] - centre_m[:, 1] * reach_m[:, 0])
-    return np.asarray(along_axes & (across <= half_m[0] * np.abs(reach_m[:, 1]) + half_m[1] * np.abs(reach_m[:, 0])))
+    return np.asarray(
+        along_axes & (across <= half_m[0] * np.abs(reach_m[:, 1]) + half_m[1] * np.abs(reach_m[:, 0]))
+    )

@@ -1,7 +1,7 @@
 """Maps as lines in GeoJSON (RFC 7946, always WGS-84), read and written.
 
-Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`, `name`; or, without
-`class`, OpenStreetMap's `highway` and its other tags. Features that are no lines are left out and counted.
+Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`, `name`; or,
+without `class`, OpenStreetMap's `highway` and its other tags. Features that are no lines are left out and counted.
 """
 
 from __future__ import annotations
@@ -12,7 +12,16 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from emulator.world.maps.classes import CLASSES, LANE_WIDTH_M, MOST_LANES, NAMES, NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
+from emulator.world.maps.classes import (
+    CLASSES,
+    LANE_WIDTH_M,
+    MOST_LANES,
+    NAMES,
+    NARROWEST_M,
+    NUMBER,
+    UNKNOWN,
+    WIDEST_M,
+)
 from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.tags import Street, street
 from emulator.world.projection import project
@@ -135,7 +144,9 @@ def write_geojson(roads: Roads, path: Path) -> None:
         raise ScenarioError(f"{path}: GeoJSON is in degrees, and nothing says where on the earth this map is")
     degrees: Array = np.column_stack(roads.frame.to_wgs84(roads.node_m)[::-1]).round(_DIGITS)
     if not np.isfinite(degrees).all():
-        raise ScenarioError(f"{path}: GeoJSON is in degrees, and this map's projection does not reach all of its points")
+        raise ScenarioError(
+            f"{path}: GeoJSON is in degrees, and this map's projection does not reach all of its points"
+        )
     lines = np.split(roads.node, roads.first[1:-1])
     features = [
         {

@@ -1,7 +1,7 @@
 """Maps as nodes and directed edges in a NumPy archive (NPZ), read and written.
 
-`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m` and
-`node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an edge:
+`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m`
+and `node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an edge:
 `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
 """
 
@@ -14,8 +14,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.maps.classes import LANE_WIDTH_M, LANES, MOST_LANES, NAMES, NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
 from emulator.world.arrays import read_arrays
+from emulator.world.maps.classes import (
+    LANE_WIDTH_M,
+    LANES,
+    MOST_LANES,
+    NAMES,
+    NARROWEST_M,
+    NUMBER,
+    UNKNOWN,
+    WIDEST_M,
+)
 from emulator.world.maps.roads import MOST_POINTS, Ints, Roads, check_extent
 from emulator.world.networks import FARTHEST_M
 from emulator.world.projection import Frame, project
@@ -134,7 +143,9 @@ def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
         return np.full(count, UNKNOWN)
     names = arrays["edge_class"]
     if names.shape != (count,) or names.dtype.kind != "U":
-        raise ScenarioError(f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}")
+        raise ScenarioError(
+            f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}"
+        )
     distinct, which = np.unique(names, return_inverse=True)
     for at, name in enumerate(distinct.tolist()):
         if name not in NUMBER:
@@ -254,9 +265,9 @@ def write_graph(roads: Roads, path: Path) -> None:
     arrays = {
         "node_x_m": roads.node_m[:, 0],
         "node_y_m": roads.node_m[:, 1],
-        "edges": np.concatenate(
-            [np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]
-        ).astype(np.int32),
+        "edges": np.concatenate([np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]).astype(
+            np.int32
+        ),
         "edge_class": np.array(NAMES)[roads.kind[edge_road]],
         "edge_lanes": np.concatenate([roads.forward[road[ahead]], roads.backward[road[back]]]).astype(np.uint8),
         "edge_lane_width_m": roads.lane_width_m[edge_road],

@@ -49,7 +49,8 @@ def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:
     for node in way.nodes:
         if not node.location.valid():
             raise ScenarioError(
-                f"{path}: {name}: node {node.ref} is not in the file, or not on the earth; cut maps out with whole ways"
+                f"{path}: {name}: node {node.ref} is not in the file, or not on the earth; "
+                "cut maps out with whole ways"
             )
         points.append((node.ref, (node.location.lon, node.location.lat)))
     if found.turned:

@@ -1,7 +1,7 @@
 """Roads: centre lines between shared points, and what is known of each; all readers end here.
 
-From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side on
-which people drive. A road with lanes one way only has its centre line in the middle of them.
+From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side
+on which people drive. A road with lanes one way only has its centre line in the middle of them.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Roads:
 
     Road r runs through the points `node[first[r]:first[r + 1]]` of `node_m` (N, 2), two at least; roads meet where
     they share a point. `name` (R,) is what the file calls them; `kind` (R,) their class, an index into `NAMES`;
-    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame` says
-    where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
+    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame`
+    says where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
     """
 
     node_m: Array
@@ -144,7 +144,7 @@ class Roads:
         )
 
     def _lanes(self, side: float) -> tuple[Ints, Array, NDArray[np.bool_]]:
-        """All lanes: their road, how far right of its centre line as one drives along it, and who goes against it."""
+        """All lanes: their road, how far right of its centre line as it goes, and which go against it."""
         counts = self.forward + self.backward
         road = np.repeat(np.arange(len(self)), counts)
         number = np.arange(len(road)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -240,7 +240,7 @@ class RoadsBuilder:
         return np.array(self._place, dtype=float).reshape(-1, 2)
 
     def build(self, node_m: Array, frame: Frame | None) -> Roads:
-        """The roads, with the points' places in metres (N, 2). Raises ScenarioError without roads or too far apart."""
+        """The roads, with the points' places in metres (N, 2). Raises ScenarioError as `check_extent` does."""
         check_extent(self._source, node_m, len(self._rows))
         return Roads(
             node_m,
