@@ -1,8 +1,8 @@
 """Maps as nodes and directed edges in a NumPy archive (NPZ), read and written.
 
 `edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m`
-and `node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an edge:
-`edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
+and `node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an
+edge: `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """SUMO road networks (.net.xml): the lanes that passenger cars may use, each as a road of its own.
 
 Read by expat as a stream, within bounds. SUMO's own reader (sumolib) knows no lines to name in an error, and
-expands whatever entities a file declares; here a file that declares any is refused. Coordinates stay SUMO's, so that its
-traces fit; its projection, if it states one, becomes the frame.
+expands whatever entities a file declares; here a file that declares any is refused. Coordinates stay SUMO's, so
+that its traces fit; its projection, if it states one, becomes the frame.
 """
 
 from __future__ import annotations
