@@ -1,4 +1,4 @@
-"""`vnet map` and `vnet trips`: looking at maps, converting and generating them, and trips along them."""
+"""`vnet map`: looking at maps, and converting them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from emulator.terminal import one_line_errors
 from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import MapReport, examine
 from emulator.world.maps.roads import Roads
+from emulator.world.projection import Frame
 from vnet.errors import ScenarioError
+from vnet.roads.lanes import Array
 
-app = typer.Typer(no_args_is_help=True, help="Look at maps, convert and generate them.")
+app = typer.Typer(no_args_is_help=True, help="Look at maps, and convert them.")
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="OSM XML or PBF, SUMO .net.xml, GeoJSON or NPZ.")]
 OriginOption = Annotated[
@@ -39,9 +41,10 @@ def show(
         if middle is not None:
             roads = _part(map_file, roads, middle, side_km)
         report = examine(roads)
-        _print(map_file, report)
+        _print(map_file, report, roads.frame)
         if out is not None:
-            _draw(roads, out, f"{map_file.name}: {report.length_km:,.1f} km of road")
+            window = None if middle is None else _box(middle, side_km)
+            _draw(roads, out, f"{map_file.name}: {report.length_km:,.1f} km of road", window)
 
 
 @app.command()
@@ -69,18 +72,30 @@ def _pair(option: str, text: str | None) -> tuple[float, float] | None:
 
 
 def _part(path: Path, roads: Roads, middle_m: tuple[float, float], side_km: float) -> Roads:
-    middle, half_m = np.array(middle_m), side_km * 500
-    part = roads.within(middle - half_m, middle + half_m)
+    part = roads.within(*_box(middle_m, side_km))
     if not len(part):
         raise ScenarioError(f"{path}: no road within {side_km:g} km around --at {middle_m[0]:g},{middle_m[1]:g}")
     return part
 
 
-def _print(path: Path, report: MapReport) -> None:
+def _box(middle_m: tuple[float, float], side_km: float) -> tuple[Array, Array]:
+    """The south-western and the north-eastern corner of a square, in metres."""
+    middle, half_m = np.array(middle_m), side_km * 500
+    return middle - half_m, middle + half_m
+
+
+def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
     east, north = report.size_km
     console = Console()
     print(f"{path.name}: {east:.1f} × {north:.1f} km, {report.roads:,} roads, {report.nodes:,} points")
-    print(f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane")
+    print(
+        f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane"
+    )
+    if frame is None:
+        print("it does not say where on the earth it is")
+    else:
+        latitude, longitude = frame.to_wgs84(np.zeros(2))
+        print(f"its metres start at {latitude:.6f}, {longitude:.6f}")
     table = Table("class", "roads", "km")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -91,11 +106,11 @@ def _print(path: Path, report: MapReport) -> None:
         print(f"{what}: {count}")
 
 
-def _draw(roads: Roads, out: Path, title: str) -> None:
+def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | None) -> None:
     from emulator.world.maps.picture import draw_map  # matplotlib takes a second to import
 
     try:
-        draw_map(roads, out, title)
+        draw_map(roads, out, title, window)
     except (OSError, ValueError) as error:  # a kind of picture that matplotlib does not know is a ValueError
         raise ScenarioError(f"--out {out}: cannot be written: {error}") from None
     print(f"wrote {out}")

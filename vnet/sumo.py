@@ -65,6 +65,6 @@ def _values(path: Path) -> dict[str, str]:
         parser.Parse(read_bounded(path, LARGEST_BYTES), True)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, expat.ExpatError) as error:
+    except (ValueError, LookupError, expat.ExpatError) as error:  # an unknown encoding is a LookupError
         raise ScenarioError(f"{path}: not a SUMO configuration: {error}") from None
     return values

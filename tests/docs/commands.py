@@ -19,7 +19,7 @@ import emulator.cli
 from tests.docs.markdown import ROOT
 
 APPS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare")
+HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
 APART = ("campaign",)
 """Commands of vnet that are run in a process of their own, as they start some themselves."""

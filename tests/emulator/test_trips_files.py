@@ -160,7 +160,7 @@ HEADER = "id,time_s,x_m,y_m\n"
         ("id,time_s,lat_deg,lon_deg\na,0,4682000,271000\n", "row 2: lat_deg = 4.682e+06"),
         (
             "id,time_s,lat_deg,lon_deg\na,0,-83.7,42.3\nb,0,42.3,-83.7\n",
-            "are lat_deg and lon_deg what they should be",
+            "are latitudes and longitudes what they should be",
         ),
         (HEADER + "a,0," + "1" * 5_000_000 + ",2\n", "not a CSV file of trips"),
         (b"\xff\xfe" * 50, "not a CSV file"),

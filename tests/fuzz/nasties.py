@@ -136,6 +136,18 @@ def _json() -> dict[str, bytes]:
     }
 
 
+def _xml() -> dict[str, bytes]:
+    declared = b'<?xml version="1.0" encoding="%s"?>\n%s'
+    roots = (b"net", b"osm", b"fcd-export", b"configuration")
+    nasty = {f"XML in {name.decode()}": declared % (name, b"<net/>") for name in (b"klingon", b"shift_jis", b"base64")}
+    entities = b'<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa">' + b"".join(
+        b'<!ENTITY %c "%s">' % (98 + i, b"&%c;" % (97 + i) * 10) for i in range(9)
+    )
+    nasty |= {f"entities in {root.decode()}": entities + b"]>\n<%s>&j;</%s>" % (root, root) for root in roots}
+    nasty |= {f"{root.decode()} 10⁵ deep": b"<%s>" % root * _DEEP for root in roots}
+    return nasty
+
+
 NASTIES = {
     "empty": b"",
     "NUL": b"\0",
@@ -147,4 +159,5 @@ NASTIES = {
     **_toml(),
     **_csv(),
     **_json(),
+    **_xml(),
 }

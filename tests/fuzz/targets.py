@@ -23,6 +23,7 @@ from emulator.run.control import answer
 from emulator.run.course import Course
 from emulator.run.emulation import Emulation
 from emulator.world.links import load_links
+from emulator.world.maps.files import read_roads
 from emulator.world.networks import load_network
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
@@ -31,6 +32,7 @@ from vnet.faults import KINDS, parse_fault
 from vnet.link import wire
 from vnet.link.access import Access, Credentials
 from vnet.link.node import Report
+from vnet.roads.road_map import RoadMap
 from vnet.scenario import Network, Radio, Scenario, dump_scenario, load_scenario
 from vnet.sumo import input_files, read_begin_s
 
@@ -155,6 +157,13 @@ def _read_trips(name: str, data: bytes) -> None:
     motion = drive(network, 21, 10**8)
     there = np.isfinite(motion.position_m).all(axis=2)
     assert motion.position_m.shape == (21, len(motion.node_ids), 2) and there[:20].any(axis=0).all()
+
+
+def _read_map(name: str, data: bytes) -> None:
+    """A map, as those who use it have it: its lanes."""
+    lanes = read_roads(_file(name, data)).lane_map()
+    assert np.isfinite(lanes.point_m).all() and (lanes.length_m > 0).all()
+    RoadMap.from_wire(lanes.to_wire())
 
 
 def _read_sumo(data: bytes) -> None:
@@ -347,6 +356,16 @@ _XML_WORDS = (
     b"nan",
     b"/>",
 )
+_NET = b"""<net version="1.20"><location netOffset="0,0" projParameter="+proj=utm +zone=17 +datum=WGS84"/>
+<edge id="a" from="1" to="2" type="highway.primary"><lane id="a_0" shape="0,0 9,0 9,5" width="3.5"/></edge></net>
+"""
+_OSM = b"""<osm version="0.6"><node id="1" lat="42.28" lon="-83.74"/><node id="2" lat="42.281" lon="-83.74"/>
+<way id="7"><nd ref="1"/><nd ref="2"/><tag k="highway" v="primary"/><tag k="lanes" v="3"/></way></osm>
+"""
+_GEOJSON = (
+    b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"class": "primary"}, '
+    b'"geometry": {"type": "LineString", "coordinates": [[-83.74, 42.28], [-83.73, 42.28]]}}]}'
+)
 _JSON_WORDS = (
     b'"user"',
     b'"password"',
@@ -404,6 +423,17 @@ TARGETS = (  # the slowest first
         partial(_read_trips, "t.npz"),
         ScenarioError,
         (_npz(x_m=np.array([[0.0, 1, 2, 3]]), y_m=np.zeros((1, 4)), rate_hz=2.0),),
+    ),
+    Target("map OSM", partial(_read_map, "m.osm"), ScenarioError, (_OSM,), (*_XML_WORDS, b"lanes:forward", b"-1")),
+    Target(
+        "map SUMO", partial(_read_map, "m.net.xml"), ScenarioError, (_NET,), (*_XML_WORDS, b"1e308,", b"+proj=")
+    ),
+    Target("map GeoJSON", partial(_read_map, "m.geojson"), ScenarioError, (_GEOJSON,), _JSON_WORDS),
+    Target(
+        "map NPZ",
+        partial(_read_map, "m.npz"),
+        ScenarioError,
+        (_npz(node_x_m=np.array([0.0, 9, 9]), node_y_m=np.zeros(3), edges=np.array([(0, 1), (1, 0)])),),
     ),
     Target("sumocfg", _read_sumo, ScenarioError, (_SUMO,), _XML_WORDS),
     Target("network CSV", _read_network, ScenarioError, (_NETWORK,), _CSV_WORDS),

@@ -6,7 +6,7 @@ A map says nothing about who drives where. Programs get the part of it around th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 
@@ -18,11 +18,25 @@ from vnet.roads.lanes import Array
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""
+MOST_INDEXED = 1_000_000
+"""About so many points besides one a segment are in the index; it is coarser where more would be needed."""
 HEADING_TOLERANCE_RAD = 0.35
 """A lane fits a vehicle whose heading differs by no more than this."""
-_TAG = "roads"
-_COLUMNS = ("point_m", "heading_rad", "length_m", "half_width_m", "kind", "one_way", "road", "lane")
-_KINDS = ("<f8", "<f8", "<f8", "<f8", "|u1", "|b1", "<i4", "<i4")
+TAG = "roads"
+"""What a map's plain form says it is."""
+MOST_CLASSES = 255
+LONGEST_CLASS = 64
+_COLUMNS = {
+    "point_m": "<f8",
+    "heading_rad": "<f8",
+    "length_m": "<f8",
+    "half_width_m": "<f8",
+    "kind": "|u1",
+    "one_way": "|b1",
+    "road": "<i4",
+    "lane": "<i4",
+}
+"""How each column is written into a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +46,7 @@ class RoadMap:
     `point_m` (S, 2) is where a segment begins, `heading_rad` (S,) the direction of travel, `length_m` (S,) > 0;
     `half_width_m` (S,) is how far a vehicle's centre may be from the lane's centre line. `kind` (S,) is the road's
     class, an index into `classes`; `one_way` (S,) whether the road has no lane the other way; `road` and `lane`
-    (S,) number roads and lanes from 0, each lane of a road by a number of its own. `sigma_m` is how far, as a
+    (S,) number roads and lanes, each lane of a road by a number of its own. `sigma_m` is how far, as a
     deviation, true lanes stray from the map's.
     """
 
@@ -65,14 +79,22 @@ class RoadMap:
         """n·p of each centre line (S,), so that the signed offset of a point q is n·q - offset."""
         return np.asarray(np.einsum("ij,ij->i", self.normal, self.point_m))
 
+    def distance_m(self, position_m: Array, segment: NDArray[np.intp]) -> Array:
+        """How far positions (n, 2) are from segments (n,), each from its own: metres (n,)."""
+        from_start_m = position_m - self.point_m[segment]
+        direction = self.direction[segment]
+        along_m = np.clip(np.einsum("ij,ij->i", from_start_m, direction), 0.0, self.length_m[segment])
+        return np.asarray(np.hypot(*(from_start_m - along_m[:, None] * direction).T))
+
     @cached_property
-    def _index(self) -> tuple[cKDTree, NDArray[np.intp]]:
-        """A tree of points on the segments, and whose they are."""
-        pieces = np.maximum(1, np.ceil(self.length_m / INDEX_STEP_M)).astype(np.intp)
+    def _index(self) -> tuple[cKDTree, NDArray[np.intp], float]:
+        """A tree of points on the segments, whose they are, and how far from one a segment's end may be."""
+        step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MOST_INDEXED)
+        pieces = np.maximum(1, np.ceil(self.length_m / step_m)).astype(np.intp)
         whose = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(whose)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along_m = (number + 0.5) / pieces[whose] * self.length_m[whose]
-        return cKDTree(self.point_m[whose] + along_m[:, None] * self.direction[whose]), whose
+        return cKDTree(self.point_m[whose] + along_m[:, None] * self.direction[whose]), whose, step_m / 2
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
@@ -81,16 +103,88 @@ class RoadMap:
 
         Returns pairs of a row and a segment, by row and then by distance, and the distances in metres.
         """
-        tree, whose = self._index
-        radius_m = reach_m + INDEX_STEP_M / 2
-        rows = tree.query_ball_point(position_m, radius_m, return_sorted=False)
+        tree, whose, half_m = self._index
+        rows = tree.query_ball_point(position_m, reach_m + half_m, return_sorted=False)
         count = np.fromiter(map(len, rows), dtype=np.intp, count=len(rows))
         row = np.repeat(np.arange(len(rows)), count)
         segment = whose[np.fromiter((i for found in rows for i in found), dtype=np.intp, count=int(count.sum()))]
         turn = np.abs(np.mod(self.heading_rad[segment] - heading_rad[row] + np.pi, 2 * np.pi) - np.pi)
-        fits = ~(turn > HEADING_TOLERANCE_RAD)
+        fits = ~(turn > HEADING_TOLERANCE_RAD)  # NaN fits
         row, segment = row[fits], segment[fits]
         distance_m = self.distance_m(position_m[row], segment)
+        within = distance_m <= reach_m[row]
+        row, segment, distance_m = row[within], segment[within], distance_m[within]
         order = np.lexsort((segment, distance_m, row))
-        order = order[distance_m[order] <= reach_m[row[order]]]
-        return row[order], segment[order], distance_m[order]
+        row, segment, distance_m = row[order], segment[order], distance_m[order]
+        new = np.ones(len(row), dtype=np.bool_)  # a long segment is found by several of its points
+        new[1:] = (row[1:] != row[:-1]) | (segment[1:] != segment[:-1])
+        return row[new], segment[new], distance_m[new]
+
+    def within(self, low_m: Array, high_m: Array) -> RoadMap:
+        """The segments that touch the box from `low_m` to `high_m` (2,); roads and lanes keep their numbers."""
+        end_m = self.point_m + self.length_m[:, None] * self.direction
+        kept = touch_box(self.point_m, end_m, low_m, high_m)
+        columns: dict[str, Any] = {name: getattr(self, name)[kept] for name in _COLUMNS}
+        return RoadMap(**columns, classes=self.classes, sigma_m=self.sigma_m)
+
+    # Messages.
+
+    def to_wire(self) -> dict[str, Any]:
+        """A plain form for a message; `from_wire` restores it bit by bit."""
+        columns = {name: getattr(self, name).astype(kind).tobytes() for name, kind in _COLUMNS.items()}
+        return {"tag": TAG, "classes": list(self.classes), "sigma_m": self.sigma_m, **columns}
+
+    @classmethod
+    def from_wire(cls, data: object) -> RoadMap:
+        """Restore a map from `to_wire`; its arrays cannot be written to. Raises ValueError on anything else."""
+        if not isinstance(data, dict) or data.keys() != {"tag", *(field.name for field in fields(cls))}:
+            raise ValueError("no road map")
+        classes, sigma_m = data["classes"], data["sigma_m"]
+        if data["tag"] != TAG or not isinstance(classes, list) or len(classes) > MOST_CLASSES:
+            raise ValueError("a road map without its tag or classes")
+        if not all(isinstance(name, str) and len(name) <= LONGEST_CLASS for name in classes):
+            raise ValueError("a road map's classes are no names")
+        if type(sigma_m) is not float or not 0 <= sigma_m < np.inf:
+            raise ValueError(f"sigma_m = {sigma_m!r:.50}: a positive number is needed")
+        columns: dict[str, Any] = {name: _column(name, data[name]) for name in _COLUMNS}
+        columns["point_m"] = columns["point_m"].reshape(-1, 2)
+        roads = cls(**columns, classes=tuple(classes), sigma_m=sigma_m)
+        roads._check()
+        return roads
+
+    def _check(self) -> None:
+        """Raises ValueError where a column is not what the class says."""
+        if any(len(getattr(self, name)) != len(self) for name in _COLUMNS):
+            raise ValueError("columns of a road map differ in length")
+        right = {
+            "point_m": np.isfinite(self.point_m).all(),
+            "heading_rad": ((self.heading_rad >= 0) & (self.heading_rad < 2 * np.pi)).all(),
+            "length_m": ((self.length_m > 0) & (self.length_m < np.inf)).all(),
+            "half_width_m": ((self.half_width_m >= 0) & (self.half_width_m < np.inf)).all(),
+            "kind": (self.kind < len(self.classes)).all(),
+            "one_way": (self.one_way.view(np.uint8) <= 1).all(),
+            "road": (self.road >= 0).all(),
+            "lane": (self.lane >= 0).all(),
+        }
+        for name, is_right in right.items():
+            if not is_right:
+                raise ValueError(f"{name} of a road map: a value that it cannot have")
+
+
+def _column(name: str, data: object) -> NDArray[Any]:
+    kind = np.dtype(_COLUMNS[name])
+    if not isinstance(data, bytes) or len(data) % (kind.itemsize * (2 if name == "point_m" else 1)):
+        raise ValueError(f"{name} of a road map: {kind} as bytes are needed")
+    return np.frombuffer(data, dtype=kind)
+
+
+def touch_box(start_m: Array, end_m: Array, low_m: Array, high_m: Array) -> NDArray[np.bool_]:
+    """Which segments from `start_m` to `end_m` (n, 2) have a point in the box from `low_m` to `high_m` (2,)."""
+    middle_m, half_m = (np.asarray(low_m) + high_m) / 2, (np.asarray(high_m) - low_m) / 2
+    centre_m, reach_m = (start_m + end_m) / 2 - middle_m, (end_m - start_m) / 2
+    # Two convex shapes are apart only if they are along an axis of the box, or across the segment.
+    along_axes = (np.abs(centre_m) <= half_m + np.abs(reach_m)).all(axis=1)
+    across = np.abs(centre_m[:, 0] * reach_m[:, 1] - centre_m[:, 1] * reach_m[:, 0])
+    return np.asarray(
+        along_axes & (across <= half_m[0] * np.abs(reach_m[:, 1]) + half_m[1] * np.abs(reach_m[:, 0]))
+    )

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from emulator.world.maps.frame import Frame
 from emulator.world.maps.geojson import read_geojson, write_geojson
 from emulator.world.maps.graph import read_graph, write_graph
 from emulator.world.maps.osm import read_osm
@@ -16,11 +15,8 @@ from vnet.errors import ScenarioError
 
 _T = TypeVar("_T")
 
-READERS: dict[str, Callable[[Path, Frame | None], Roads]] = {
+READERS: dict[str, Callable[[Path, tuple[float, float] | None], Roads]] = {
     ".osm": read_osm,
-    ".osm.pbf": read_osm,
-    ".osm.gz": read_osm,
-    ".osm.bz2": read_osm,
     ".pbf": read_osm,
     ".net.xml": read_sumo,
     ".geojson": read_geojson,
@@ -32,11 +28,13 @@ WRITERS: dict[str, Callable[[Roads, Path], None]] = {
     ".json": write_geojson,
     ".npz": write_graph,
 }
-LARGEST_BYTES = 2**32
+LARGEST_BYTES = 2**31
 
 
 def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roads:
-    """Read a map. `origin_deg` (latitude, longitude) is where its metres start, else the middle of the map.
+    """Read a map. `origin_deg` (latitude, longitude) is where its metres start.
+
+    Without it they start in the middle of the map, or where a file that is in metres says.
 
     Raises ScenarioError in one line that names the file, and the line or the feature.
     """
@@ -51,7 +49,7 @@ def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roa
         raise ScenarioError(f"{path}: empty")
     if size > LARGEST_BYTES:
         raise ScenarioError(f"{path}: larger than {LARGEST_BYTES} bytes; cut out a part first")
-    return reader(path, None if origin_deg is None else Frame.around(*origin_deg))
+    return reader(path, origin_deg)
 
 
 def write_roads(roads: Roads, path: Path) -> None:

@@ -1,29 +1,38 @@
 """Maps as lines in GeoJSON (RFC 7946, always WGS-84), read and written.
 
-Properties of a line: `class` (or OpenStreetMap's `highway`), `lanes_forward` and `lanes_backward` (or `oneway`),
-`lane_width_m`, `name`. Features that are no lines are left out and counted.
+Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`, `name`; or,
+without `class`, OpenStreetMap's `highway` and its other tags. Features that are no lines are left out and counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from emulator.world.maps.classes import CLASSES, LANE_WIDTH_M, MOST_LANES, NAMES, NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
-from emulator.world.maps.frame import Frame, frame_around
+from emulator.world.maps.classes import (
+    CLASSES,
+    LANE_WIDTH_M,
+    MOST_LANES,
+    NAMES,
+    NARROWEST_M,
+    NUMBER,
+    UNKNOWN,
+    WIDEST_M,
+)
 from emulator.world.maps.roads import Roads, RoadsBuilder
+from emulator.world.maps.tags import Street, street
+from emulator.world.projection import project
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, printable, shown
 from vnet.roads.lanes import Array
 
 LARGEST_BYTES = 512 * 2**20
 _WGS84_NAMES = ("CRS84", "EPSG::4326", "EPSG:4326")
-_DIGITS = 7
-"""Decimals of a degree: a centimetre."""
+_SAME_DIGITS, _DIGITS = 7, 9
+"""Decimals of a degree in which points that are one agree (a centimetre), and that are written (0.1 mm)."""
 
 
 class _Geometry(msgspec.Struct):
@@ -42,8 +51,8 @@ class _Collection(msgspec.Struct):
     crs: Any = None
 
 
-def read_geojson(path: Path, frame: Frame | None) -> Roads:
-    """Read roads; the frame is around their middle unless given. Raises ScenarioError that names the feature.
+def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
+    """Read roads; the origin is their middle unless given. Raises ScenarioError that names the feature.
 
     Points that are equal to seven decimals are one, so that roads meet where their lines do.
     """
@@ -63,8 +72,8 @@ def read_geojson(path: Path, frame: Frame | None) -> Roads:
     degrees = builder.places()
     if not len(degrees):
         raise ScenarioError(f"{path}: no lines among {len(collection.features)} features")
-    frame = frame or frame_around(degrees[:, 1], degrees[:, 0])
-    return builder.build(frame.to_local(degrees[:, 1], degrees[:, 0]), frame)
+    frame, node_m = project(path, degrees[:, 1], degrees[:, 0], origin_deg)
+    return builder.build(node_m, frame)
 
 
 def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Feature) -> None:
@@ -73,56 +82,60 @@ def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Featu
     if geometry is None or geometry.type not in ("LineString", "MultiLineString"):
         builder.note("features that are no lines")
         return
-    name = properties.get("class", properties.get("highway", "road"))
-    kind = NUMBER.get(name) if isinstance(name, str) else None
-    if kind is None and "class" in properties:
-        raise ScenarioError(f"{where}: class = {shown(name)}: allowed are {', '.join(NAMES)}")
-    if kind is None:
+    if "highway" in properties and "class" not in properties:
+        found = street({key: str(value).lower() for key, value in properties.items()})
+    else:
+        found = _own_street(where, properties)
+    if found is None:
         builder.note("ways not for cars")
         return
-    lanes = _lanes(where, properties, kind)
-    width_m = properties.get("lane_width_m", float(LANE_WIDTH_M[kind]))
-    if not isinstance(width_m, int | float) or not NARROWEST_M <= width_m <= WIDEST_M:
-        raise ScenarioError(
-            f"{where}: lane_width_m = {shown(width_m)}: {NARROWEST_M:g} to {WIDEST_M:g} allowed"
-        )
     lines = [geometry.coordinates] if geometry.type == "LineString" else geometry.coordinates
-    label = str(properties.get("name") or f"feature {number}")
+    name = str(properties.get("name") or f"feature {number}")
     for line in lines:
-        builder.add(label, _points(where, line), kind, lanes, float(width_m))
+        points = _points(where, line)
+        builder.add(name, points[::-1] if found.turned else points, found.kind, found.lanes, found.lane_width_m)
 
 
-def _points(where: str, line: Any) -> Iterator[tuple[object, tuple[float, float]]]:
+def _own_street(where: str, properties: dict[str, Any]) -> Street:
+    name = properties.get("class", NAMES[UNKNOWN])
+    kind = NUMBER.get(name) if isinstance(name, str) else None
+    if kind is None:
+        raise ScenarioError(f"{where}: class = {shown(name)}: allowed are {', '.join(NAMES)}")
+    one_way = properties.get("oneway") in (True, 1, "yes", "true", "1")
+    usual = CLASSES[NAMES[kind]].lanes
+    lanes = [
+        _number(where, properties, "lanes_forward", usual, 0, MOST_LANES),
+        _number(where, properties, "lanes_backward", 0 if one_way else usual, 0, MOST_LANES),
+    ]
+    if not any(lanes) or any(count % 1 for count in lanes):
+        raise ScenarioError(f"{where}: lanes_forward, lanes_backward = {lanes}: integers, not both 0, are needed")
+    width_m = _number(where, properties, "lane_width_m", float(LANE_WIDTH_M[kind]), NARROWEST_M, WIDEST_M)
+    return Street(kind, (int(lanes[0]), int(lanes[1])), float(width_m), False)
+
+
+def _number(where: str, properties: dict[str, Any], key: str, usual: float, least: float, most: float) -> float:
+    value = properties.get(key, usual)
+    if not isinstance(value, int | float) or not least <= value <= most:
+        raise ScenarioError(f"{where}: {key} = {shown(value)}: {least:g} to {most:g} allowed")
+    return value
+
+
+def _points(where: str, line: Any) -> list[tuple[object, tuple[float, float]]]:
+    """The points of a line, each with what it shares with those that are the same."""
     try:
-        degrees = np.array([point[:2] for point in line], dtype=float)
-        valid = degrees.ndim == 2 and degrees.shape[1] == 2 and len(degrees) >= 2
-    except (TypeError, ValueError, KeyError, OverflowError):
-        valid = False
-    if not valid:
+        found = msgspec.convert(line, list[list[float]])
+    except ValueError:
+        found = []
+    if len(found) < 2 or any(len(point) < 2 for point in found):
         raise ScenarioError(f"{where}: its coordinates are no line of two or more points")
+    degrees = np.array([point[:2] for point in found])
     beyond = ~(np.abs(degrees) <= [180.0, 90.0])
     if beyond.any():
         at, axis = np.argwhere(beyond)[0].tolist()
-        what, limit = ("longitude", 180), ("latitude", 90)
-        which, most = (what, limit)[axis]
-        raise ScenarioError(f"{where}: {which} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
-    keys = np.round(degrees * 10**_DIGITS).astype(np.int64).tolist()
-    for (east, north), (lon, lat) in zip(keys, degrees.tolist(), strict=True):
-        yield (east, north), (lon, lat)
-
-
-def _lanes(where: str, properties: dict[str, Any], kind: int) -> tuple[int, int]:
-    one_way = properties.get("oneway") in (True, 1, "yes", "true", "1")
-    each = CLASSES[NAMES[kind]].lanes if "class" in properties or "highway" in properties else 1
-    found = []
-    for key, default in (("lanes_forward", each), ("lanes_backward", 0 if one_way else each)):
-        count = properties.get(key, default)
-        if type(count) is not int or not 0 <= count <= MOST_LANES:
-            raise ScenarioError(f"{where}: {key} = {shown(count)}: an integer from 0 to {MOST_LANES} is needed")
-        found.append(count)
-    if not any(found):
-        raise ScenarioError(f"{where}: no lanes in either direction")
-    return found[0], found[1]
+        what, most = (("longitude", 180), ("latitude", 90))[axis]
+        raise ScenarioError(f"{where}: {what} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
+    keys = np.round(degrees * 10**_SAME_DIGITS).astype(np.int64).tolist()
+    return [((east, north), (lon, lat)) for (east, north), (lon, lat) in zip(keys, degrees.tolist(), strict=True)]
 
 
 def write_geojson(roads: Roads, path: Path) -> None:
@@ -130,6 +143,10 @@ def write_geojson(roads: Roads, path: Path) -> None:
     if roads.frame is None:
         raise ScenarioError(f"{path}: GeoJSON is in degrees, and nothing says where on the earth this map is")
     degrees: Array = np.column_stack(roads.frame.to_wgs84(roads.node_m)[::-1]).round(_DIGITS)
+    if not np.isfinite(degrees).all():
+        raise ScenarioError(
+            f"{path}: GeoJSON is in degrees, and this map's projection does not reach all of its points"
+        )
     lines = np.split(roads.node, roads.first[1:-1])
     features = [
         {

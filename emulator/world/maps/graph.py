@@ -1,13 +1,12 @@
 """Maps as nodes and directed edges in a NumPy archive (NPZ), read and written.
 
-`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m` and
-`node_y_m`, of which `frame_proj` and `frame_offset_m` say where on the earth they are. Optional, one an edge:
-`edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
+`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m`
+and `node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an
+edge: `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
 """
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,42 +14,44 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.maps.classes import LANE_WIDTH_M, LANES, MOST_LANES, NAMES, NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
-from emulator.world.maps.frame import Frame, frame_around
+from emulator.world.arrays import read_arrays
+from emulator.world.maps.classes import (
+    LANE_WIDTH_M,
+    LANES,
+    MOST_LANES,
+    NAMES,
+    NARROWEST_M,
+    NUMBER,
+    UNKNOWN,
+    WIDEST_M,
+)
 from emulator.world.maps.roads import MOST_POINTS, Ints, Roads, check_extent
-from vnet.errors import ScenarioError, printable, shown
+from emulator.world.networks import FARTHEST_M
+from emulator.world.projection import Frame, project
+from vnet.errors import ScenarioError, shown
 from vnet.roads.lanes import Array
 
 LARGEST_ARRAY_BYTES = 16 * MOST_POINTS
-_LONGEST_TEXT = 1000
+_NODES = ("node_lon_deg", "node_lat_deg", "node_x_m", "node_y_m")
+_EDGES = ("edges", "edge_class", "edge_lanes", "edge_lane_width_m")
+_FRAME = ("frame_proj", "frame_offset_m")
 
 Arrays = dict[str, NDArray[np.generic]]
 
 
-def read_graph(path: Path, frame: Frame | None) -> Roads:
-    """Read roads; positions in degrees get a frame around their middle unless one is given.
+def read_graph(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
+    """Read roads; the origin is their middle unless given, or the file's own if it is in metres.
 
     Edges that meet where no others do, and are of one kind, become one road. Raises ScenarioError that names the
     array and the entry.
     """
-    arrays = _load(path)
-    node_m, frame = _nodes(path, arrays, frame)
+    arrays = read_arrays(path, (*_NODES, *_EDGES, *_FRAME), LARGEST_ARRAY_BYTES)
+    if "node_lon_deg" in arrays:
+        frame, node_m = project(path, *_degrees(path, arrays), origin_deg)
+        return _Merger(path, node_m, _edges(path, arrays, len(node_m)), frame).roads()
+    node_m = _metres(path, arrays)
     edges = _edges(path, arrays, len(node_m))
-    return _Merger(path, node_m, edges, frame).roads()
-
-
-def _load(path: Path) -> Arrays:
-    """All arrays that are known, none of them larger than `LARGEST_ARRAY_BYTES`."""
-    known = "node_lon_deg node_lat_deg node_x_m node_y_m edges edge_class edge_lanes edge_lane_width_m".split()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for entry in archive.infolist():
-                if entry.file_size > LARGEST_ARRAY_BYTES:
-                    raise ScenarioError(f"{path}: {entry.filename}: larger than {LARGEST_ARRAY_BYTES} bytes")
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in (*known, "frame_proj", "frame_offset_m") if name in file}
-    except (ValueError, EOFError, KeyError, OSError, zipfile.BadZipFile, NotImplementedError, MemoryError) as error:
-        raise ScenarioError(f"{path}: not a NumPy archive: {printable(str(error), 300)}") from None
+    return _Merger(path, node_m, edges, _frame(path, arrays)).roads().around(path, origin_deg)
 
 
 def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) -> Array:
@@ -67,33 +68,33 @@ def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) ->
     return numbers
 
 
-def _nodes(path: Path, arrays: Arrays, frame: Frame | None) -> tuple[Array, Frame | None]:
-    if "node_lon_deg" not in arrays:
-        if "node_x_m" not in arrays:
-            raise ScenarioError(f"{path}: neither 'node_lon_deg' nor 'node_x_m' is among its arrays")
-        x = _numbers(path, arrays, "node_x_m")
-        return np.column_stack([x, _numbers(path, arrays, "node_y_m", len(x))]), _frame(path, arrays)
-    lon = _numbers(path, arrays, "node_lon_deg")
-    lat = _numbers(path, arrays, "node_lat_deg", len(lon))
-    for name, degrees, limit in (("node_lon_deg", lon, 180.0), ("node_lat_deg", lat, 90.0)):
-        beyond = np.abs(degrees) > limit
-        if beyond.any():
-            at = int(np.argmax(beyond))
-            raise ScenarioError(f"{path}: {name}[{at}] = {degrees[at]:g}: not within ±{limit:g}; is it WGS-84?")
+def _degrees(path: Path, arrays: Arrays) -> tuple[Array, Array]:
+    """Latitudes and longitudes of all nodes, one at least."""
+    lon = _within(path, arrays, "node_lon_deg", None, -180.0, 180.0)
+    lat = _within(path, arrays, "node_lat_deg", len(lon), -90.0, 90.0)
     if not len(lon):
         raise ScenarioError(f"{path}: no nodes")
-    frame = frame or frame_around(lat, lon)
-    return frame.to_local(lat, lon), frame
+    return lat, lon
+
+
+def _metres(path: Path, arrays: Arrays) -> Array:
+    if "node_x_m" not in arrays:
+        raise ScenarioError(f"{path}: neither 'node_lon_deg' nor 'node_x_m' is among its arrays")
+    x = _within(path, arrays, "node_x_m", None, -FARTHEST_M, FARTHEST_M)
+    return np.column_stack([x, _within(path, arrays, "node_y_m", len(x), -FARTHEST_M, FARTHEST_M)])
 
 
 def _frame(path: Path, arrays: Arrays) -> Frame | None:
     if "frame_proj" not in arrays:
         return None
     proj = arrays["frame_proj"]
-    if proj.shape or proj.dtype.kind != "U" or len(str(proj)) > _LONGEST_TEXT:
-        raise ScenarioError(f"{path}: frame_proj: one text is needed")
-    x, y = _numbers(path, arrays, "frame_offset_m", 2).tolist()
-    return Frame(str(proj), (x, y))
+    if proj.shape or proj.dtype.kind != "U":
+        raise ScenarioError(f"{path}: frame_proj: one text is needed, not {proj.dtype} {proj.shape}")
+    x, y = _within(path, arrays, "frame_offset_m", 2, -FARTHEST_M, FARTHEST_M).tolist()
+    try:
+        return Frame.named(str(proj), (x, y))
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: frame_proj: {error}") from None
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def _edges(path: Path, arrays: Arrays, nodes: int) -> _Edges:
     return _Edges(ends.astype(np.intp), kind, lanes, width_m)
 
 
-def _within(path: Path, arrays: Arrays, name: str, count: int, least: float, most: float) -> Array:
+def _within(path: Path, arrays: Arrays, name: str, count: int | None, least: float, most: float) -> Array:
     numbers = _numbers(path, arrays, name, count)
     wrong = (numbers < least) | (numbers > most)
     if wrong.any():
@@ -142,7 +143,9 @@ def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
         return np.full(count, UNKNOWN)
     names = arrays["edge_class"]
     if names.shape != (count,) or names.dtype.kind != "U":
-        raise ScenarioError(f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}")
+        raise ScenarioError(
+            f"{path}: edge_class: texts of shape ({count},) are needed, not {names.dtype} {names.shape}"
+        )
     distinct, which = np.unique(names, return_inverse=True)
     for at, name in enumerate(distinct.tolist()):
         if name not in NUMBER:
@@ -179,7 +182,7 @@ class _Merger:
         first = number[first]
         swapped = lanes[0] == 0
         self._lanes = np.where(swapped, lanes[::-1], lanes)
-        self._kind, self._width_m = edges.kind[first], edges.lane_width_m[first]
+        self._kind, self._width_m, self._file_edge = edges.kind[first], edges.lane_width_m[first], first
         ends = np.column_stack([low[first], high[first]])
         ends[swapped] = ends[swapped, ::-1]
         return ends
@@ -202,7 +205,7 @@ class _Merger:
             self._node_m[used],
             node,
             first,
-            tuple(f"edge {number}" for number in edge.tolist()),
+            tuple(f"edge {number}" for number in self._file_edge[edge].tolist()),
             self._kind[edge],
             lanes[0],
             lanes[1],
@@ -254,7 +257,7 @@ class _Merger:
 
 
 def write_graph(roads: Roads, path: Path) -> None:
-    """Write an NPZ that `read_graph` reads: in degrees where the roads' place on the earth is known."""
+    """Write an NPZ that `read_graph` reads, in metres. Raises OSError."""
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     road = roads.road_of[roads.segment]
     ahead, back = roads.forward[road] > 0, roads.backward[road] > 0
@@ -262,9 +265,9 @@ def write_graph(roads: Roads, path: Path) -> None:
     arrays = {
         "node_x_m": roads.node_m[:, 0],
         "node_y_m": roads.node_m[:, 1],
-        "edges": np.concatenate(
-            [np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]
-        ).astype(np.int32),
+        "edges": np.concatenate([np.column_stack([start, end])[ahead], np.column_stack([end, start])[back]]).astype(
+            np.int32
+        ),
         "edge_class": np.array(NAMES)[roads.kind[edge_road]],
         "edge_lanes": np.concatenate([roads.forward[road[ahead]], roads.backward[road[back]]]).astype(np.uint8),
         "edge_lane_width_m": roads.lane_width_m[edge_road],

@@ -1,7 +1,7 @@
 """Roads: centre lines between shared points, and what is known of each; all readers end here.
 
-From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side on
-which people drive. A road with lanes one way only has its centre line in the middle of them.
+From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side
+on which people drive. A road with lanes one way only has its centre line in the middle of them.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
-from emulator.world.maps.frame import WIDEST_M, Frame
+from emulator.world.projection import WIDEST_M, Frame, project
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import Array
-from vnet.roads.road_map import RoadMap
+from vnet.roads.road_map import RoadMap, touch_box
 
 MOST_POINTS = 5_000_000
 """A map has no more points: a large city has a tenth of that."""
@@ -35,8 +35,8 @@ class Roads:
 
     Road r runs through the points `node[first[r]:first[r + 1]]` of `node_m` (N, 2), two at least; roads meet where
     they share a point. `name` (R,) is what the file calls them; `kind` (R,) their class, an index into `NAMES`;
-    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame` says
-    where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
+    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame`
+    says where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
     """
 
     node_m: Array
@@ -76,28 +76,42 @@ class Roads:
         return np.bincount(self.road_of[self.segment], self.segment_length_m, minlength=len(self))
 
     def within(self, low_m: Array, high_m: Array) -> Roads:
-        """The roads of which a point lies in the box from `low_m` (2,) to `high_m` (2,)."""
-        place = self.node_m[self.node]
-        inside = ((place >= low_m) & (place <= high_m)).all(axis=1)
-        return self.only(np.bincount(self.road_of[inside], minlength=len(self)) > 0)
+        """What of the roads touches the box from `low_m` (2,) to `high_m` (2,), in whole segments.
 
-    def only(self, kept: NDArray[np.bool_]) -> Roads:
-        """The roads marked in `kept` (R,), and the points that they run through."""
-        used, node = np.unique(self.node[kept[self.road_of]], return_inverse=True)
-        first = np.concatenate([[0], np.cumsum(np.diff(self.first)[kept])])
-        name = tuple(name for name, stays in zip(self.name, kept.tolist(), strict=True) if stays)
+        A road that leaves the box and comes back becomes several of the same name.
+        """
+        place = self.node_m[self.node]
+        segment = self.segment[touch_box(place[self.segment], place[self.segment + 1], low_m, high_m)]
+        begins, ends = np.zeros((2, len(self.node)), dtype=np.bool_)
+        begins[segment], ends[segment + 1] = True, True
+        kept = begins | ends
+        used, node = np.unique(self.node[kept], return_inverse=True)
+        first = np.flatnonzero(begins & ~ends)
+        road = self.road_of[first]
         return replace(
             self,
             node_m=self.node_m[used],
             node=node,
-            first=first,
-            name=name,
-            kind=self.kind[kept],
-            forward=self.forward[kept],
-            backward=self.backward[kept],
-            lane_width_m=self.lane_width_m[kept],
-            one_way=self.one_way[kept],
+            first=np.append(np.cumsum(kept)[first] - 1, len(node)),
+            name=tuple(self.name[r] for r in road.tolist()),
+            kind=self.kind[road],
+            forward=self.forward[road],
+            backward=self.backward[road],
+            lane_width_m=self.lane_width_m[road],
+            one_way=self.one_way[road],
         )
+
+    def around(self, source: object, origin_deg: tuple[float, float] | None) -> Roads:
+        """The same roads in metres around another origin, if one is given.
+
+        Raises ScenarioError, naming `source`, where nobody knows where on the earth they are, or too far from it.
+        """
+        if origin_deg is None:
+            return self
+        if self.frame is None:
+            raise ScenarioError(f"{source}: does not say where on the earth its metres are; leave out the origin")
+        frame, node_m = project(source, *self.frame.to_wgs84(self.node_m), origin_deg)
+        return replace(self, node_m=node_m, frame=frame)
 
     # Lanes.
 
@@ -118,7 +132,7 @@ class Roads:
         of_road = road[of_lane]
         return RoadMap(
             place[segment],
-            np.mod(np.arctan2(step[segment, 1], step[segment, 0]), 2 * np.pi),
+            _heading_rad(step[segment]),
             np.hypot(step[segment, 0], step[segment, 1]),
             np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, NARROWEST_SPACE_M),
             self.kind[of_road].astype(np.uint8),
@@ -130,7 +144,7 @@ class Roads:
         )
 
     def _lanes(self, side: float) -> tuple[Ints, Array, NDArray[np.bool_]]:
-        """All lanes: their road, how far right of its centre line as one drives along it, and who goes against it."""
+        """All lanes: their road, how far right of its centre line as it goes, and which go against it."""
         counts = self.forward + self.backward
         road = np.repeat(np.arange(len(self)), counts)
         number = np.arange(len(road)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -152,6 +166,12 @@ class Roads:
         both = after.any(axis=1) & before.any(axis=1)
         scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), _SHARPEST), 1.0)
         return np.asarray((after + before) / scale[:, None])
+
+
+def _heading_rad(step_m: Array) -> Array:
+    """Directions (n,) of steps (n, 2), in [0, 2π)."""
+    heading_rad = np.mod(np.arctan2(step_m[:, 1], step_m[:, 0]), 2 * np.pi)
+    return np.where(heading_rad < 2 * np.pi, heading_rad, 0.0)  # of the smallest negative angles mod makes 2π
 
 
 @dataclass
@@ -177,9 +197,6 @@ class RoadsBuilder:
         self._first = [0]
         self._rows: list[_Row] = []
         self.notes: dict[str, int] = {}
-
-    def __len__(self) -> int:
-        return len(self._rows)
 
     def note(self, what: str) -> None:
         """Count something odd."""
@@ -223,7 +240,7 @@ class RoadsBuilder:
         return np.array(self._place, dtype=float).reshape(-1, 2)
 
     def build(self, node_m: Array, frame: Frame | None) -> Roads:
-        """The roads, with the points' places in metres (N, 2). Raises ScenarioError without roads or too far apart."""
+        """The roads, with the points' places in metres (N, 2). Raises ScenarioError as `check_extent` does."""
         check_extent(self._source, node_m, len(self._rows))
         return Roads(
             node_m,
@@ -251,8 +268,8 @@ def check_extent(source: object, node_m: Array, roads: int) -> None:
     if not np.isfinite(node_m).all():
         raise ScenarioError(f"{source}: positions that its projection does not reach")
     span_m = float(np.ptp(node_m, axis=0).max())
-    if span_m > WIDEST_M:
+    if span_m > 2 * WIDEST_M:
         raise ScenarioError(
-            f"{source}: spans {span_m / 1000:.0f} km; at most {WIDEST_M / 1000:.0f} are allowed: "
+            f"{source}: spans {span_m / 1000:.0f} km; at most {2 * WIDEST_M / 1000:.0f} are allowed: "
             "are all points in the same projection?"
         )

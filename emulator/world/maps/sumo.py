@@ -1,8 +1,8 @@
 """SUMO road networks (.net.xml): the lanes that passenger cars may use, each as a road of its own.
 
-Read by expat as a stream, within bounds. SUMO's own reader (sumolib) knows no lines to name in an error, and expands
-whatever entities a file declares; here a file that declares any is refused. Coordinates stay SUMO's, so that its
-traces fit; its projection, if it states one, becomes the frame.
+Read by expat as a stream, within bounds. SUMO's own reader (sumolib) knows no lines to name in an error, and
+expands whatever entities a file declares; here a file that declares any is refused. Coordinates stay SUMO's, so
+that its traces fit; its projection, if it states one, becomes the frame.
 """
 
 from __future__ import annotations
@@ -13,18 +13,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from emulator.world.maps.classes import NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
-from emulator.world.maps.frame import Frame
-from emulator.world.maps.roads import Roads, RoadsBuilder
+from emulator.world.maps.roads import MOST_POINTS, Roads, RoadsBuilder
+from emulator.world.networks import FARTHEST_M
+from emulator.world.projection import Frame
 from vnet.errors import ScenarioError, printable, shown
 
 LARGEST_BYTES = 2**31
 _CHUNK_BYTES = 2**20
 _SUMO_WIDTH_M = 3.2
 """Of a lane that does not say; SUMO's default."""
-_FARTHEST_M = 1e8
 _NO_ROADS = {"crossing", "walkingarea", "connector"}
 _CARS = {"passenger", "all", "private"}
 
@@ -51,6 +49,7 @@ class _Reader:
         self._edge: dict[str, str] | None = None
         self.frame: Frame | None = None
         self.lanes: list[_Lane] = []
+        self._points_left = MOST_POINTS
         self.pairs: set[tuple[str, str]] = set()
         self.left_out = 0
 
@@ -74,6 +73,8 @@ class _Reader:
         except xml.parsers.expat.ExpatError as error:
             what = xml.parsers.expat.ErrorString(error.code)
             raise ScenarioError(f"{self._path}: line {error.lineno}: not XML: {what}") from None
+        except (LookupError, ValueError) as error:  # an encoding that Python does not know, or has more bytes
+            raise self.wrong(f"not XML: {printable(str(error))}") from None
 
     def _refuse_doctype(self, *_: object) -> None:
         raise self.wrong("a document type declaration; networks of SUMO have none")
@@ -101,7 +102,10 @@ class _Reader:
             points = self._points(attributes.get("netOffset", "0,0"), "netOffset")
             if len(points) != 1:
                 raise self.wrong("netOffset: one x,y in metres is needed")
-            self.frame = Frame(proj, points[0])
+            try:
+                self.frame = Frame.named(proj, points[0])
+            except ScenarioError as error:
+                raise self.wrong(str(error)) from None
 
     def _start_edge(self, attributes: dict[str, str]) -> None:
         self._edge = attributes
@@ -143,9 +147,12 @@ class _Reader:
                 numbers = [float(number) for number in part.split(",")]
             except ValueError:
                 numbers = []
-            if len(numbers) not in (2, 3) or not all(abs(number) <= _FARTHEST_M for number in numbers):
+            if len(numbers) not in (2, 3) or not all(abs(number) <= FARTHEST_M for number in numbers):
                 raise self.wrong(f"{what}: {shown(part)}: x,y in metres is needed")
             points.append((numbers[0], numbers[1]))
+        self._points_left -= len(points)
+        if self._points_left < 0:
+            raise self.wrong(f"more than {MOST_POINTS} points; cut out a part first")
         return points
 
 
@@ -156,10 +163,8 @@ def _for_cars(lane: dict[str, str]) -> bool:
     return _CARS.isdisjoint(refused)
 
 
-def read_sumo(path: Path, frame: Frame | None) -> Roads:
-    """Read the lanes. `frame` must be None: the file has its own. Raises ScenarioError that names the line."""
-    if frame is not None:
-        raise ScenarioError(f"{path}: networks of SUMO have their own origin; leave out yours")
+def read_sumo(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
+    """Read the lanes; metres are SUMO's own unless an origin is given. Raises ScenarioError that names the line."""
     reader = _Reader(path)
     reader.read()
     builder = RoadsBuilder(path)
@@ -170,4 +175,4 @@ def read_sumo(path: Path, frame: Frame | None) -> Roads:
         points = [((round(100 * x), round(100 * y)), (x, y)) for x, y in lane.points]
         one_way = lane.ends is None or lane.ends[::-1] not in reader.pairs
         builder.add(lane.name, points, lane.kind, (1, 0), lane.width_m, one_way)
-    return builder.build(np.asarray(builder.places()), reader.frame)
+    return builder.build(builder.places(), reader.frame).around(path, origin_deg)

@@ -58,7 +58,7 @@ class _Reader:
                 self._parser.Parse(b"", True)
         except OSError as error:
             raise ScenarioError(f"{self._path}: cannot be read: {error.strerror}") from None
-        except expat.ExpatError as error:
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter for encodings
             raise ScenarioError(f"{self._path}: not an XML file: {error}") from None
         self._flush()
         return self._samples

@@ -6,8 +6,6 @@ given; without ids vehicles are v1, v2, …, with zeros in front so that they so
 
 from __future__ import annotations
 
-import math
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from emulator.world.arrays import read_arrays
 from emulator.world.trips.samples import DEGREES, METRES, MOST_SAMPLES, OPTIONAL, Samples
 from vnet.errors import ScenarioError, printable
 from vnet.roads.lanes import Array
@@ -52,39 +51,13 @@ def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
-    arrays = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for name in (*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"):
-                if f"{name}.npy" in archive.namelist():
-                    _check_size(archive, f"{name}.npy")
-                    with archive.open(f"{name}.npy") as member:
-                        arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (
-        Exception
-    ) as error:  # zipfile, zlib and numpy have a dozen ways to say that something is wrong with a file
-        raise ScenarioError(f"{path}: not an NPZ file: {printable(str(error), 300)}") from None
+    arrays = read_arrays(path, (*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"), _LARGEST_BYTES)
     for name, array in arrays.items():
         if name != "id":
             if array.dtype.kind not in "fiu":
                 raise ScenarioError(f"{path}: {name} holds {array.dtype}: numbers are needed")
             arrays[name] = array.astype(float)
     return arrays
-
-
-def _check_size(archive: zipfile.ZipFile, name: str) -> None:
-    """Raises ValueError where an array is larger than what is taken, or than it is."""
-    size = archive.getinfo(name).file_size
-    if size > _LARGEST_BYTES:
-        raise ValueError(f"{name}: {size:,} bytes; at most {_LARGEST_BYTES:,} are taken")
-    with archive.open(name) as member:
-        version = np.lib.format.read_magic(member)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, kind = read(member)
-    if math.prod(shape) * kind.itemsize > size:
-        raise ValueError(f"{name}: {shape} of {kind} in {size:,} bytes")
 
 
 def _shape(path: Path, where: tuple[str, str], first: Array, second: Array) -> tuple[int, int]:

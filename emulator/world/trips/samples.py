@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.world.networks import FARTHEST_M
-from emulator.world.projection import middle_deg, to_local_m
+from emulator.world.projection import project
 from vnet.errors import ScenarioError, shown
 from vnet.link.keys import is_segment
 from vnet.roads.lanes import Array
@@ -25,8 +25,6 @@ MOST_SAMPLES = 10_000_000
 """How many samples are kept in memory."""
 MOST_IDS = 100_000
 """How many vehicles a file may name; far fewer can take part."""
-WIDEST_M = 200_000.0
-"""How far from its origin the plane of metres is used for points in degrees."""
 METRES = ("x_m", "y_m")
 DEGREES = ("lat_deg", "lon_deg")
 OPTIONAL = ("heading_rad", "speed_mps")
@@ -174,15 +172,7 @@ class Samples:
             if len(self._code) > 1 and np.ptp(position_m, axis=0).max() < 1.0:
                 raise ScenarioError(f"{self._path}: all of x_m, y_m within a metre: are these degrees?")
             return position_m
-        origin = origin_deg or middle_deg(columns["lat_deg"], columns["lon_deg"])
-        position_m = to_local_m(columns["lat_deg"], columns["lon_deg"], origin)
-        farthest_m = float(np.abs(position_m).max())
-        if not farthest_m <= WIDEST_M:
-            raise ScenarioError(
-                f"{self._path}: {farthest_m / 1000:,.0f} km from the origin {origin[0]:.4f}, {origin[1]:.4f}: "
-                f"at most {WIDEST_M / 1000:g} km; are lat_deg and lon_deg what they should be?"
-            )
-        return position_m
+        return project(self._path, columns["lat_deg"], columns["lon_deg"], origin_deg)[1]
 
 
 def _by(columns: dict[str, Array], order: NDArray[np.intp]) -> list[tuple[str, Array]]:
