@@ -49,6 +49,7 @@ from vnet.cmm.weights import (
     random_weights,
 )
 from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.road_map import RoadMap
 
 NS_PER_S = 1_000_000_000
 SUMS_GATE_SIGMAS = 5.0
@@ -64,7 +65,7 @@ class Estimator:
     """The state of one vehicle's cooperation, without any input or output of its own."""
 
     def __init__(
-        self, node_id: str, options: Options, lanes: LaneMap, rng: np.random.Generator, period_ns: int
+        self, node_id: str, options: Options, lanes: LaneMap | RoadMap, rng: np.random.Generator, period_ns: int
     ) -> None:
         self.name = short_name(node_id)
         self._admission = Admission(self.name, period_ns, options.two_frames)

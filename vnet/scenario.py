@@ -112,14 +112,14 @@ class Network(Section):
 
 
 class Map(Section):
-    """`[map]`: the roads on which vehicles drive, as programs know them. Without it programs of trips know no road."""
+    """`[map]`: the roads on which vehicles drive, as programs know them. Without it they know none."""
 
     path: Path
     """Relative to the scenario file: OpenStreetMap's XML or PBF, SUMO's `.net.xml`, GeoJSON or NPZ."""
     drive_on: Literal["right", "left"] = "right"
     """On which side of the road people drive."""
     origin_deg: OriginDeg | None = None
-    """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips' own."""
+    """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips'."""
     sigma_m: float = Field(0.0, ge=0, le=WILD_M)
     """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)

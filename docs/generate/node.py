@@ -14,6 +14,7 @@ from docs.generate.markdown import page as whole_page
 from vnet.errors import PayloadTooLargeError
 from vnet.link.node import INBOX_LIMIT, GnssReceiver, Radio
 from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
 
 INTRODUCTION = """
 A program is one async function of one argument. It needs `from vnet import Node`, and nothing else of vnet; `Fix`
@@ -39,6 +40,7 @@ PARTS = {
     "Packet": vnet.Packet,
     "Fix": vnet.Fix,
     "node.map": LaneMap,
+    "node.map of a city": RoadMap,
 }
 HOSTS_ONLY = {"sever", "to_wire", "from_wire"}
 """Public, but none of a program's business."""

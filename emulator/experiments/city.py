@@ -97,13 +97,13 @@ def report(results: Sequence[Result], duration_s: float) -> str:
         "# Driving through a city\n\n"
         f"{markdown_table(header, rows)}\n\n"
         f"RMSE from {min(SETTLED_S, duration_s / 2):g} s on, of {duration_s:g} s; "
-        f"{len(unique(results, 'seed'))} seeds, ± standard error; {100 * LOSS:g} % loss. `centralized` is one filter "
-        "that hears every fix.\n"
+        f"{len(unique(results, 'seed'))} seeds, ± standard error; {100 * LOSS:g} % loss. `centralized` is one "
+        "filter that hears every fix.\n"
     )
 
 
 def errors_by_place(states: pa.Table) -> tuple[Array, Array, Array]:
-    """Squares of the map (n, 2), by their corners in metres; RMSE (n,) of positions in them; how many states (n,)."""
+    """Squares of the map (n, 2), by their corners in metres; RMSE (n,) of positions in them, and how many (n,)."""
     states = states.filter(pc.and_(pc.is_valid(states["estimate_m"]), pc.is_valid(states["position_m"])))
     position_m, estimate_m = (_points(states, name) for name in ("position_m", "estimate_m"))
     square, which, count = np.unique(
@@ -122,9 +122,8 @@ def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
     axes.add_collection(LineCollection(list(lanes / 1000), colors="#bbbbbb", linewidths=0.4))
     middle_km = (corner_m + PLACE_M / 2) / 1000
     order = np.argsort(error_m)  # the worst on top
-    dots = axes.scatter(
-        *middle_km[order].T, c=error_m[order], s=9, cmap="viridis", vmin=0, vmax=max(2.0, np.percentile(error_m, 98))
-    )
+    top_m = max(2.0, np.percentile(error_m, 98))
+    dots = axes.scatter(*middle_km[order].T, c=error_m[order], s=9, cmap="viridis", vmin=0, vmax=top_m)
     figure.colorbar(dots, ax=axes, label="RMSE of the position (m)", extend="max", shrink=0.7)
     axes.set(xlabel="east (km)", ylabel="north (km)", aspect="equal", title=title)
     low, high = middle_km.min(axis=0) - 0.2, middle_km.max(axis=0) + 0.2

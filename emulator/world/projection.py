@@ -82,7 +82,7 @@ def project(
 
     Raises ScenarioError, naming `source`, where they are further than `WIDEST_M` from there.
     """
-    origin = origin_deg or (_middle(latitude_deg), _middle(longitude_deg))
+    origin = origin_deg or middle_deg(latitude_deg, longitude_deg)
     frame = Frame.around(*origin)
     position_m = frame.to_local(latitude_deg, longitude_deg)
     farthest_m = float(np.abs(position_m).max())
@@ -92,6 +92,11 @@ def project(
             f"at most {WIDEST_M / 1000:g} km; are latitudes and longitudes what they should be?"
         )
     return frame, position_m
+
+
+def middle_deg(latitude_deg: Array, longitude_deg: Array) -> tuple[float, float]:
+    """The middle of the box that holds these points (n,), one at least."""
+    return _middle(latitude_deg), _middle(longitude_deg)
 
 
 def _middle(values: Array) -> float:

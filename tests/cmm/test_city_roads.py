@@ -93,7 +93,11 @@ def test_who_has_no_candidate_scores_nothing() -> None:
 
 
 def drive(
-    roads: RoadMap, courses: list[tuple[Array, Array]], common_m: Array, seed: int = 1, config: RbpfConfig | None = None
+    roads: RoadMap,
+    courses: list[tuple[Array, Array]],
+    common_m: Array,
+    seed: int = 1,
+    config: RbpfConfig | None = None,
 ) -> Rbpf:
     """A filter that has heard the fixes of vehicles with courses (K, 2) and headings (K,)."""
     rng = np.random.default_rng(seed)

@@ -140,7 +140,7 @@ class Matcher(Protocol):
         ...
 
     def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
-        """log P(on a road) of `count` vehicles, (count, K); `row` (E,) and `lane` (E,) are their candidates, by row.
+        """log P(on a road) of `count` vehicles, (count, K); `row` (E,), `lane` (E,) are their candidates, by row.
 
         Positions (E, 2, K) and covariances (E, 2, 2) are the vehicles' of each candidate. Without a candidate: 0.
         """

@@ -326,7 +326,8 @@ class Rbpf:
         rows, middle_m = rows[some], middle_m[some]
         along_rad = self._roads.heading_rad[lane[first]]
         driven_m = np.hypot(*(middle_m - self._anchor_m[rows]).T)
-        turned = ~(np.cos(along_rad - self._anchor_rad[rows]) > np.cos(TURN_RAD))  # NaN: it is seen for the first time
+        # NaN, so true, where it is seen for the first time.
+        turned = ~(np.cos(along_rad - self._anchor_rad[rows]) > np.cos(TURN_RAD))
         new = np.where(driven_m > STAND_M, driven_m / self.config.lateral_m, 0.0)
         new[turned] = 1.0
         anew = rows[new > 0]

@@ -23,7 +23,7 @@ from vnet.errors import ProgramError
 from vnet.link import wire
 from vnet.link.node import Node, Report
 from vnet.link.virtual_time import BendableLoop, LoopAbandonedError, SpinError, VirtualTimeLoop
-from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import map_from_wire
 
 Program = Callable[[Node], Awaitable[None]]
 Programs = Mapping[str, Program]
@@ -93,7 +93,7 @@ class Host:
         return Node(
             welcome.node,
             self,
-            lane_map=LaneMap.from_wire(welcome.lane_map),
+            lane_map=map_from_wire(welcome.lane_map),
             seed=welcome.seed,
             options=welcome.options,
             period_ns=welcome.period_ns,

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from vnet.errors import PayloadTooLargeError
 from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.road_map import RoadMap
 
 T = TypeVar("T")
 
@@ -201,7 +202,7 @@ class Node:
         node_id: str,
         link: NodeLink,
         *,
-        lane_map: LaneMap,
+        lane_map: LaneMap | RoadMap,
         seed: int,
         options: Mapping[str, Any],
         period_ns: int,

@@ -153,7 +153,7 @@ class Welcome(Message, frozen=True):
     pacing: Literal["lockstep", "realtime"]
     entry: str
     options: dict[str, Any]
-    lane_map: list[Any]
+    lane_map: list[Any] | dict[str, Any]
     seed: int
     period_ns: Annotated[int, msgspec.Meta(gt=0)]
     max_payload: Annotated[int, msgspec.Meta(gt=0)]

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from vnet.roads.lanes import Array
+from vnet.roads.lanes import Array, LaneMap
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""
@@ -169,6 +169,11 @@ class RoadMap:
         for name, is_right in right.items():
             if not is_right:
                 raise ValueError(f"{name} of a road map: a value that it cannot have")
+
+
+def map_from_wire(data: Any) -> LaneMap | RoadMap:
+    """Restore whichever map it is. Raises ValueError or TypeError on anything else."""
+    return RoadMap.from_wire(data) if isinstance(data, dict) else LaneMap.from_wire(data)
 
 
 def _column(name: str, data: object) -> NDArray[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from emulator.world.trips.clean import Rules
@@ -37,9 +38,10 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     if start_s is None:
         start_s = min(float(trip.time_s[0]) for trip in trips)
     try:
-        return motion_of(trips, Frame(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
+        motion = motion_of(trips, Frame(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
+    return replace(motion, origin_deg=samples.origin_deg)
 
 
 def _read(path: Path, window_s: tuple[float, float] | None) -> Samples:

@@ -28,12 +28,14 @@ MOST_STATES = 50_000_000
 class Motion:
     """`position_m` (K, N, 2) and `heading_rad` (K, N) at the start of each period; NaN where one is not there.
 
-    A vehicle that is there has no heading, NaN, only if it never moves and nobody says how it stands.
+    A vehicle that is there has no heading, NaN, only if it never moves and nobody says how it stands. `origin_deg`
+    (latitude, longitude) is where metres start, if anybody knows.
     """
 
     node_ids: tuple[str, ...]
     position_m: Array
     heading_rad: Array
+    origin_deg: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.world.networks import FARTHEST_M
-from emulator.world.projection import project
+from emulator.world.projection import middle_deg, project
 from vnet.errors import ScenarioError, shown
 from vnet.link.keys import is_segment
 from vnet.roads.lanes import Array
@@ -56,11 +56,13 @@ class Samples:
     """Takes a file's samples in its order.
 
     `unit` is what messages count (row, line); only samples within `window_s`, if it is given, are kept.
+    `origin_deg` (latitude, longitude) is where metres start, once there are trips that were in degrees.
     """
 
     def __init__(self, path: Path, unit: str, window_s: tuple[float, float] | None = None) -> None:
         self._path = path
         self._unit = unit
+        self.origin_deg: tuple[float, float] | None = None
         self._window_s = window_s
         self._code: dict[str, int] = {}
         self._last: dict[str, Array] = {}
@@ -172,7 +174,9 @@ class Samples:
             if len(self._code) > 1 and np.ptp(position_m, axis=0).max() < 1.0:
                 raise ScenarioError(f"{self._path}: all of x_m, y_m within a metre: are these degrees?")
             return position_m
-        return project(self._path, columns["lat_deg"], columns["lon_deg"], origin_deg)[1]
+        latitude_deg, longitude_deg = columns["lat_deg"], columns["lon_deg"]
+        self.origin_deg = origin_deg or middle_deg(latitude_deg, longitude_deg)
+        return project(self._path, latitude_deg, longitude_deg, self.origin_deg)[1]
 
 
 def _by(columns: dict[str, Array], order: NDArray[np.intp]) -> list[tuple[str, Array]]:
