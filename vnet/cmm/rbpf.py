@@ -528,8 +528,7 @@ def _acceleration(heading_rad: float | None, white_m2_s4: tuple[float, float]) -
         return np.eye(2) * white_m2_s4[0]
     along = np.array([np.cos(heading_rad), np.sin(heading_rad)])
     across = np.array([-along[1], along[0]])
-    share = white_m2_s4[1] / white_m2_s4[0]
-    return np.asarray(white_m2_s4[0] * (np.outer(along, along) + share * np.outer(across, across)))
+    return np.asarray(white_m2_s4[0] * np.outer(along, along) + white_m2_s4[1] * np.outer(across, across))
 
 
 def _moving(elapsed_s: Array) -> Array:
