@@ -12,16 +12,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from vnet.roads.grid import Grid
 from vnet.roads.lanes import Array
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""
 MOST_INDEXED = 1_000_000
 """About so many points besides one a segment are in the index; it is coarser where more would be needed."""
+SQUARE_M = 25.0
+"""The side of the index's squares."""
 HEADING_TOLERANCE_RAD = 0.35
 """A lane fits a vehicle whose heading differs by no more than this."""
+FARTHEST_M = 1e8
+"""No place is further from the origin, and no segment longer, in a map that comes in a message."""
 TAG = "roads"
 """What a map's plain form says it is."""
 MOST_CLASSES = 255
@@ -87,29 +91,31 @@ class RoadMap:
         return np.asarray(np.hypot(*(from_start_m - along_m[:, None] * direction).T))
 
     @cached_property
-    def _index(self) -> tuple[cKDTree, NDArray[np.intp], float]:
-        """A tree of points on the segments, whose they are, and how far from one a segment's end may be."""
+    def _index(self) -> tuple[Grid, NDArray[np.intp], float]:
+        """A grid of points on the segments, whose they are, and how far from one a segment's end may be."""
         step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MOST_INDEXED)
         pieces = np.maximum(1, np.ceil(self.length_m / step_m)).astype(np.intp)
         whose = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(whose)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along_m = (number + 0.5) / pieces[whose] * self.length_m[whose]
-        return cKDTree(self.point_m[whose] + along_m[:, None] * self.direction[whose]), whose, step_m / 2
+        grid = Grid(self.point_m[whose] + along_m[:, None] * self.direction[whose], SQUARE_M)
+        return grid, whose[grid.order], step_m / 2
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
         """All segments within `reach_m` (M,) of positions (M, 2) that fit their headings (M,), NaN if unknown.
 
-        Returns pairs of a row and a segment, by row and then by distance, and the distances in metres.
+        Returns pairs of a row and a segment, by row and then by distance, and the distances in metres. A position
+        that is NaN has none.
         """
-        tree, whose, half_m = self._index
-        rows = tree.query_ball_point(position_m, reach_m + half_m, return_sorted=False)
-        count = np.fromiter(map(len, rows), dtype=np.intp, count=len(rows))
-        row = np.repeat(np.arange(len(rows)), count)
-        segment = whose[np.fromiter((i for found in rows for i in found), dtype=np.intp, count=int(count.sum()))]
-        turn = np.abs(np.mod(self.heading_rad[segment] - heading_rad[row] + np.pi, 2 * np.pi) - np.pi)
-        fits = ~(turn > HEADING_TOLERANCE_RAD)  # NaN fits
+        grid, whose, half_m = self._index
+        margin_m = (reach_m + half_m)[:, None]
+        row, place = grid.find(position_m - margin_m, position_m + margin_m)
+        segment = whose[place]
+        travel = np.column_stack([np.cos(heading_rad), np.sin(heading_rad)])
+        along = np.einsum("ij,ij->i", self.direction[segment], travel[row])
+        fits = ~(along < np.cos(HEADING_TOLERANCE_RAD))  # NaN fits
         row, segment = row[fits], segment[fits]
         distance_m = self.distance_m(position_m[row], segment)
         within = distance_m <= reach_m[row]
@@ -157,9 +163,9 @@ class RoadMap:
         if any(len(getattr(self, name)) != len(self) for name in _COLUMNS):
             raise ValueError("columns of a road map differ in length")
         right = {
-            "point_m": np.isfinite(self.point_m).all(),
+            "point_m": (np.abs(self.point_m) <= FARTHEST_M).all(),
             "heading_rad": ((self.heading_rad >= 0) & (self.heading_rad < 2 * np.pi)).all(),
-            "length_m": ((self.length_m > 0) & (self.length_m < np.inf)).all(),
+            "length_m": ((self.length_m > 0) & (self.length_m <= FARTHEST_M)).all(),
             "half_width_m": ((self.half_width_m >= 0) & (self.half_width_m < np.inf)).all(),
             "kind": (self.kind < len(self.classes)).all(),
             "one_way": (self.one_way.view(np.uint8) <= 1).all(),
