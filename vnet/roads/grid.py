@@ -41,15 +41,16 @@ class Grid:
         empty = (first > final).any(axis=1)
         first[empty], final[empty] = 0.0, -1.0
         first, final = first.astype(np.intp), final.astype(np.intp)
-        box, row = _ranges(first[:, 1], final[:, 1] + 1)  # each row of squares is one range of points
-        start = np.searchsorted(self._number, row * self._columns + first[box, 0], side="left")
-        end = np.searchsorted(self._number, row * self._columns + final[box, 0], side="right")
-        which, place = _ranges(start, end)
-        return box[which], place
+        box, row = _ranges(np.arange(len(first)), first[:, 1], final[:, 1] + 1)
+        # The squares of a row, one beside the other, are one range of points.
+        start = np.searchsorted(self._number, row * self._columns + first[:, 0][box], side="left")
+        end = np.searchsorted(self._number, row * self._columns + final[:, 0][box], side="right")
+        return _ranges(box, start, end)
 
 
-def _ranges(start: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """All integers from `start` (n,) to `end` (n,), and which range each is of."""
+def _ranges(label: Ints, start: Ints, end: Ints) -> tuple[Ints, Ints]:
+    """All integers from `start` (n,) to `end` (n,), each after the `label` (n,) of its range."""
     count = np.maximum(end - start, 0)
-    which = np.repeat(np.arange(len(start)), count)
-    return which, np.arange(len(which)) - np.repeat(np.cumsum(count) - count - start, count)
+    until = np.cumsum(count)
+    total = int(until[-1]) if len(until) else 0
+    return np.repeat(label, count), np.arange(total) + np.repeat(start - until + count, count)

@@ -83,23 +83,18 @@ class RoadMap:
         """n·p of each centre line (S,), so that the signed offset of a point q is n·q - offset."""
         return np.asarray(np.einsum("ij,ij->i", self.normal, self.point_m))
 
-    def distance_m(self, position_m: Array, segment: NDArray[np.intp]) -> Array:
-        """How far positions (n, 2) are from segments (n,), each from its own: metres (n,)."""
-        from_start_m = position_m - self.point_m[segment]
-        direction = self.direction[segment]
-        along_m = np.clip(np.einsum("ij,ij->i", from_start_m, direction), 0.0, self.length_m[segment])
-        return np.asarray(np.hypot(*(from_start_m - along_m[:, None] * direction).T))
-
     @cached_property
-    def _index(self) -> tuple[Grid, NDArray[np.intp], float]:
-        """A grid of points on the segments, whose they are, and how far from one a segment's end may be."""
+    def _index(self) -> _Index:
         step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MOST_INDEXED)
         pieces = np.maximum(1, np.ceil(self.length_m / step_m)).astype(np.intp)
         whose = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(whose)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along_m = (number + 0.5) / pieces[whose] * self.length_m[whose]
         grid = Grid(self.point_m[whose] + along_m[:, None] * self.direction[whose], SQUARE_M)
-        return grid, whose[grid.order], step_m / 2
+        whose = whose[grid.order]
+        east_m, north_m = self.point_m[whose].T.copy()
+        to_east, to_north = self.direction[whose].T.copy()
+        return _Index(grid, step_m / 2, whose, east_m, north_m, to_east, to_north, self.length_m[whose])
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
@@ -109,17 +104,15 @@ class RoadMap:
         Returns pairs of a row and a segment, by row and then by distance, and the distances in metres. A position
         that is NaN has none.
         """
-        grid, whose, half_m = self._index
-        margin_m = (reach_m + half_m)[:, None]
-        row, place = grid.find(position_m - margin_m, position_m + margin_m)
-        segment = whose[place]
-        travel = np.column_stack([np.cos(heading_rad), np.sin(heading_rad)])
-        along = np.einsum("ij,ij->i", self.direction[segment], travel[row])
-        fits = ~(along < np.cos(HEADING_TOLERANCE_RAD))  # NaN fits
-        row, segment = row[fits], segment[fits]
-        distance_m = self.distance_m(position_m[row], segment)
-        within = distance_m <= reach_m[row]
-        row, segment, distance_m = row[within], segment[within], distance_m[within]
+        index = self._index
+        margin_m = (reach_m + index.half_m)[:, None]
+        row, place = index.grid.find(position_m - margin_m, position_m + margin_m)
+        turn = index.to_east[place] * np.cos(heading_rad)[row] + index.to_north[place] * np.sin(heading_rad)[row]
+        fits = np.flatnonzero(~(turn < np.cos(HEADING_TOLERANCE_RAD)))  # NaN fits
+        row, place = row[fits], place[fits]
+        distance_m = index.distance_m(position_m[:, 0][row], position_m[:, 1][row], place)
+        within = np.flatnonzero(distance_m <= reach_m[row])
+        row, segment, distance_m = row[within], index.whose[place[within]], distance_m[within]
         order = np.lexsort((segment, distance_m, row))
         row, segment, distance_m = row[order], segment[order], distance_m[order]
         new = np.ones(len(row), dtype=np.bool_)  # a long segment is found by several of its points
@@ -175,6 +168,31 @@ class RoadMap:
         for name, is_right in right.items():
             if not is_right:
                 raise ValueError(f"{name} of a road map: a value that it cannot have")
+
+
+@dataclass(frozen=True)
+class _Index:
+    """Points on the segments in the order of a grid (P,): whose each is, and again what is known of that segment.
+
+    What is near each other on the map is near each other in these arrays; a segment's end is at most `half_m` from
+    one of its points.
+    """
+
+    grid: Grid
+    half_m: float
+    whose: NDArray[np.intp]
+    east_m: Array
+    north_m: Array
+    to_east: Array
+    to_north: Array
+    length_m: Array
+
+    def distance_m(self, east_m: Array, north_m: Array, place: NDArray[np.intp]) -> Array:
+        """How far positions (n,) are from the whole segments at `place` (n,)."""
+        east_m, north_m = east_m - self.east_m[place], north_m - self.north_m[place]
+        to_east, to_north = self.to_east[place], self.to_north[place]
+        along_m = np.minimum(np.maximum(east_m * to_east + north_m * to_north, 0.0), self.length_m[place])
+        return np.asarray(np.hypot(east_m - along_m * to_east, north_m - along_m * to_north))
 
 
 def _column(name: str, data: object) -> NDArray[Any]:
