@@ -7,6 +7,7 @@ in another projection (SUMO's) keep it, and say which one it is.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -76,27 +77,39 @@ class Frame:
 
 
 def project(
-    source: object, latitude_deg: Array, longitude_deg: Array, origin_deg: tuple[float, float] | None
+    source: object,
+    latitude_deg: Array,
+    longitude_deg: Array,
+    origin_deg: tuple[float, float] | None,
+    name: Callable[[int], str] | None = None,
 ) -> tuple[Frame, Array]:
     """Points (n,), one at least, in degrees as metres (n, 2), and the frame around `origin_deg`, else their middle.
 
-    Raises ScenarioError, naming `source`, where they are further than `WIDEST_M` from there.
+    Raises ScenarioError where they are further than `WIDEST_M` from there: it names `source`, and what `name` says of
+    the point that is off most others.
     """
     origin = origin_deg or middle_deg(latitude_deg, longitude_deg)
     frame = Frame.around(*origin)
     position_m = frame.to_local(latitude_deg, longitude_deg)
     farthest_m = float(np.abs(position_m).max())
     if not farthest_m <= WIDEST_M:
+        where = f"{name(most_off(np.column_stack([latitude_deg, longitude_deg])))}: " if name else ""
         raise ScenarioError(
-            f"{source}: {farthest_m / 1000:,.0f} km from the origin {origin[0]:.4f}, {origin[1]:.4f}: "
+            f"{source}: {where}{farthest_m / 1000:,.0f} km from the origin {origin[0]:.4f}, {origin[1]:.4f}: "
             f"at most {WIDEST_M / 1000:g} km; are latitudes and longitudes what they should be?"
         )
     return frame, position_m
 
 
+<<<<<<< HEAD
 def middle_deg(latitude_deg: Array, longitude_deg: Array) -> tuple[float, float]:
     """The middle of the box that holds these points (n,), one at least."""
     return _middle(latitude_deg), _middle(longitude_deg)
+=======
+def most_off(place: Array) -> int:
+    """Which of some places (n, 2) is the furthest from the middle one."""
+    return int(np.abs(place - np.median(place, axis=0)).max(axis=1).argmax())
+>>>>>>> maps2
 
 
 def _middle(values: Array) -> float:

@@ -99,9 +99,16 @@ def test_only_lanes_of_the_heading_fit_also_across_north_and_east() -> None:
 
 
 def test_a_map_whose_lanes_are_endless_does_not_fill_the_memory() -> None:
-    roads = road_map([[0.0, 0.0], [0.0, 5.0]], [0.0, 0.0], [1e300, 10.0])
+    roads = road_map([[0.0, 0.0], [0.0, 5.0]], [0.0, 0.0], [1e8, 10.0])
     _, segment, _ = roads.near(np.array([[1e6, 1.0]]), np.zeros(1), np.full(1, 3.0))
     assert segment.tolist() == [0]
+
+
+def test_who_is_nowhere_has_no_lane_near() -> None:
+    roads = scattered(3, 40)
+    position_m = np.array([[np.nan, np.nan], [0.0, 0.0], [1e9, -1e9], [np.inf, 0.0]])
+    row, _, _ = roads.near(position_m, np.full(4, np.nan), np.full(4, 500.0))
+    assert set(row.tolist()) == {1}
 
 
 # Parts.
@@ -166,6 +173,8 @@ WRONG = {
     "a heading that is no number": changed(heading_rad=(THREE * np.nan).tobytes()),
     "no length": changed(length_m=(THREE - 1).tobytes()),
     "an endless length": changed(length_m=(THREE * np.inf).tobytes()),
+    "a length around the earth": changed(length_m=(THREE * 1e8).tobytes()),
+    "a point beyond the earth": changed(point_m=np.array([0, 0, 0, 0, 0, 2e8]).tobytes()),
     "a negative width": changed(half_width_m=(-THREE).tobytes()),
     "a class that is not there": changed(kind=bytes([0, 1, 2])),
     "a truth value that is none": changed(one_way=bytes([0, 1, 2])),

@@ -12,16 +12,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from vnet.roads.grid import Grid
 from vnet.roads.lanes import Array, LaneMap
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""
 MOST_INDEXED = 1_000_000
 """About so many points besides one a segment are in the index; it is coarser where more would be needed."""
+SQUARE_M = 25.0
+"""The side of the index's squares."""
 HEADING_TOLERANCE_RAD = 0.35
 """A lane fits a vehicle whose heading differs by no more than this."""
+FARTHEST_M = 1e8
+"""No place is further from the origin, and no segment longer, in a map that comes in a message."""
 TAG = "roads"
 """What a map's plain form says it is."""
 MOST_CLASSES = 255
@@ -79,41 +83,36 @@ class RoadMap:
         """n·p of each centre line (S,), so that the signed offset of a point q is n·q - offset."""
         return np.asarray(np.einsum("ij,ij->i", self.normal, self.point_m))
 
-    def distance_m(self, position_m: Array, segment: NDArray[np.intp]) -> Array:
-        """How far positions (n, 2) are from segments (n,), each from its own: metres (n,)."""
-        from_start_m = position_m - self.point_m[segment]
-        direction = self.direction[segment]
-        along_m = np.clip(np.einsum("ij,ij->i", from_start_m, direction), 0.0, self.length_m[segment])
-        return np.asarray(np.hypot(*(from_start_m - along_m[:, None] * direction).T))
-
     @cached_property
-    def _index(self) -> tuple[cKDTree, NDArray[np.intp], float]:
-        """A tree of points on the segments, whose they are, and how far from one a segment's end may be."""
+    def _index(self) -> _Index:
         step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MOST_INDEXED)
         pieces = np.maximum(1, np.ceil(self.length_m / step_m)).astype(np.intp)
         whose = np.repeat(np.arange(len(self)), pieces)
         number = np.arange(len(whose)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         along_m = (number + 0.5) / pieces[whose] * self.length_m[whose]
-        return cKDTree(self.point_m[whose] + along_m[:, None] * self.direction[whose]), whose, step_m / 2
+        grid = Grid(self.point_m[whose] + along_m[:, None] * self.direction[whose], SQUARE_M)
+        whose = whose[grid.order]
+        east_m, north_m = self.point_m[whose].T.copy()
+        to_east, to_north = self.direction[whose].T.copy()
+        return _Index(grid, step_m / 2, whose, east_m, north_m, to_east, to_north, self.length_m[whose])
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
         """All segments within `reach_m` (M,) of positions (M, 2) that fit their headings (M,), NaN if unknown.
 
-        Returns pairs of a row and a segment, by row and then by distance, and the distances in metres.
+        Returns pairs of a row and a segment, by row and then by distance, and the distances in metres. A position
+        that is NaN has none.
         """
-        tree, whose, half_m = self._index
-        rows = tree.query_ball_point(position_m, reach_m + half_m, return_sorted=False)
-        count = np.fromiter(map(len, rows), dtype=np.intp, count=len(rows))
-        row = np.repeat(np.arange(len(rows)), count)
-        segment = whose[np.fromiter((i for found in rows for i in found), dtype=np.intp, count=int(count.sum()))]
-        turn = np.abs(np.mod(self.heading_rad[segment] - heading_rad[row] + np.pi, 2 * np.pi) - np.pi)
-        fits = ~(turn > HEADING_TOLERANCE_RAD)  # NaN fits
-        row, segment = row[fits], segment[fits]
-        distance_m = self.distance_m(position_m[row], segment)
-        within = distance_m <= reach_m[row]
-        row, segment, distance_m = row[within], segment[within], distance_m[within]
+        index = self._index
+        margin_m = (reach_m + index.half_m)[:, None]
+        row, place = index.grid.find(position_m - margin_m, position_m + margin_m)
+        turn = index.to_east[place] * np.cos(heading_rad)[row] + index.to_north[place] * np.sin(heading_rad)[row]
+        fits = np.flatnonzero(~(turn < np.cos(HEADING_TOLERANCE_RAD)))  # NaN fits
+        row, place = row[fits], place[fits]
+        distance_m = index.distance_m(position_m[:, 0][row], position_m[:, 1][row], place)
+        within = np.flatnonzero(distance_m <= reach_m[row])
+        row, segment, distance_m = row[within], index.whose[place[within]], distance_m[within]
         order = np.lexsort((segment, distance_m, row))
         row, segment, distance_m = row[order], segment[order], distance_m[order]
         new = np.ones(len(row), dtype=np.bool_)  # a long segment is found by several of its points
@@ -157,9 +156,9 @@ class RoadMap:
         if any(len(getattr(self, name)) != len(self) for name in _COLUMNS):
             raise ValueError("columns of a road map differ in length")
         right = {
-            "point_m": np.isfinite(self.point_m).all(),
+            "point_m": (np.abs(self.point_m) <= FARTHEST_M).all(),
             "heading_rad": ((self.heading_rad >= 0) & (self.heading_rad < 2 * np.pi)).all(),
-            "length_m": ((self.length_m > 0) & (self.length_m < np.inf)).all(),
+            "length_m": ((self.length_m > 0) & (self.length_m <= FARTHEST_M)).all(),
             "half_width_m": ((self.half_width_m >= 0) & (self.half_width_m < np.inf)).all(),
             "kind": (self.kind < len(self.classes)).all(),
             "one_way": (self.one_way.view(np.uint8) <= 1).all(),
@@ -174,6 +173,31 @@ class RoadMap:
 def map_from_wire(data: Any) -> LaneMap | RoadMap:
     """Restore whichever map it is. Raises ValueError or TypeError on anything else."""
     return RoadMap.from_wire(data) if isinstance(data, dict) else LaneMap.from_wire(data)
+
+
+@dataclass(frozen=True)
+class _Index:
+    """Points on the segments in the order of a grid (P,): whose each is, and again what is known of that segment.
+
+    What is near each other on the map is near each other in these arrays; a segment's end is at most `half_m` from
+    one of its points.
+    """
+
+    grid: Grid
+    half_m: float
+    whose: NDArray[np.intp]
+    east_m: Array
+    north_m: Array
+    to_east: Array
+    to_north: Array
+    length_m: Array
+
+    def distance_m(self, east_m: Array, north_m: Array, place: NDArray[np.intp]) -> Array:
+        """How far positions (n,) are from the whole segments at `place` (n,)."""
+        east_m, north_m = east_m - self.east_m[place], north_m - self.north_m[place]
+        to_east, to_north = self.to_east[place], self.to_north[place]
+        along_m = np.minimum(np.maximum(east_m * to_east + north_m * to_north, 0.0), self.length_m[place])
+        return np.asarray(np.hypot(east_m - along_m * to_east, north_m - along_m * to_north))
 
 
 def _column(name: str, data: object) -> NDArray[Any]:

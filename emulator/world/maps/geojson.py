@@ -1,6 +1,6 @@
 """Maps as lines in GeoJSON (RFC 7946, always WGS-84), read and written.
 
-Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`, `name`; or,
+Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`; or,
 without `class`, OpenStreetMap's `highway` and its other tags. Features that are no lines are left out and counted.
 """
 
@@ -24,7 +24,6 @@ from emulator.world.maps.classes import (
 )
 from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.tags import Street, street
-from emulator.world.projection import project
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, printable, shown
 from vnet.roads.lanes import Array
@@ -69,11 +68,7 @@ def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     builder = RoadsBuilder(path)
     for number, feature in enumerate(collection.features):
         _add_feature(path, builder, number, feature)
-    degrees = builder.places()
-    if not len(degrees):
-        raise ScenarioError(f"{path}: no lines among {len(collection.features)} features")
-    frame, node_m = project(path, degrees[:, 1], degrees[:, 0], origin_deg)
-    return builder.build(node_m, frame)
+    return builder.build_from_degrees(origin_deg)
 
 
 def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Feature) -> None:
@@ -90,7 +85,7 @@ def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Featu
         builder.note("ways not for cars")
         return
     lines = [geometry.coordinates] if geometry.type == "LineString" else geometry.coordinates
-    name = str(properties.get("name") or f"feature {number}")
+    name = f"feature {number}"
     for line in lines:
         points = _points(where, line)
         builder.add(name, points[::-1] if found.turned else points, found.kind, found.lanes, found.lane_width_m)

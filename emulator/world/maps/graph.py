@@ -47,7 +47,7 @@ def read_graph(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     """
     arrays = read_arrays(path, (*_NODES, *_EDGES, *_FRAME), LARGEST_ARRAY_BYTES)
     if "node_lon_deg" in arrays:
-        frame, node_m = project(path, *_degrees(path, arrays), origin_deg)
+        frame, node_m = project(path, *_degrees(path, arrays), origin_deg, "node {}".format)
         return _Merger(path, node_m, _edges(path, arrays, len(node_m)), frame).roads()
     node_m = _metres(path, arrays)
     edges = _edges(path, arrays, len(node_m))
@@ -60,8 +60,10 @@ def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) ->
         raise ScenarioError(f"{path}: no array {name!r}")
     array = arrays[name]
     if array.ndim != 1 or array.dtype.kind not in "iuf" or count not in (None, len(array)):
-        wanted = "one-dimensional" if count is None else f"of shape ({count},)"
-        raise ScenarioError(f"{path}: {name}: numbers {wanted} are needed, not {array.dtype} {array.shape}")
+        wanted = f"({'n' if count is None else count},)"
+        raise ScenarioError(
+            f"{path}: {name}: numbers of shape {wanted} are needed, not {array.dtype} {array.shape}"
+        )
     numbers = array.astype(float)
     if not np.isfinite(numbers).all():
         raise ScenarioError(f"{path}: {name}[{int(np.argmin(np.isfinite(numbers)))}]: a finite number is needed")
@@ -193,7 +195,7 @@ class _Merger:
 
     def roads(self) -> Roads:
         """All roads. Raises ScenarioError without any."""
-        check_extent(self._path, self._node_m, len(self._ends))
+        check_extent(self._path, self._node_m, len(self._ends), "node {}".format)
         chains = list(self._chains())
         node = np.array([n for chain, _ in chains for n in chain], dtype=np.intp)
         first = np.concatenate([[0], np.cumsum([len(chain) for chain, _ in chains])])

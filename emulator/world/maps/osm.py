@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.tags import street
-from emulator.world.projection import project
 from vnet.errors import ScenarioError, printable
 
 if TYPE_CHECKING:
     from osmium.osm import Way
+
+_LONGEST_LINE = 1 << 16
 
 
 def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
@@ -28,13 +29,23 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
         for entity in file:
             if isinstance(entity, osmium.osm.Way):
                 _add_way(path, builder, entity)
+    except osmium.InvalidLocationError as error:
+        value = str(error).partition("'")[2].removesuffix("'")
+        raise ScenarioError(f"{path}: {_line_of(path, value)}{printable(str(error), 300)}") from None
     except (RuntimeError, ValueError, OSError) as error:
         raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
-    degrees = builder.places()
-    if not len(degrees):
-        raise ScenarioError(f"{path}: no roads that vehicles may use")
-    frame, node_m = project(path, degrees[:, 1], degrees[:, 0], origin_deg)
-    return builder.build(node_m, frame)
+    return builder.build_from_degrees(origin_deg)
+
+
+def _line_of(path: Path, value: str) -> str:
+    """Where a value is in an XML file: pyosmium says only of what is no XML at all in which line it stands."""
+    quoted, line = value.encode(), 1
+    with path.open("rb") as file:
+        while part := file.readline(_LONGEST_LINE):
+            if b'"' + quoted + b'"' in part or b"'" + quoted + b"'" in part:
+                return f"line {line}: "
+            line += part.endswith(b"\n")
+    return ""
 
 
 def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:

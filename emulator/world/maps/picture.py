@@ -31,7 +31,7 @@ _STYLES = {
     "road": ("#0072B2", 0.7),
     "crossing": ("#999999", 0.6),
 }
-_SIDE_INCHES, _LEGEND_INCHES, _DPI = 9.0, 1.6, 140
+_SIDE_INCHES, _DPI = 9.0, 140
 
 
 def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] | None = None) -> None:
@@ -44,7 +44,7 @@ def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] |
     low, high = low - margin_m, high + margin_m
     span_m = float((high - low).max())
     width, height = np.maximum((high - low) / span_m, 0.3) * _SIDE_INCHES
-    figure = Figure(figsize=(width + _LEGEND_INCHES, height + 1.0), layout="constrained")
+    figure = Figure(figsize=(width, height))
     axes = figure.add_subplot()
     if span_m <= CLOSE_M:
         _draw_lanes(axes, roads)
@@ -53,7 +53,7 @@ def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] |
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_title(title, loc="left", fontsize=11)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=_DPI, bbox_inches="tight")
 
 
 def _style(kind: int) -> tuple[str, float]:
@@ -71,9 +71,9 @@ def _draw_roads(axes: Axes, roads: Roads, scale: float) -> None:
         axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width * scale, capstyle="round"))
         name = NAMES[kind].removesuffix("_link").replace("_", " ")
         handles[name] = Line2D([], [], color=colour, linewidth=width + 0.6, label=name)
-    axes.legend(
-        handles=list(handles.values())[::-1], loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9
-    )
+    if len(handles) > 1:
+        shown = list(handles.values())[::-1]
+        axes.legend(handles=shown, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=9)
 
 
 def _draw_lanes(axes: Axes, roads: Roads) -> None:

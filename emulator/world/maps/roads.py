@@ -6,7 +6,8 @@ on which people drive. A road with lanes one way only has its centre line in the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from bisect import bisect
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
-from emulator.world.projection import WIDEST_M, Frame, project
+from emulator.world.projection import WIDEST_M, Frame, most_off, project
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import Array
 from vnet.roads.road_map import RoadMap, touch_box
@@ -78,7 +79,7 @@ class Roads:
     def within(self, low_m: Array, high_m: Array) -> Roads:
         """What of the roads touches the box from `low_m` (2,) to `high_m` (2,), in whole segments.
 
-        A road that leaves the box and comes back becomes several of the same name.
+        A road that leaves the box and comes back becomes several of the same name. Notes are about the whole.
         """
         place = self.node_m[self.node]
         segment = self.segment[touch_box(place[self.segment], place[self.segment + 1], low_m, high_m)]
@@ -99,6 +100,7 @@ class Roads:
             backward=self.backward[road],
             lane_width_m=self.lane_width_m[road],
             one_way=self.one_way[road],
+            notes={},
         )
 
     def around(self, source: object, origin_deg: tuple[float, float] | None) -> Roads:
@@ -215,19 +217,20 @@ class RoadsBuilder:
 
         Raises ScenarioError when there are more points than `MOST_POINTS`.
         """
-        nodes: list[int] = []
-        for key, place in points:
+        line: list[tuple[object, tuple[float, float]]] = []
+        for point in points:
+            if line and line[-1][0] == point[0]:
+                self.note("points twice in a row")
+            else:
+                line.append(point)
+        if len(line) < 2:
+            self.note("roads without length")
+            return
+        for key, place in line:
             number = self._number.setdefault(key, len(self._place))
             if number == len(self._place):
                 self._place.append(place)
-            if nodes and nodes[-1] == number:
-                self.note("points twice in a row")
-            else:
-                nodes.append(number)
-        if len(nodes) < 2:
-            self.note("roads without length")
-            return
-        self._node += nodes
+            self._node.append(number)
         if len(self._node) > MOST_POINTS:
             raise ScenarioError(f"{self._source}: {name}: more than {MOST_POINTS} points; cut out a part first")
         self._first.append(len(self._node))
@@ -239,9 +242,21 @@ class RoadsBuilder:
         """The coordinates of the points so far, (N, 2)."""
         return np.array(self._place, dtype=float).reshape(-1, 2)
 
+    def build_from_degrees(self, origin_deg: tuple[float, float] | None) -> Roads:
+        """The roads, whose points are longitudes and latitudes. Raises ScenarioError as `project` does."""
+        if not self._rows:
+            raise ScenarioError(f"{self._source}: no roads that vehicles may use")
+        lon, lat = self.places().T
+        frame, node_m = project(self._source, lat, lon, origin_deg, self._name_of)
+        return self.build(node_m, frame)
+
+    def _name_of(self, point: int) -> str:
+        """The name of a road that runs through a point."""
+        return self._rows[bisect(self._first, self._node.index(point)) - 1].name
+
     def build(self, node_m: Array, frame: Frame | None) -> Roads:
         """The roads, with the points' places in metres (N, 2). Raises ScenarioError as `check_extent` does."""
-        check_extent(self._source, node_m, len(self._rows))
+        check_extent(self._source, node_m, len(self._rows), self._name_of)
         return Roads(
             node_m,
             np.array(self._node, dtype=np.intp),
@@ -261,8 +276,11 @@ def _column(values: Sequence[int]) -> Ints:
     return np.array(values, dtype=np.intp)
 
 
-def check_extent(source: object, node_m: Array, roads: int) -> None:
-    """Raises ScenarioError where there are no roads, or where their points lie too far apart to be one map."""
+def check_extent(source: object, node_m: Array, roads: int, name: Callable[[int], str]) -> None:
+    """Raises ScenarioError where there are no roads, or where points (N, 2) lie too far apart to be one map.
+
+    `name` says what a point is in the file.
+    """
     if not roads:
         raise ScenarioError(f"{source}: no roads that vehicles may use")
     if not np.isfinite(node_m).all():
@@ -270,6 +288,6 @@ def check_extent(source: object, node_m: Array, roads: int) -> None:
     span_m = float(np.ptp(node_m, axis=0).max())
     if span_m > 2 * WIDEST_M:
         raise ScenarioError(
-            f"{source}: spans {span_m / 1000:.0f} km; at most {2 * WIDEST_M / 1000:.0f} are allowed: "
-            "are all points in the same projection?"
+            f"{source}: {name(most_off(node_m))}: the map spans {span_m / 1000:.0f} km, and at most "
+            f"{2 * WIDEST_M / 1000:.0f} are allowed; are all points in the same projection?"
         )
