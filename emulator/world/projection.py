@@ -85,8 +85,8 @@ def project(
 ) -> tuple[Frame, Array]:
     """Points (n,), one at least, in degrees as metres (n, 2), and the frame around `origin_deg`, else their middle.
 
-    Raises ScenarioError where they are further than `WIDEST_M` from there: it names `source`, and what `name` says of
-    the point that is off most others.
+    Raises ScenarioError where they are further than `WIDEST_M` from there: it names `source`, and what `name` says
+    of the point that is off most others.
     """
     origin = origin_deg or middle_deg(latitude_deg, longitude_deg)
     frame = Frame.around(*origin)
@@ -101,15 +101,14 @@ def project(
     return frame, position_m
 
 
-<<<<<<< HEAD
 def middle_deg(latitude_deg: Array, longitude_deg: Array) -> tuple[float, float]:
     """The middle of the box that holds these points (n,), one at least."""
     return _middle(latitude_deg), _middle(longitude_deg)
-=======
+
+
 def most_off(place: Array) -> int:
     """Which of some places (n, 2) is the furthest from the middle one."""
     return int(np.abs(place - np.median(place, axis=0)).max(axis=1).argmax())
->>>>>>> maps2
 
 
 def _middle(values: Array) -> float:
