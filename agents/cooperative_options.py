@@ -71,6 +71,10 @@ class Options:
     """If positive, the common error is a random walk of so much a √s, in place of the Gauss-Markov process."""
     lateral_tau_s: float = 20.0
     """How long a vehicle keeps its offset in the lane: a road counts anew so often."""
+    lateral_m: float = 500.0
+    """On the map of a city: over how much road a vehicle keeps its offset in the lane."""
+    off_road: float = 0.1
+    """On the map of a city: the share of vehicles that are on no road."""
     start_m: list[float] = field(default_factory=lambda: [0.0, 0.0])
     """Where the cloud starts."""
     start_sigma_m: float = 0.0
@@ -120,6 +124,7 @@ class Options:
             ("slots", 1, 1000),
             ("alpha", 0, 1),
             ("self_floor", 0, 1),
+            ("off_road", 0, 0.99),
             ("ridge_m2", 0, 1e6),
             ("common_sigma_m", 0, COMMON_LIMIT_M),
             ("common_walk_m", 0, COMMON_LIMIT_M),
@@ -127,7 +132,7 @@ class Options:
         ):
             if not low <= getattr(self, key) <= high:
                 raise _wrong(key, getattr(self, key), f"{low} to {high} allowed")
-        for key in ("common_tau_s", "lateral_tau_s", "fusion_interval_s"):
+        for key in ("common_tau_s", "lateral_tau_s", "lateral_m", "fusion_interval_s"):
             if not getattr(self, key) > 0:
                 raise _wrong(key, getattr(self, key), "must be positive")
 
@@ -151,6 +156,8 @@ class Options:
             self.common_tau_s,
             common_walk_m=self.common_walk_m or None,
             lateral_tau_s=self.lateral_tau_s,
+            lateral_m=self.lateral_m,
+            off_road=self.off_road,
             start_m=(self.start_m[0], self.start_m[1]),
             start_sigma_m=self.start_sigma_m or None,
             one_sided=self.one_sided,

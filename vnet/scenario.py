@@ -122,6 +122,8 @@ class Map(Section):
     """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips'."""
     sigma_m: float = Field(0.0, ge=0, le=WILD_M)
     """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
+    aside_m: float = Field(0.0, ge=-FAR_M, le=FAR_M)
+    """How far to the right of the map's lanes vehicles really drive, in the mean; negative: to the left."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)
     """Programs are given the roads within so much of the box in which vehicles drive."""
 

@@ -52,6 +52,8 @@ class Cell:
     labels: Mapping[str, str | int | float]
     scenario: Scenario
     from_s: float = 0.0
+    keeps_states: bool = False
+    """Whether every vehicle's state in every period is kept as well."""
 
     @property
     def digest(self) -> str:
@@ -98,6 +100,16 @@ def read_series(cell: Cell, folder: Path) -> pa.Table:
     return pq.read_table(folder / "cells" / f"{cell.digest}.parquet")
 
 
+def read_states(cell: Cell, folder: Path) -> pa.Table:
+    """The states of a finished cell that keeps them, a row for each vehicle and period."""
+    return pq.read_table(_states_path(folder / "cells", cell))
+
+
+def has_result(cell: Cell, folder: Path) -> bool:
+    """Whether a cell has been simulated."""
+    return _result_path(folder / "cells", cell).exists()
+
+
 def write_results(results: Sequence[dict[str, Any]], folder: Path, name: str) -> Path:
     """All cells as one Parquet file."""
     path = folder / f"{name}.parquet"
@@ -107,6 +119,10 @@ def write_results(results: Sequence[dict[str, Any]], folder: Path, name: str) ->
 
 def _result_path(store: Path, cell: Cell) -> Path:
     return store / f"{cell.digest}.json"
+
+
+def _states_path(store: Path, cell: Cell) -> Path:
+    return store / f"{cell.digest}.states.parquet"
 
 
 def _run_all(cells: list[Cell], store: Path, live: bool) -> Iterator[Cell]:
@@ -155,6 +171,8 @@ def run_cell(cell: Cell, store: Path, live: bool = False) -> None:
     series = store / f"{cell.digest}.parquet"
     pq.write_table(emulation.metrics.metrics_table(), series.with_suffix(".tmp"))
     series.with_suffix(".tmp").rename(series)
+    if cell.keeps_states:
+        pq.write_table(emulation.metrics.states_table(), _states_path(store, cell))
     result = _result_path(store, cell)
     result.with_suffix(".tmp").write_text(json.dumps(figures))
     result.with_suffix(".tmp").rename(result)
@@ -197,6 +215,9 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
 
 
 def _rms_columns(rows: list[list[float | None]]) -> list[float]:
+    """By column; none where vehicles move and the number of components changes."""
+    if len({len(row) for row in rows}) > 1:
+        return []
     table = np.array([[np.nan if value is None else value for value in row] for row in rows], dtype=float)
     return [float(value) for value in np.sqrt(np.mean(table**2, axis=0))]
 

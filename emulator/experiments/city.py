@@ -16,12 +16,13 @@ import pyarrow.compute as pc
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from emulator.experiments.cells import Cell
-from emulator.experiments.figures import save, styled
-from emulator.experiments.paper import SETTLED_S, _everybody
+from emulator.experiments.cells import Cell, has_result, read_series, read_states
+from emulator.experiments.figures import against_time, save, styled
+from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table, mean_and_error
 from emulator.world.world import build_world
+from vnet.errors import VnetError
 from vnet.roads.lanes import Array
 from vnet.scenario import Scenario
 
@@ -36,38 +37,57 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "none": {"fusion": "none"},
 }
 """Options of each mechanism that is not centralized."""
+KEPT = "optimized"
+"""Of this mechanism and the first seed the states are kept, for the map of errors."""
+VEHICLES = 50
 PLACE_M = 50.0
 """The map of errors has squares of this side."""
 
 
-def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float, range_m: float) -> list[Cell]:
+def place(trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float) -> dict[str, Any]:
+    """The sections `network` and `map` of scenarios: of files, or of a generated city.
+
+    Raises VnetError unless trips and roads come together, and from files that are there.
+    """
+    if trips is None and roads is None:
+        return {"network": {"kind": "city", "vehicles": VEHICLES}}
+    for option, path in (("--trips", trips), ("--map", roads)):
+        if path is None:
+            raise VnetError(f"{option} is needed: trips and the map that they are on come together")
+        if not path.is_file():
+            raise VnetError(f"{option} {path}: no such file")
+    return {
+        "network": {"kind": "trips", "path": str(trips and trips.resolve())},
+        "map": {"path": str(roads and roads.resolve()), "sigma_m": sigma_m, "aside_m": aside_m},
+    }
+
+
+def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float) -> list[Cell]:
     """One filter that hears all, and each mechanism; `place` are the sections `network` and, if any, `map`."""
-    cells = []
-    for seed in seeds:
-        for mechanism in ("centralized", *MECHANISMS):
-            scenario = city_scenario(place, seed, mechanism, duration_s, range_m)
-            settled_s = min(SETTLED_S, duration_s / 2)
-            cells.append(Cell({"mechanism": mechanism, "seed": seed}, scenario, settled_s))
-    return cells
+    return [
+        Cell(
+            {"mechanism": mechanism, "seed": seed},
+            city_scenario(place, seed, mechanism, duration_s),
+            min(SETTLED_S, duration_s / 2),
+            mechanism == KEPT and seed == seeds[0],
+        )
+        for seed in seeds
+        for mechanism in ("centralized", *MECHANISMS)
+    ]
 
 
-def city_scenario(
-    place: Mapping[str, Any], seed: int, mechanism: str, duration_s: float, range_m: float
-) -> Scenario:
+def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_s: float) -> Scenario:
     """One run. Raises ScenarioError if there is no such place."""
     data: dict[str, Any] = {
-        "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
+        "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": 0.0},
         **place,
-        "radio": {"range_m": range_m, "loss": LOSS},
+        "radio": {"range_m": RANGE_M, "loss": LOSS},
         "program": {"entry": "agents.cooperative:main", "options": MECHANISMS.get(mechanism, {})},
     }
     if mechanism == "centralized":
         count = len(build_world(Scenario.model_validate(data)).node_ids)
-        data["radio"] = _everybody(np.ones((count, count)))
-        data["program"] = {
-            "entry": "agents.centralized:main",
-            "options": {"particles": CENTRALIZED_PARTICLES},
-        }
+        data["radio"] = everybody(np.ones((count, count)))
+        data["program"] = {"entry": "agents.centralized:main", "options": {"particles": CENTRALIZED_PARTICLES}}
     return Scenario.model_validate(data)
 
 
@@ -131,9 +151,29 @@ def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
     return figure
 
 
-def errors_picture(states: pa.Table, lanes: Array, out: Path, title: str) -> Path:
-    """Write the map of errors; returns the PNG."""
-    return save(draw_errors_by_place(states, lanes, title), out)
+def draw_against_time(cells: Sequence[Cell], folder: Path) -> Path:
+    """Errors of each mechanism against time; returns the PNG."""
+    series: dict[str, list[pa.Table]] = {}
+    for cell in cells:
+        if has_result(cell, folder):
+            series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
+    columns = {
+        "common_error_rmse_m": "RMSE of the\ncommon error (m)",
+        "position_rmse_m": "RMSE of the\nposition (m)",
+    }
+    return against_time(series, folder / "city_against_time", "Driving through a city", columns=columns)
+
+
+def draw_errors(cells: Sequence[Cell], folder: Path) -> Path | None:
+    """Where positions are wrong, on the map, in the run that was kept; returns the PNG, None without that run."""
+    kept = next(cell for cell in cells if cell.keeps_states)
+    if not has_result(kept, folder):
+        return None
+    lanes = build_world(kept.scenario).lane_map
+    start_m, ahead = lanes.point_m, np.column_stack([np.cos(lanes.heading_rad), np.sin(lanes.heading_rad)])
+    pieces = np.stack([start_m, start_m + lanes.length_m[:, None] * ahead], axis=1)
+    figure = draw_errors_by_place(read_states(kept, folder), pieces, f"{KEPT}: where positions are wrong")
+    return save(figure, folder / "city_errors")
 
 
 def _points(states: pa.Table, name: str) -> Array:

@@ -127,6 +127,38 @@ def divergence(
         _show(study.report(results), folder / "divergence.md")
 
 
+@app.command()
+def city(
+    trips: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="How vehicles drive; through a generated city otherwise.")
+    ] = None,
+    roads: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="The roads they drive on.")] = None,
+    map_sigma: Annotated[
+        float, typer.Option(min=0, metavar="METRES", help="How far true lanes stray from the map's.")
+    ] = 0.0,
+    map_aside: Annotated[
+        float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
+    ] = 0.0,
+    seeds: SeedsOption = 3,
+    duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 300.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+    live: LiveOption = False,
+) -> None:
+    """Vehicles that drive: every mechanism on the same trips and roads, raw fixes beside. Takes hours for all."""
+    from emulator.experiments import city as study
+
+    with one_line_errors():
+        folder = _folder(out, "city")
+        place = study.place(trips, roads, map_sigma, map_aside)
+        cells = study.city_cells(place, range(1, seeds + 1), duration)
+        results = _run(cells, folder, "city", only, live)
+        print(study.draw_against_time(cells, folder))
+        if picture := study.draw_errors(cells, folder):
+            print(picture)
+        _show(study.report(results, duration), folder / "city.md")
+
+
 @app.command("figures")
 def draw_figures(
     networks: NetworksOption = None,

@@ -202,23 +202,29 @@ def against_time(
     title: str,
     references: Mapping[str, float] | None = None,
     log: bool = False,
+    columns: Mapping[str, str] = TIME_COLUMNS,
 ) -> Path:
     """RMSE of the common error and network deviation (m) against time (s): means over seeds ± 1 standard error.
 
     `series` has the metrics of each seed for each mechanism. `references` are levels of the RMSE (m) by label, as
-    the paper's; one whose label ends with a mechanism's name has its colour.
+    the paper's; one whose label ends with a mechanism's name has its colour. `columns` are those of the metrics
+    that are drawn, a panel each, with its title.
     """
-    return save(draw_against_time(series, title, references or {}, log), out)
+    return save(draw_against_time(series, title, references or {}, log, columns), out)
 
 
 @styled
 def draw_against_time(
-    series: Mapping[str, Sequence[pa.Table]], title: str, references: Mapping[str, float], log: bool
+    series: Mapping[str, Sequence[pa.Table]],
+    title: str,
+    references: Mapping[str, float],
+    log: bool,
+    columns: Mapping[str, str] = TIME_COLUMNS,
 ) -> Figure:
     figure = Figure(figsize=(9, 6.4), layout="constrained")
-    panels = figure.subplots(len(TIME_COLUMNS), 1, sharex=True)
+    panels = figure.subplots(len(columns), 1, sharex=True)
     looks = _looks(list(series))
-    for axes, (column, label) in zip(panels, TIME_COLUMNS.items(), strict=True):
+    for axes, (column, label) in zip(panels, columns.items(), strict=True):
         for number, (mechanism, tables) in enumerate(series.items()):
             _draw_band(axes, tables, column, looks[mechanism], mechanism, number / len(series))
         axes.set_ylabel(label)

@@ -142,7 +142,7 @@ def bound_scenario(
         {
             "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
             "network": network,
-            "radio": _everybody(label[:, None] == label[None, :]),
+            "radio": everybody(label[:, None] == label[None, :]),
             "program": {
                 "entry": "agents.centralized:main",
                 "options": {"particles": CENTRALIZED_PARTICLES} | (options or {}),
@@ -182,11 +182,11 @@ def _paper(network: dict[str, Any], seed: int, options: dict[str, Any], hears: A
             for node, row in zip(world.node_ids, hears, strict=True)
         }
     data["program"]["options"] = options
-    data["radio"] = _everybody(np.ones((len(world.node_ids),) * 2))
+    data["radio"] = everybody(np.ones((len(world.node_ids),) * 2))
     return Scenario.model_validate(data)
 
 
-def _everybody(linked: Any) -> dict[str, Any]:
+def everybody(linked: Any) -> dict[str, Any]:
     """A radio without loss or cap on which `linked` (N, N) hear each other."""
     links = np.asarray(linked).astype(int).tolist()
     return {

@@ -61,10 +61,10 @@ class RbpfConfig:
     one_sided: bool = False
     roads_apart: bool = False
     least_log_road: float = -np.inf
-    off_road: float = 0.05
+    off_road: float = 0.1
     driving_m2_s4: tuple[float, float] = (16.0, 4.0)
     driving_m_s: float = 15.0
-    lateral_m: float = 200.0
+    lateral_m: float = 500.0
 
     def __post_init__(self) -> None:
         if self.particles < 1:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from emulator.world.maps.files import read_roads
@@ -31,6 +33,8 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
     low_m, high_m = place_m.min(axis=0) - section.margin_m, place_m.max(axis=0) + section.margin_m
     part = roads.within(low_m, high_m)
     lanes = part.lane_map(section.drive_on, section.sigma_m) if len(part) else None
+    if lanes is not None and section.aside_m:
+        lanes = replace(lanes, point_m=lanes.point_m + section.aside_m * lanes.normal)
     if lanes is None or _far_share(lanes, place_m) > 0.5:
         (x, y), (left, low), (right, high) = np.median(place_m, axis=0), *_extent(roads)
         raise ScenarioError(
