@@ -122,28 +122,29 @@ def report(results: Sequence[Result], duration_s: float) -> str:
     )
 
 
-def errors_by_place(states: pa.Table) -> tuple[Array, Array, Array]:
-    """Squares of the map (n, 2), by their corners in metres; RMSE (n,) of positions in them, and how many (n,)."""
+def errors_by_place(states: pa.Table) -> tuple[Array, Array]:
+    """Squares of the map (n, 2), by their corners in metres, and RMSE (n,) of the positions in them."""
     states = states.filter(pc.and_(pc.is_valid(states["estimate_m"]), pc.is_valid(states["position_m"])))
     position_m, estimate_m = (_points(states, name) for name in ("position_m", "estimate_m"))
     square, which, count = np.unique(
         np.floor(position_m / PLACE_M), axis=0, return_inverse=True, return_counts=True
     )
     squares = np.bincount(which.ravel(), np.sum((estimate_m - position_m) ** 2, axis=1))
-    return square * PLACE_M, np.sqrt(squares / count), count
+    return np.asarray(square * PLACE_M), np.asarray(np.sqrt(squares / count))
 
 
 @styled
 def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
     """Position errors on the map; `lanes` (s, 2, 2) are pieces of the roads in metres."""
-    corner_m, error_m, _ = errors_by_place(states)
+    corner_m, error_m = errors_by_place(states)
     figure = Figure(figsize=(9, 8), layout="constrained")
     axes = figure.add_subplot()
     axes.add_collection(LineCollection(list(lanes / 1000), colors="#bbbbbb", linewidths=0.4))
     middle_km = (corner_m + PLACE_M / 2) / 1000
     order = np.argsort(error_m)  # the worst on top
     top_m = max(2.0, np.percentile(error_m, 98))
-    dots = axes.scatter(*middle_km[order].T, c=error_m[order], s=9, cmap="viridis", vmin=0, vmax=top_m)
+    east_km, north_km = middle_km[order].T
+    dots = axes.scatter(east_km, north_km, c=error_m[order], s=9, cmap="viridis", vmin=0, vmax=top_m)
     figure.colorbar(dots, ax=axes, label="RMSE of the position (m)", extend="max", shrink=0.7)
     axes.set(xlabel="east (km)", ylabel="north (km)", aspect="equal", title=title)
     low, high = middle_km.min(axis=0) - 0.2, middle_km.max(axis=0) + 0.2
