@@ -17,6 +17,7 @@ from rich.table import Table
 
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
 
 Figures = dict[str, float]
 ROOT = Path(__file__).parents[1]
@@ -186,6 +187,47 @@ def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Fi
     return {"step_us": statistics.median(times_s) * 1e6}
 
 
+def bench_city_rbpf(particles: int = 500, vehicles: int = 10, lanes: int = 4, steps: int = 400) -> Figures:
+    """The same of vehicles that drive on roads of several lanes, each a candidate; on straight lanes beside."""
+    rng = np.random.default_rng(0)
+    heading = rng.uniform(0, 2 * np.pi, vehicles)
+    ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+    aside = np.column_stack([np.sin(heading), -np.cos(heading)])
+    place = rng.uniform(0, 5000, (vehicles, 2))
+    which, number = np.divmod(np.arange(vehicles * lanes), lanes)
+    start = place[which] - 1000 * ahead[which] + 3.5 * (number - (lanes - 1) / 2)[:, None] * aside[which]
+    count = vehicles * lanes
+    roads = RoadMap(
+        start,
+        heading[which],
+        np.full(count, 3000.0),
+        np.full(count, 0.85),
+        np.zeros(count, dtype=np.uint8),
+        np.ones(count, dtype=np.bool_),
+        which.astype(np.int32),
+        np.arange(count, dtype=np.int32),
+        ("road",),
+        1.5,  # so that the lanes stay hypotheses
+    )
+    filters = {
+        name: Rbpf(RbpfConfig(particles=particles), known, np.random.default_rng(1))
+        for name, known in (("city", roads), ("straight", LaneMap(place, heading, 0.85)))
+    }
+    times_s: dict[str, list[float]] = {name: [] for name in filters}
+    for step in range(steps):
+        for name, rbpf in filters.items():
+            position = place + 1.2 * step * ahead * (name == "city")
+            noise = rng.normal(size=(vehicles, 2))
+            fixes = {
+                f"v{j}": Observation(position[j] + [2.0, -1.0] + noise[j], np.eye(2), float(heading[j]))
+                for j in range(vehicles)
+            }
+            started = time.perf_counter()
+            rbpf.step(0.1, fixes)
+            times_s[name].append(time.perf_counter() - started)
+    return {f"{name}_step_us": statistics.median(times) * 1e6 for name, times in times_s.items()}
+
+
 def bench_dashboard() -> Figures:
     """What the picture of a run with 50 vehicles costs: taking a snapshot, and a redraw at 100 × 30."""
     from benchmarks import dashboard
@@ -223,6 +265,7 @@ def bench_maps() -> Figures:
 
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
+    "city_rbpf": bench_city_rbpf,
     "maps": bench_maps,
     "dashboard": bench_dashboard,
     "estimators": bench_estimators,
