@@ -102,8 +102,8 @@ def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
     for name, (count, km) in report.by_class.items():
         table.add_row(name, f"{count:,}", f"{km:,.1f}")
     console.print(table)
-    for what, count in report.problems.items():
-        print(f"{what}: {count}")
+    for what, how_many in report.problems.items():
+        print(f"{what}: {how_many}")
 
 
 def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | None) -> None:

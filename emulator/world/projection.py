@@ -85,8 +85,8 @@ def project(
 ) -> tuple[Frame, Array]:
     """Points (n,), one at least, in degrees as metres (n, 2), and the frame around `origin_deg`, else their middle.
 
-    Raises ScenarioError where they are further than `WIDEST_M` from there: it names `source`, and what `name` says of
-    the point that is off most others.
+    Raises ScenarioError where they are further than `WIDEST_M` from there: it names `source`, and what `name` says
+    of the point that is off most others.
     """
     origin = origin_deg or (_middle(latitude_deg), _middle(longitude_deg))
     frame = Frame.around(*origin)
