@@ -21,6 +21,7 @@ from vnet.roads.lanes import Array
 app = typer.Typer(no_args_is_help=True, help="Look at maps, and convert them.")
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="OSM XML or PBF, SUMO .net.xml, GeoJSON or NPZ.")]
+OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="A file: .geojson, .json or .npz.")]
 OriginOption = Annotated[
     str | None, typer.Option(metavar="LAT,LON", help="Where the map's metres start; else in its middle.")
 ]
@@ -32,7 +33,7 @@ def show(
     out: Annotated[Path | None, typer.Option(help="Write a picture (PNG).")] = None,
     origin: OriginOption = None,
     at: Annotated[str | None, typer.Option(metavar="EAST,NORTH", help="The middle of a part, in metres.")] = None,
-    side_km: Annotated[float, typer.Option(min=0.01, max=1000, help="The side of that part.")] = 3.0,
+    side_km: Annotated[float, typer.Option(min=0.01, max=1000, help="The side of that part, in km.")] = 3.0,
 ) -> None:
     """Say how long a map's roads are and what is odd about it, and draw it."""
     with one_line_errors():
@@ -48,7 +49,7 @@ def show(
 
 
 @app.command()
-def convert(map_file: MapArgument, out: Path, origin: OriginOption = None) -> None:
+def convert(map_file: MapArgument, out: OutArgument, origin: OriginOption = None) -> None:
     """Write a map as GeoJSON or NPZ, by the name of OUT."""
     with one_line_errors():
         writer_of(out)  # before a large file is read
@@ -102,8 +103,8 @@ def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
     for name, (count, km) in report.by_class.items():
         table.add_row(name, f"{count:,}", f"{km:,.1f}")
     console.print(table)
-    for what, count in report.problems.items():
-        print(f"{what}: {count}")
+    for what, how_many in report.problems.items():
+        print(f"{what}: {how_many}")
 
 
 def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | None) -> None:

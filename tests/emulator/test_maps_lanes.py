@@ -29,11 +29,11 @@ def ends(found: Any, lane: int) -> list[tuple[float, ...]]:
 def test_people_drive_on_the_right_or_on_the_left() -> None:
     right, left = roads((EAST, (2, 1))).lane_map(), roads((EAST, (2, 1))).lane_map("left")
     assert [ends(right, lane) for lane in range(3)] == [
-        [(0.0, -1.5), (100.0, -1.5)],
-        [(0.0, -4.5), (100.0, -4.5)],
-        [(100.0, 1.5), (0.0, 1.5)],
+        [(0.0, 0.0), (100.0, 0.0)],
+        [(0.0, -3.0), (100.0, -3.0)],
+        [(100.0, 3.0), (0.0, 3.0)],
     ]
-    assert [ends(left, lane)[0][1] for lane in range(3)] == [1.5, 4.5, -1.5]
+    assert [ends(left, lane)[0][1] for lane in range(3)] == [0.0, 3.0, -3.0]
     assert right.heading_rad.tolist() == pytest.approx([0, 0, np.pi])
     assert right.half_width_m == pytest.approx(np.full(3, (3.0 - 1.8) / 2))
     assert not right.one_way.any() and right.road.tolist() == [0, 0, 0]

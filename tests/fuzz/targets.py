@@ -27,6 +27,7 @@ from emulator.world.maps.files import read_roads
 from emulator.world.networks import load_network
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
+from tests.emulator import maps
 from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, VnetError, WireError
 from vnet.faults import KINDS, parse_fault
 from vnet.link import wire
@@ -164,6 +165,11 @@ def _read_map(name: str, data: bytes) -> None:
     lanes = read_roads(_file(name, data)).lane_map()
     assert np.isfinite(lanes.point_m).all() and (lanes.length_m > 0).all()
     RoadMap.from_wire(lanes.to_wire())
+
+
+def _pbf() -> bytes:
+    with temporary_folder() as folder:
+        return maps.write_pbf(Path(folder) / "town.osm.pbf").read_bytes()
 
 
 def _read_sumo(data: bytes) -> None:
@@ -425,6 +431,7 @@ TARGETS = (  # the slowest first
         (_npz(x_m=np.array([[0.0, 1, 2, 3]]), y_m=np.zeros((1, 4)), rate_hz=2.0),),
     ),
     Target("map OSM", partial(_read_map, "m.osm"), ScenarioError, (_OSM,), (*_XML_WORDS, b"lanes:forward", b"-1")),
+    Target("map PBF", partial(_read_map, "m.osm.pbf"), ScenarioError, (_pbf(),)),
     Target(
         "map SUMO", partial(_read_map, "m.net.xml"), ScenarioError, (_NET,), (*_XML_WORDS, b"1e308,", b"+proj=")
     ),

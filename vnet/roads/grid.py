@@ -19,7 +19,7 @@ class Grid:
 
     def __init__(self, point_m: Array, side_m: float) -> None:
         self._side_m = side_m
-        self._low_m = point_m.min(axis=0, initial=np.inf) if len(point_m) else np.zeros(2)
+        self._low_m = point_m.min(axis=0) if len(point_m) else np.zeros(2)
         cell = self._cell(point_m).astype(np.intp)
         self._columns, self._rows = (cell.max(axis=0, initial=-1) + 1).tolist()
         number = cell[:, 1] * self._columns + cell[:, 0]

@@ -50,7 +50,7 @@ def examine(roads: Roads) -> MapReport:
     )
 
 
-def piece_of_node(roads: Roads) -> Ints:
+def _piece_of_node(roads: Roads) -> Ints:
     """Which connected piece each point belongs to, (N,); 0 is the one of most road."""
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     count = len(roads.node_m)
@@ -59,13 +59,13 @@ def piece_of_node(roads: Roads) -> Ints:
     length_m = np.bincount(label[start], roads.segment_length_m, minlength=pieces)
     rank = np.empty(pieces, dtype=np.intp)
     rank[np.argsort(-length_m, kind="stable")] = np.arange(pieces)
-    return rank[label]
+    return np.asarray(rank[label])
 
 
 def _problems(roads: Roads) -> dict[str, str]:
     found = {what: f"{count:,}" for what, count in roads.notes.items()}
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
-    piece = piece_of_node(roads)
+    piece = _piece_of_node(roads)
     if piece.max():
         aside_km = roads.segment_length_m[piece[start] > 0].sum() / 1000
         found["isolated pieces"] = f"{piece.max():,}, {aside_km:.1f} km of road beside the largest piece"

@@ -1,7 +1,7 @@
 """Roads: centre lines between shared points, and what is known of each; all readers end here.
 
-From roads to lanes: a road's lanes lie side by side about its centre line, those in its own direction on the side
-on which people drive. A road with lanes one way only has its centre line in the middle of them.
+From roads to lanes: a road's lanes lie side by side, its centre line in the middle of all of them, those in its own
+direction on the side on which people drive.
 """
 
 from __future__ import annotations
@@ -74,7 +74,9 @@ class Roads:
     @cached_property
     def length_m(self) -> Array:
         """Lengths (R,) of the centre lines."""
-        return np.bincount(self.road_of[self.segment], self.segment_length_m, minlength=len(self))
+        return np.asarray(
+            np.bincount(self.road_of[self.segment], self.segment_length_m, minlength=len(self)), dtype=float
+        )
 
     def within(self, low_m: Array, high_m: Array) -> Roads:
         """What of the roads touches the box from `low_m` (2,) to `high_m` (2,), in whole segments.
@@ -151,10 +153,9 @@ class Roads:
         road = np.repeat(np.arange(len(self)), counts)
         number = np.arange(len(road)) - np.repeat(np.cumsum(counts) - counts, counts)
         against = number >= self.forward[road]
-        place = np.where(against, number - self.forward[road], number) + 0.5
-        one_sided = (self.forward == 0) | (self.backward == 0)
-        place = np.where(one_sided[road], place - counts[road] / 2, place)
-        return road, side * np.where(against, -1, 1) * place * self.lane_width_m[road], against
+        from_between = np.where(against, self.forward[road] - number - 0.5, number + 0.5)
+        between = (self.backward - self.forward)[road] / 2  # the two directions meet there
+        return road, side * (between + from_between) * self.lane_width_m[road], against
 
     @cached_property
     def _aside(self) -> Array:
