@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from emulator.channel.stages import Topology
+from emulator.channel.topology import Topology
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
@@ -114,7 +114,7 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 def hears_matrix(radio: Radio, world: World) -> Links:
     """Who (row) hears whom (column) at the start, (N, N): range or links, and the peer cap."""
     topology = Topology(world.at(0).position_m, radio.range_m, radio.max_peers, world.links)
-    return np.asarray(topology.admitted.T)
+    return np.asarray(topology.now.admitted.T)
 
 
 def mutual(hears: Links) -> Links:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.channel.stages import NO_CAUSE
+from emulator.channel.frames import NO_CAUSE
 from emulator.faults.plan import PlannedFault
 from vnet.faults import DataReplay, DoS, SenderFault, StaleMessages, Sybil
 from vnet.scenario import NS_PER_S

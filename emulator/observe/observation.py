@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.engine import Delivery
+from emulator.engine import Deliveries
 from emulator.observe.metrics import PeriodFigures
 from emulator.world.world import Instant, World
 from vnet.link.node import Report
@@ -51,14 +51,13 @@ def period_message(
     reports: Iterable[Report],
     figures: PeriodFigures,
     counts: dict[str, int],
-    deliveries: Iterable[Delivery],
+    deliveries: Sequence[Deliveries],
 ) -> dict[str, Any]:
     """One period: truth, fixes, what was reported, `figures`, `counts` by outcome so far, and `links` (int16 pairs
     sender, receiver of what was delivered).
     """
     last = {report.node: report for report in reports}
-    number = {node: index for index, node in enumerate(node_ids)}
-    links = {(number[delivery.packet.sender], delivery.receiver) for delivery in deliveries}
+    heard = np.concatenate([np.zeros((0, 2), np.int64), *(some.pairs() for some in deliveries)])
     return {
         "period": instant.period,
         "time_ns": instant.time_ns,
@@ -74,7 +73,7 @@ def period_message(
         },
         "figures": asdict(figures),
         "counts": counts,
-        "links": np.array(sorted(links), dtype="<i2").tobytes(),
+        "links": np.unique(heard, axis=0).astype("<i2").tobytes(),
     }
 
 

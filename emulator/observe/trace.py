@@ -10,15 +10,16 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from emulator.channel.frames import NO_CAUSE
 from emulator.channel.outcomes import Outcome
-from emulator.channel.stages import NO_CAUSE, Frame
 
 NOT_ARRIVING = -1
 FIRST_ROWS = 1 << 22
@@ -54,37 +55,28 @@ class Trace:
     def __len__(self) -> int:
         return self._count
 
-    def append(
-        self,
-        frame: Frame,
-        receivers: NDArray[np.intp],
-        payload_digest: int | NDArray[np.uint64],
-        outcome: NDArray[np.uint8],
-        arrival_ns: NDArray[np.int64],
-        cause: NDArray[np.int16],
-    ) -> int:
-        """Add the rows of one frame, one a receiver; returns the number of the first.
+    def append(self, count: int, **columns: ArrayLike) -> int:
+        """Add `count` rows, one for each frame and receiver; returns the number of the first.
 
-        `payload_digest` is of what arrives; `cause` are numbers of faults, whose names `name_cause` has told.
+        All columns are wanted, each a number or (count,). `payload_digest` is of what arrives; `cause` are numbers
+        of faults, whose names `name_cause` has told; `arrival_ns` counts only where the outcome is pending.
         """
-        first, end = self._count, self._count + len(receivers)
+        first, end = self._count, self._count + count
         if end > len(self._rows):
             grown = np.zeros(max(2 * len(self._rows), end), dtype=_ROW)
             grown[:first] = self._rows[:first]
             self._rows = grown
         rows = self._rows[first:end]
-        rows["sent_ns"] = frame.sent_ns
-        rows["sender"] = frame.sender
-        rows["seq"] = frame.seq
-        rows["receiver"] = receivers
-        rows["size_bytes"] = frame.size_bytes
-        rows["payload_digest"] = payload_digest
-        rows["outcome"] = outcome
-        rows["cause"] = cause - NO_CAUSE
-        rows["arrival_ns"] = np.where(outcome == Outcome.pending, arrival_ns, NOT_ARRIVING)
-        rows["copy"] = frame.copy
+        for name, values in columns.items():
+            rows[name] = values
+        rows["cause"] -= NO_CAUSE
+        rows["arrival_ns"][rows["outcome"] != Outcome.pending] = NOT_ARRIVING
         self._count = end
         return first
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A column of the trace so far, as numbers."""
+        return np.asarray(self._rows[name][: self._count])
 
     def name_cause(self, number: int, name: str) -> None:
         """Say what fault `number` is called."""

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emulator.channel.stages import Topology
-from emulator.engine import Delivery, Engine
+from emulator.channel.topology import Topology
+from emulator.engine import Deliveries, Engine
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.faults.sensors import BentGnss, clock_of
@@ -34,7 +34,7 @@ class PeriodView:
     reports: list[Report]
     figures: PeriodFigures
     counts: dict[str, int]
-    deliveries: list[Delivery]
+    deliveries: list[Deliveries]
 
     def message(self, node_ids: Sequence[str]) -> dict[str, Any]:
         """The period as observers are told it."""
@@ -70,7 +70,7 @@ class Emulation:
         self.world = world
         self.folder = folder
         radio = scenario.radio
-        in_range = Topology(start.position_m, radio.range_m, radio.max_peers, world.links).in_range
+        in_range = Topology(start.position_m, radio.range_m, radio.max_peers, world.links).now.in_range
         self.faults = FaultPlan(scenario, Nodes(world.node_ids, start.position_m, in_range.sum(axis=0)))
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
@@ -89,7 +89,7 @@ class Emulation:
         self._period = 0
         self._finished = False
         self._reports: list[Report] = []
-        self._delivered: list[Delivery] = []
+        self._delivered: list[Deliveries] = []
 
     def watch(self, watcher: Callable[[PeriodView], None]) -> None:
         """Call `watcher` at the end of every period from now on."""
@@ -254,11 +254,11 @@ class Emulation:
         text = dump_scenario(scenario)
         self.folder.put("scenario.toml", lambda path: write_text(path, text))
 
-    def advance(self, time_ns: int) -> list[Delivery]:
+    def advance(self, time_ns: int) -> Deliveries:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
         deliveries = self.engine.advance(time_ns)
-        self._delivered.extend(deliveries)
+        self._delivered.append(deliveries)
         return deliveries
 
     def fix_time_ns(self, period: int) -> int | None:
