@@ -20,9 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.arrivals import NEVER_NS, Arrivals, Deliveries, Delivery
+from emulator.channel.csma import Csma
 from emulator.channel.frames import Frame, Pairs, Stage
 from emulator.channel.outcomes import Outcome
 from emulator.channel.queue import Access, TransmitQueue
+from emulator.channel.reach import reach_of
+from emulator.channel.reception import Reception
+from emulator.channel.signals import Signals
 from emulator.channel.stages import (
     MIN_LATENCY_NS,
     Latency,
@@ -60,20 +64,27 @@ class Engine:
     ) -> None:
         self._node_ids = tuple(node_ids)
         self._max_payload_bytes = radio.max_payload_bytes
-        self._topology = Topology(position_m, radio.range_m, radio.max_peers, links)
-        self._access: Access = TransmitQueue(seed, radio)
-        self._links = LinkFaults(seed, self._access, len(node_ids))
+        count = len(node_ids)
+        signals = Signals(seed, radio.fading, count) if radio.is_physical else None
+        nakagami = signals.nakagami if signals is not None else None
+        self._topology = Topology(position_m, reach_of(radio, seed, links), radio.max_peers, nakagami)
+        self._csma = (
+            Csma(radio.mac, radio, signals, count) if radio.mac is not None and signals is not None else None
+        )
+        self._access: Access = self._csma or TransmitQueue(seed, radio)
+        self._links = LinkFaults(seed, self._access, count)
         self._senders = SenderFaults(self._node_ids, self._next_copy)
         self.chain: list[Stage] = [
             in_range,
             sender_side,
             peer_cap,
             lose_by_faults,
+            *([Reception(radio, signals)] if signals is not None else []),
             Loss(seed, radio.loss),
             Latency(seed, radio),
             change_by_faults,
         ]
-        self._trace = Trace(node_ids)
+        self._trace = Trace(node_ids, knows_air=self._csma is not None)
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
         self._copies: Counter[tuple[int, int]] = Counter()
@@ -157,8 +168,8 @@ class Engine:
 
     def _book(self, frames: Sequence[Frame], pairs: Pairs) -> None:
         """Write the rows of pairs in range, and put those that arrive where they are awaited."""
-        for (place, receiver), flips in pairs.flips.items():
-            frames[place].altered[receiver] = _flipped(frames[place].payload, flips)
+        for (number, node), flips in pairs.flips.items():
+            frames[number].altered[node] = _flipped(frames[number].payload, flips)
         place, receiver = which = np.nonzero(pairs.outcome != Outcome.out_of_range)
         self._counts[Outcome.out_of_range] += len(frames) * (len(self._node_ids) - 1) - len(place)
         self._enter(frames, place, receiver, pairs.outcome[which], pairs.arrival_ns[which], pairs.cause[which])
@@ -181,7 +192,7 @@ class Engine:
         cause: NDArray[np.int16] | np.int16,
     ) -> None:
         """The pairs of frame `place` and `receiver`, (n,) each, as rows of the trace and perhaps in flight."""
-        named = ("sent_ns", "sender", "seq", "size_bytes", "copy")
+        named = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns")
         columns = {name: np.array([getattr(frame, name) for frame in frames])[place] for name in named}
         first = self._trace.append(
             len(place),
@@ -207,8 +218,28 @@ class Engine:
     def next_time(self) -> int | None:
         """When `advance` must be called next: something arrives, or happens on the air."""
         self._settle()
-        times_ns = (self._arrivals.soonest_ns(), self._access.next_ns())
+        # What happens on the air at an instant happens right after it.
+        air_ns = self._access.next_ns()
+        times_ns = (self._arrivals.soonest_ns(), None if air_ns is None else air_ns + 1)
         return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
+
+    def look_ahead(self, time_ns: int, nodes: Sequence[int]) -> None:
+        """Let what happens on the air come as far as `time_ns`, or the first arrival at one of these nodes.
+
+        The caller promises that nobody hands over anything before that.
+        """
+        if self._csma is None:
+            return
+        until_ns = self._first_ns(time_ns, nodes)
+        while (next_ns := self._csma.next_ns()) is not None and next_ns < until_ns:
+            self._csma.step()
+            if self._csma.sent:
+                until_ns = self._first_ns(time_ns, nodes)
+
+    def _first_ns(self, time_ns: int, nodes: Sequence[int]) -> int:
+        """`time_ns`, or the first arrival at one of these nodes if that is earlier."""
+        arrivals_ns = [self.next_arrival_ns(node) for node in nodes]
+        return min([time_ns, *(arrival_ns for arrival_ns in arrivals_ns if arrival_ns is not None)])
 
     def advance(self, time_ns: int) -> Deliveries:
         """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""

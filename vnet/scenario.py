@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from vnet.errors import ScenarioError, printable, shown
 from vnet.faults import Fault
+from vnet.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from vnet.sections import Section, first_problem
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
 
@@ -109,6 +110,8 @@ class Radio(Section):
     All within `range_m` hear each other, unless `links` says who hears whom: a matrix of 0 and 1, or a CSV file of
     one without a header (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in
     the order of the network's vehicles; the diagonal means nothing.
+
+    The subsections make it a physical radio, stage by stage; docs/radio.md says what each of them does.
     """
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
@@ -122,6 +125,33 @@ class Radio(Section):
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     bitrate_mbps: float = Field(6.0, ge=1e-6)
     queue_frames: int = Field(64, ge=1, le=MANY)
+    path_loss: PathLoss | None = None
+    shadowing: Shadowing | None = None
+    fading: Fading | None = None
+    receiver: Receiver | None = None
+    mac: Mac | None = None
+    congestion: Congestion | None = None
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether signals have a power, and frames the air time of 802.11p."""
+        return self.path_loss is not None or self.mac is not None
+
+    @model_validator(mode="after")
+    def _stages_fit_together(self) -> Radio:
+        if self.path_loss is not None and self.links is not None:
+            raise ValueError("path_loss and links both say who hears whom: leave one of them out")
+        for name in ("shadowing", "fading"):
+            if getattr(self, name) is not None and self.path_loss is None:
+                raise ValueError(f"{name} needs path_loss: without it no signal is weaker than another")
+        if self.receiver is not None and not self.is_physical:
+            raise ValueError("receiver needs path_loss or mac: without them there is no signal and no interference")
+        if self.congestion is not None and self.mac is None:
+            raise ValueError("congestion needs mac: without it nobody senses how busy the channel is")
+        if self.is_physical and self.bitrate_mbps not in RATES_MBPS:
+            rates = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
+            raise ValueError(f"bitrate_mbps = {self.bitrate_mbps:g}: 802.11p has {rates}")
+        return self
 
     @field_validator("links", mode="before")
     @classmethod

@@ -21,6 +21,24 @@ if TYPE_CHECKING:
 
 NS_PER_MS = 1_000_000
 NO_CAUSE = -1
+NOT_ON_AIR = -1
+
+
+@dataclass(slots=True, eq=False)
+class Signal:
+    """A frame as it arrives at the receivers, (N,) each; at its own sender, with the power that it was sent with.
+
+    `luck` (N, 3) are draws in [0, 1): of the fading, of the reception, and of the latency. Those at the sender,
+    which receives nothing, are of its access to the medium. `power_mw` is 0 where the sender is out of range.
+
+    `locked` is where a receiver has set itself on this frame, or None where nothing kept it from doing so.
+    `pieces` are the times until which the sum of all powers on air was so much (N,); none if it was alone.
+    """
+
+    luck: NDArray[np.float64]
+    power_mw: NDArray[np.float64]
+    locked: NDArray[np.bool_] | None = None
+    pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
 
 
 @dataclass(slots=True, eq=False)
@@ -32,8 +50,8 @@ class Frame:
     under `name`, and `cause` is the number of the fault that sends or changes it.
 
     `surroundings` and `effects` are those of its handing over. `fate` is what its sender decides (oversize,
-    queue_full, or pending if it was sent), and `end_ns` when it had left the air. `altered` are the payloads that
-    arrive with other bytes, by receiver.
+    queue_full, held_back, or pending if it was sent). It was on air from `on_air_ns`, NOT_ON_AIR if nobody knows,
+    to `end_ns`. `altered` are the payloads that arrive with other bytes, by receiver.
     """
 
     sender: int
@@ -48,7 +66,9 @@ class Frame:
     name: str = ""
     cause: int = NO_CAUSE
     fate: Outcome = Outcome.pending
+    on_air_ns: int = NOT_ON_AIR
     end_ns: int = 0
+    signal: Signal | None = None
     altered: dict[int, bytes] = field(default_factory=dict)
 
 

@@ -19,3 +19,6 @@ class Outcome(IntEnum):
     fault = 7
     receiver_down = 8
     transport = 9
+    faded = 10
+    collided = 11
+    held_back = 12

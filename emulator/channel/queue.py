@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from emulator.channel.dot11p import airtime_ns
 from emulator.channel.draws import Draws
 from emulator.channel.frames import NS_PER_MS, Frame
 from emulator.channel.outcomes import Outcome
@@ -59,6 +60,8 @@ class _Backlog:
 class TransmitQueue:
     """The sender's own queue: random access delay, airtime at `radio.bitrate_mbps`, at most `queue_frames` waiting.
 
+    With a physical radio the airtime is that of 802.11p.
+
     When a frame ends is known at once. Faults `throttle` some senders.
     """
 
@@ -66,6 +69,7 @@ class TransmitQueue:
         self._draws = Draws(seed, "access")
         self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._bitrate_mbps = radio.bitrate_mbps
+        self._is_physical = radio.is_physical
         self._limit = radio.queue_frames
         self._backlogs: dict[int, _Backlog] = {}
         self._throttled_mbps: dict[int, float] = {}
@@ -103,7 +107,10 @@ class TransmitQueue:
     def _put(self, frame: Frame, backlog: _Backlog, jitter_ns: int, bitrate_mbps: float) -> int | None:
         if not backlog.room(frame.sent_ns, self._limit):
             return None
-        return backlog.take(frame.sent_ns + jitter_ns, round(frame.size_bytes * 8_000 / bitrate_mbps))
+        airtime = round(frame.size_bytes * 8_000 / bitrate_mbps)
+        if self._is_physical:  # a throttled sender takes even longer
+            airtime = max(airtime_ns(frame.size_bytes, self._bitrate_mbps), airtime)
+        return backlog.take(frame.sent_ns + jitter_ns, airtime)
 
     def next_ns(self) -> int | None:
         """Nothing happens between a frame's handing over and its arrival."""
@@ -111,3 +118,26 @@ class TransmitQueue:
 
     def run(self, time_ns: int | None) -> None:
         """Nothing to be done."""
+
+
+class Throttle:
+    """What stands before an access whose own bitrate is fixed: throttled senders' frames come to it slowly."""
+
+    def __init__(self) -> None:
+        self._slow: dict[int, tuple[float, _Backlog]] = {}
+
+    def set(self, bitrate_mbps: Mapping[int, float]) -> None:
+        """From now on these senders are throttled, and no others; what waits then comes as it was decided."""
+        kept = {sender: backlog for sender, (_, backlog) in self._slow.items()}
+        self._slow = {sender: (mbps, kept.get(sender, _Backlog())) for sender, mbps in bitrate_mbps.items()}
+
+    def slows(self, sender: int) -> bool:
+        """Whether a sender is throttled now."""
+        return sender in self._slow
+
+    def put(self, frame: Frame, ready_ns: int, limit: int) -> int | None:
+        """When a frame comes to the access; None if `limit` others wait before it."""
+        bitrate_mbps, backlog = self._slow[frame.sender]
+        if not backlog.room(frame.sent_ns, limit):
+            return None
+        return backlog.take(ready_ns, round(frame.size_bytes * 8_000 / bitrate_mbps))

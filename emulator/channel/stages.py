@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from emulator.channel.draws import Draws
 from emulator.channel.frames import NS_PER_MS, Frame, Pairs
 from emulator.channel.outcomes import Outcome
+from emulator.channel.signals import LATENCY
 from vnet.scenario import Radio
 
 MIN_LATENCY_NS = 1_000
@@ -88,9 +89,15 @@ class Latency:
 
     def __call__(self, frames: Sequence[Frame], pairs: Pairs) -> None:
         """Set when each pair arrives."""
-        draws = self._draws.of(frames, pairs.outcome.shape[1])
+        draws = self._draws_of(frames, pairs.outcome.shape[1])
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = pairs.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
         pairs.arrival_ns = arrival_ns
+
+    def _draws_of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
+        """(K, count), those of the signals where frames have one."""
+        if all(frame.signal is None for frame in frames):
+            return self._draws.of(frames, count)
+        return np.stack([np.zeros(count) if f.signal is None else f.signal.luck[:, LATENCY] for f in frames])

@@ -33,14 +33,15 @@ def unpack(data: bytes, columns: int = 1) -> NDArray[np.float32]:
 def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
     """What does not change during a run: `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`), `range_m`.
 
-    `range_m` is None where the scenario gives links, and the range says nothing about who hears whom.
+    `range_m` is None where the scenario gives links or a path loss, and it says nothing about who hears whom.
     """
+    radio = scenario.radio
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),
         "lane_point_m": pack(world.lane_map.point_m),
         "lane_heading_rad": pack(world.lane_map.heading_rad),
-        "range_m": scenario.radio.range_m if scenario.radio.links is None else None,
+        "range_m": radio.range_m if radio.links is None and radio.path_loss is None else None,
         "period_ns": world.period_ns,
     }
 

@@ -37,17 +37,21 @@ _ROW = np.dtype(
         ("cause", "<i2"),
         ("arrival_ns", "<i8"),
         ("copy", "<i2"),
+        ("on_air_ns", "<i8"),
     ]
 )
-_PLAIN = ("sent_ns", "seq", "size_bytes", "payload_digest", "arrival_ns", "copy")
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
 class Trace:
-    """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`."""
+    """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
-    def __init__(self, node_ids: Sequence[str]) -> None:
+    `knows_air` says that frames have a time at which they went on air.
+    """
+
+    def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
         self._node_ids = list(node_ids)
+        self._knows_air = knows_air
         self._causes = [""]
         self._rows = np.zeros(FIRST_ROWS, dtype=_ROW)
         self._count = 0
@@ -89,7 +93,10 @@ class Trace:
         self._rows["outcome"][rows] = outcome
 
     def to_table(self) -> pa.Table:
-        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy)."""
+        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
+
+        Where senders share the air there is a last column, `on_air_ns`: when a frame began, null if it never did.
+        """
         rows = self._rows[: self._count]
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
         rows = rows[order]
@@ -100,7 +107,8 @@ class Trace:
                 pa.array(rows[column].astype(np.int32)), pa.array(list(names), pa.string())
             )
 
-        arrival = pa.array(rows["arrival_ns"], mask=rows["arrival_ns"] == NOT_ARRIVING)
+        times = ("arrival_ns", "on_air_ns")
+        arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
         return pa.table(
             {
                 "sent_ns": pa.array(rows["sent_ns"]),
@@ -113,6 +121,7 @@ class Trace:
                 "cause": named("cause", self._causes).cast(pa.string()),
                 "arrival_ns": arrival,
                 "copy": pa.array(rows["copy"]),
+                **({"on_air_ns": on_air} if self._knows_air else {}),
             }
         )
 
@@ -139,7 +148,7 @@ def sha256_of_table(table: pa.Table) -> str:
             codes, names = _canonical_codes(array)
             digest.update(json.dumps([column, names]).encode())
         else:
-            filled = pc.fill_null(array, NOT_ARRIVING) if column == "arrival_ns" else array
+            filled = pc.fill_null(array, NOT_ARRIVING) if column in ("arrival_ns", "on_air_ns") else array
             codes = filled.to_numpy(zero_copy_only=False)
             digest.update(json.dumps([column]).encode())
         digest.update(np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder("<")).tobytes())

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from emulator.channel.topology import Topology
+from emulator.channel.reach import distances_m, reach_of
 from emulator.engine import Deliveries, Engine
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
@@ -70,7 +70,8 @@ class Emulation:
         self.world = world
         self.folder = folder
         radio = scenario.radio
-        in_range = Topology(start.position_m, radio.range_m, radio.max_peers, world.links).now.in_range
+        reach = reach_of(radio, scenario.run.seed, world.links)
+        in_range = reach.in_range(start.position_m, distances_m(start.position_m))
         self.faults = FaultPlan(scenario, Nodes(world.node_ids, start.position_m, in_range.sum(axis=0)))
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
@@ -81,7 +82,7 @@ class Emulation:
         self._acted_ns = -1
         self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
-        component = components(start.position_m, scenario.radio.range_m, world.links)
+        component = components(start.position_m, radio.range_m, in_range)
         self.metrics = Metrics(world.node_ids, component, world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.up = dict.fromkeys(world.node_ids, True)
@@ -260,6 +261,10 @@ class Emulation:
         deliveries = self.engine.advance(time_ns)
         self._delivered.append(deliveries)
         return deliveries
+
+    def look_ahead(self, time_ns: int, nodes: Iterable[str]) -> None:
+        """Let the radio come as far as anybody can act: `time_ns`, or an arrival at one of these nodes before."""
+        self.engine.look_ahead(time_ns, [self.number[node] for node in nodes])
 
     def fix_time_ns(self, period: int) -> int | None:
         """When the fix of a period is due; None after the end of the run."""

@@ -13,6 +13,7 @@ from emulator.channel.draws import Draws
 from emulator.channel.frames import Frame, Pairs, Stage
 from emulator.channel.outcomes import Outcome
 from emulator.channel.queue import TransmitQueue
+from emulator.channel.reach import Disc
 from emulator.channel.stages import Latency, Loss, in_range, peer_cap, sender_side
 from emulator.channel.topology import Topology
 from emulator.engine import Engine
@@ -40,7 +41,7 @@ def frame_of(
     sender: int = 0, seq: int = 0, sent_ns: int = 0, size: int = 100, among: Topology | None = None
 ) -> Frame:
     """A frame that has been sent without taking any time."""
-    surroundings = (among or Topology(np.zeros((1, 2)), 1.0, 1)).now
+    surroundings = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
     return Frame(sender, seq, sent_ns, size, surroundings, LinkEffects(), end_ns=sent_ns)
 
 
@@ -91,7 +92,7 @@ def test_seed_stage_sender_and_sequence_each_give_other_draws() -> None:
 def test_a_pair_that_is_decided_stays_decided() -> None:
     strict = radio(loss=1.0, max_payload_bytes=10, max_peers=1)
     chain = Engine(["a", "b", "c"], strict, 1, np.zeros((3, 2)), None).chain
-    among = Topology(np.zeros((3, 2)), 1.0, 1)
+    among = Topology(np.zeros((3, 2)), Disc(1.0), 1)
     for decided in set(Outcome) - {Outcome.pending}:
         for stage in chain:
             frame = frame_of(size=11, among=among)
@@ -104,7 +105,7 @@ def test_a_pair_that_is_decided_stays_decided() -> None:
 
 def test_the_range_is_a_closed_disc_without_its_centre() -> None:
     position = np.array([[0.0, 0.0], [3000.0, 0.0], [0.0, np.nextafter(3000.0, 4000.0)], [1800.0, 2400.0]])
-    heard = sent(in_range, 4, among=Topology(position, 3000.0, 30)).outcome
+    heard = sent(in_range, 4, among=Topology(position, Disc(3000.0), 30)).outcome
     assert [Outcome(o).name for o in heard] == ["out_of_range", "pending", "out_of_range", "pending"]
 
 
@@ -113,7 +114,7 @@ def test_the_range_is_a_closed_disc_without_its_centre() -> None:
 def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     places: list[tuple[int, int]], cap: int, reach: int, down: set[int]
 ) -> None:
-    topology = Topology(np.array(places, float), float(reach), cap)
+    topology = Topology(np.array(places, float), Disc(float(reach)), cap)
     count = len(places)
     for node in down & set(range(count)):
         topology.set_up(node, False)
@@ -131,7 +132,7 @@ def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
 
 
 def test_a_death_lets_the_next_one_in_and_a_restart_puts_it_out_again() -> None:
-    topology = Topology(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), 3000.0, 2)
+    topology = Topology(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), Disc(3000.0), 2)
     assert topology.now.admitted[:, 0].tolist() == [False, True, True, False]
     topology.set_up(1, False)
     topology.move(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
@@ -157,7 +158,7 @@ def test_what_a_sender_did_not_send_reaches_nobody() -> None:
 
 
 def test_a_frame_keeps_the_surroundings_of_its_handing_over_among_others() -> None:
-    topology = Topology(np.array([[0.0, 0.0], [50.0, 0.0]]), 100.0, 30)
+    topology = Topology(np.array([[0.0, 0.0], [50.0, 0.0]]), Disc(100.0), 30)
     near = frame_of(among=topology)
     topology.move(np.array([[0.0, 0.0], [500.0, 0.0]]))
     subject = Pairs.of([near, frame_of(among=topology)], 2)

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.channel.reach import Reach, distances_m, reach_of
 from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
 from emulator.observe.checks.verdicts import MOST_ROWS
@@ -86,9 +87,7 @@ class Evidence:
     @cached_property
     def distance_m(self) -> Array:
         """(N, N) between first positions."""
-        position_m = self.positions()
-        offset = position_m[:, None] - position_m[None]
-        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
+        return distances_m(self.positions())
 
     @cached_property
     def links(self) -> Mask | None:
@@ -96,15 +95,16 @@ class Evidence:
         return load_links(self.scenario.radio, len(self.node_ids))
 
     @cached_property
+    def law_of_reach(self) -> Reach:
+        """The law of who is in range of whom. Raises ScenarioError."""
+        return reach_of(self.scenario.radio, self.scenario.run.seed, self.links)
+
+    @cached_property
     def in_range(self) -> Mask:
         """(N, N), rows are senders: who is in range of whom."""
         if not self.node_ids:  # a run that ended before its first period did
             return np.zeros((0, 0), dtype=bool)
-        if self.links is not None:
-            return np.asarray(self.links.T)
-        in_range = self.distance_m <= self.scenario.radio.range_m
-        np.fill_diagonal(in_range, False)
-        return np.asarray(in_range)
+        return self.law_of_reach.in_range(self.positions(), self.distance_m)
 
     # The trace, column by column.
 

@@ -1,0 +1,121 @@
+"""The air: what is on it, what every vehicle senses of it, and whom each receiver listens to.
+
+Everything here is done for all vehicles at once. It knows nothing of who may send when.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.channel.dot11p import DETECTION_NS
+from emulator.channel.frames import Frame, Signal
+from emulator.channel.reception import Threshold
+from vnet.roads.lanes import Array
+
+WINDOW_NS = 100_000_000
+"""Over which time the channel busy ratio is taken (ETSI TS 102 687)."""
+LONG_AGO_NS = -(1 << 60)
+
+
+class Medium:
+    """Frames on air between `count` vehicles.
+
+    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, or None if nothing is on air;
+    `busy_ns` and `idle_ns` (N,) are when it last became so, and when it last was no longer.
+    """
+
+    def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
+        self._carrier_sense_mw = carrier_sense_mw
+        self._threshold = threshold
+        self._frames: list[Frame] = []
+        self._total_mw: Array = np.zeros(count)
+        self.sensed: NDArray[np.bool_] | None = None
+        self.busy_ns = np.full(count, LONG_AGO_NS)
+        self.idle_ns = np.full(count, LONG_AGO_NS)
+        self._counted_ns = 0
+        self._busy_for_ns = np.zeros(count, np.int64)
+        self.windows: list[Array] = []
+        """The channel busy ratios (N,) of the windows that are over."""
+
+    def is_sensed(self, node: int) -> bool:
+        """Whether the medium is busy at `node`."""
+        return self.sensed is not None and bool(self.sensed[node])
+
+    def begin(self, frame: Frame, time_ns: int) -> None:
+        """A frame begins, `frame.signal` its powers."""
+        self.count(time_ns)
+        signal = _signal(frame)
+        before_mw, others = self._total_mw, self._frames
+        if others:
+            total_mw = before_mw + signal.power_mw
+            self._listen(frame, signal, total_mw)
+            for other in others:
+                _signal(other).pieces.append((time_ns, before_mw))
+        else:
+            total_mw = signal.power_mw
+        others.append(frame)
+        self._sense(total_mw, time_ns)
+
+    def _listen(self, frame: Frame, signal: Signal, total_mw: Array) -> None:
+        """Who sets itself on a new signal: who detects it, and does not listen to another one yet.
+
+        A signal that has not been there long enough to be detected is given up where a new one drowns it, and the
+        new one's sender listens to nobody.
+        """
+        taken = np.zeros(len(total_mw), dtype=bool)
+        for other in self._frames:
+            known = _signal(other)
+            if known.locked is None:
+                known.locked = known.power_mw >= self._threshold.alone_mw
+            if other.on_air_ns + DETECTION_NS > frame.on_air_ns:
+                known.locked &= self._threshold.detects(known.power_mw, total_mw)
+            known.locked[frame.sender] = False
+            taken |= known.locked
+        signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
+
+    def end(self, frame: Frame, time_ns: int) -> None:
+        """A frame ends."""
+        self.count(time_ns)
+        signal, before_mw = _signal(frame), self._total_mw
+        self._frames.remove(frame)
+        if signal.pieces or self._frames:
+            signal.pieces.append((time_ns, before_mw))
+        if not self._frames:
+            assert self.sensed is not None
+            np.copyto(self.idle_ns, time_ns, where=self.sensed)
+            self.sensed = None
+            return
+        total_mw = _signal(self._frames[0]).power_mw
+        for other in self._frames:
+            _signal(other).pieces.append((time_ns, before_mw))
+            if other is not self._frames[0]:
+                total_mw = total_mw + _signal(other).power_mw
+        self._sense(total_mw, time_ns)
+
+    def _sense(self, total_mw: Array, time_ns: int) -> None:
+        sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
+        if before is None:
+            np.copyto(self.busy_ns, time_ns, where=sensed)
+        else:
+            np.copyto(self.busy_ns, time_ns, where=sensed & ~before)
+            np.copyto(self.idle_ns, time_ns, where=before & ~sensed)
+        self._total_mw, self.sensed = total_mw, sensed
+
+    def count(self, time_ns: int) -> None:
+        """Add up for how long the medium has been busy, until `time_ns`, which is no earlier than the last."""
+        while time_ns - len(self.windows) * WINDOW_NS >= WINDOW_NS:
+            self._count((len(self.windows) + 1) * WINDOW_NS)
+            self.windows.append(self._busy_for_ns / WINDOW_NS)
+            self._busy_for_ns[:] = 0
+        self._count(time_ns)
+
+    def _count(self, time_ns: int) -> None:
+        if self.sensed is not None:
+            self._busy_for_ns += self.sensed * (time_ns - self._counted_ns)
+        self._counted_ns = time_ns
+
+
+def _signal(frame: Frame) -> Signal:
+    assert frame.signal is not None
+    return frame.signal
