@@ -6,6 +6,8 @@ changes when others come nor depends on how it came there; fading is drawn for e
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv, ndtri
@@ -103,6 +105,12 @@ class MeanPower:
         return np.round(power_dbm, DIGITS)
 
 
+@lru_cache(maxsize=16)
+def _quantiles(m: float) -> Array:
+    """Of the gamma distribution of shape m and mean one, at the middles of equally likely steps."""
+    return np.asarray(gammaincinv(m, (np.arange(QUANTILES) + 0.5) / QUANTILES) / m)
+
+
 class Nakagami:
     """Fading: the factor that a frame's power has at a receiver is gamma distributed, of shape m and mean one.
 
@@ -112,9 +120,7 @@ class Nakagami:
 
     def __init__(self, fading: Fading | None) -> None:
         self._until_m = np.array(fading.until_m if fading is not None else ())
-        middles = (np.arange(QUANTILES) + 0.5) / QUANTILES
-        shapes = fading.m if fading is not None else ()
-        self._factor = np.concatenate([gammaincinv(m, middles) / m for m in shapes]) if shapes else np.ones(1)
+        self._factor = np.concatenate([_quantiles(m) for m in fading.m]) if fading is not None else np.ones(1)
 
     def shape(self, distance_m: Array) -> NDArray[np.int64]:
         """Which shape belongs to distances, as `factor` wants it."""
