@@ -21,7 +21,7 @@ class _PathLoss(Section):
     """What all path losses have. Pairs whose mean power is below `floor_dbm` are out of range."""
 
     tx_power_dbm: float = Field(20.0, ge=-100, le=100)
-    floor_dbm: float = Field(-97.0, ge=-300, le=100)
+    floor_dbm: float = Field(-94.0, ge=-300, le=100)
 
 
 class FreeSpace(_PathLoss):
