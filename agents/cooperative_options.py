@@ -41,42 +41,52 @@ PROFILES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Options:
-    """What a cooperative vehicle does; lengths in metres, times in seconds. Defaults fit the default world.
-
-    `profile` chooses other defaults. `fusion` is the rule of the weights (`constant` gives `alpha` to the vehicle
-    itself); `exchange` whether estimates are pulled together or particles are mixed; `relay` whether fixes are
-    passed on. `consensus` is how the network's mean is found; `exact` takes it from everybody's frame, so that
-    everybody must hear everybody, and `hears` (ids by id) then says whose frames count as a neighbour's.
-    `self_floor` is the least weight of the vehicle itself under `optimized`; `ridge_m2` > 0 is the same ridge for
-    all in place of each estimate's variance. `common_walk_m` > 0 is a random walk of so much a √s in place of the
-    Gauss-Markov process. `start_m` and `start_sigma_m` (if positive) say where the cloud starts. The paper's are
-    `one_sided`, `roads_apart` (roads weigh the particles after stacking, all and each time anew) and `two_frames`
-    (estimates follow in a frame of their own, once the fixes have been filtered). `defence`: what contradicts the
-    majority is left out (docs/estimator.md).
-    """
+    """What a cooperative vehicle does; lengths in metres, times in seconds. Defaults fit the default world."""
 
     profile: str = "default"
+    """`paper` gives many other keys the paper's values as defaults; what is named besides still counts."""
     fusion: str = "optimized"
+    """The rule of the fusion weights; `none` fuses nothing."""
     exchange: str = "estimates"
+    """Whether estimates are pulled together, or particles mixed, as the paper does."""
     relay: bool = True
+    """Whether a frame passes on the newest fixes of others."""
     consensus: str = "ratio"
+    """How the network's mean is found. `exact` takes it from everybody's frame, so that all must hear all."""
     alpha: float = 0.5
+    """Weight of the vehicle itself, if `fusion = "constant"`; 0 to 1."""
     self_floor: float = 0.0
+    """Least weight of the vehicle itself, if `fusion = "optimized"`; 0 to 1."""
     ridge_m2: float = 0.0
+    """If positive, the ridge of the weights' quadratic program, in place of each estimate's own variance."""
     fusion_interval_s: float = 0.2
+    """Time between two fusions."""
     particles: int = 200
+    """How many hypotheses of the common error a vehicle keeps; 1 to 100 000."""
     common_sigma_m: float = 3.0
+    """Standard deviation of the common error, as the vehicle takes it to be."""
     common_tau_s: float = 600.0
+    """Correlation time of the common error, as the vehicle takes it to be."""
     common_walk_m: float = 0.0
+    """If positive, the common error is a random walk of so much a √s, in place of the Gauss-Markov process."""
     lateral_tau_s: float = 20.0
+    """How long a vehicle keeps its offset in the lane: a road counts anew so often."""
     start_m: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    """Where the cloud starts."""
     start_sigma_m: float = 0.0
+    """How wide it starts; 0 means as wide as `common_sigma_m`."""
     one_sided: bool = False
+    """Whether lanes are bounded on their right only, as the paper's."""
     roads_apart: bool = False
+    """Whether roads weigh the particles after stacking, all and each time anew, as the paper's."""
     two_frames: bool = False
+    """Whether estimates follow in a frame of their own, once the fixes have been filtered, as the paper's."""
     hears: dict[str, list[str]] = field(default_factory=dict)
+    """Whose frames count as a neighbour's (ids by id), if `consensus = "exact"`."""
     slots: int = 2
+    """In how many slots of the period vehicles send; each draws one for good. 1 to 1000."""
     defence: bool = True
+    """Whether what contradicts the majority is left out."""
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:

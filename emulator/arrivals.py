@@ -133,6 +133,10 @@ class Arrivals:
         next_ns = int(self._by_receiver[receiver])
         return None if next_ns == NEVER_NS else next_ns
 
+    def rows(self) -> list[int]:
+        """The rows of the trace of all pairs in flight."""
+        return [int(row) for row in self._table[_ROW, : self._length]]
+
     def take(self, time_ns: int) -> Whole:
         """Remove and return the table (4, n) of what arrives up to `time_ns`."""
         if self._soonest_ns > time_ns:

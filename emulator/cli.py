@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -23,18 +23,21 @@ from emulator.experiments.cli import app as experiment_app
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
-from emulator.observe.observation import scene_message
 from emulator.observe.run_folder import RunFolder
+from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
+from emulator.playback_cli import play, render
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
 from emulator.run.live import run_live
+from emulator.run.messages import Messages
 from emulator.run.progress import ProgressLine
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
 from emulator.terminal import one_line_errors
+from emulator.viewing_cli import RerunBindOption, RerunPortOption, RerunVehicleOption, view
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.link.access import Access, Credentials, is_tls
@@ -51,6 +54,9 @@ app = typer.Typer(
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(fault_app, name="fault")
 app.command()(status)
+app.command()(view)
+app.command()(render)
+app.command()(play)
 
 
 class Pacing(StrEnum):
@@ -65,13 +71,6 @@ class RouterKind(StrEnum):
 
     EMBEDDED = "embedded"
     SEPARATE = "separate"
-
-
-class Rerun(StrEnum):
-    """What is done for the Rerun viewer."""
-
-    OFF = "off"
-    SAVE = "save"
 
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
@@ -92,7 +91,14 @@ TlsNameOption = Annotated[
         "--tls-name", metavar="NAME", help="A further name or address of the router, for its certificate."
     ),
 ]
-RerunOption = Annotated[Rerun, typer.Option(help="save writes recording.rrd into the run's folder.")]
+RerunOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WHAT",
+        help="save: recording.rrd in the run's folder. serve: to viewers and browsers as well. spawn: open a "
+        "viewer here as well. off. Several as serve,save.",
+    ),
+]
 DeterminismOption = Annotated[
     bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
 ]
@@ -107,7 +113,10 @@ def run(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
@@ -119,15 +128,17 @@ def run(
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
+        _check_vehicle(sinks, world)
         access = _create_access(loaded, world)
         with ExitStack() as stack:
             separate = None
             if router is RouterKind.SEPARATE:
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
-            options = LiveOptions(access, router=separate)
-            _run_live(loaded, world, RunFolder.create(out, loaded), rerun, options, check_determinism)
+            options = LiveOptions(access, router=separate, record=sinks)
+            _run_live(loaded, world, RunFolder.create(out, loaded), options, check_determinism)
 
 
 @app.command()
@@ -138,30 +149,37 @@ def simulate(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
     with one_line_errors():
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+        world = build_world(loaded)
+        _check_vehicle(sinks, world)
         sys.path.append(str(Path.cwd()))
-        emulation = Emulation(loaded, build_world(loaded), RunFolder.create(out, loaded))
+        emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
         with ExitStack() as stack:
-            if rerun is Rerun.SAVE:
-                _record_here(emulation, stack)
+            if sinks is not None:
+                _record_here(emulation, sinks, stack)
             stack.enter_context(ProgressLine(emulation))
             wall_s, interrupted = run_simulation(emulation)
         _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
 
 
-def _record_here(emulation: Emulation, stack: ExitStack) -> None:
+def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
     """Record a simulation from within its own process."""
     from emulator.observe.recorder import Recorder  # Rerun is slow to import, and only recordings need it
 
-    recorder = stack.enter_context(Recorder(emulation.folder.path / "recording.rrd"))
-    recorder.scene(scene_message(emulation.world, emulation.scenario))
-    emulation.watch(lambda view: recorder.period(view.message(emulation.world.node_ids)))
+    name = emulation.scenario.run.name
+    recorder = stack.enter_context(Recorder(sinks.inside(emulation.folder.path), name))
+    messages = Messages(emulation)
+    recorder.take("scene", messages.scene())
+    emulation.watch(lambda view: recorder.take("period", messages.period(view)))
+    stack.callback(lambda: recorder.take("end", messages.end()))
 
 
 @app.command()
@@ -182,7 +200,10 @@ def emulator(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
-    rerun: RerunOption = Rerun.OFF,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
     with one_line_errors():
@@ -190,14 +211,16 @@ def emulator(
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         _check_restarts(loaded, own_router=False)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
+        _check_vehicle(sinks, world)
         folder = RunFolder.create(out, loaded)
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
-        options = LiveOptions(users, listen, connect, launch=False)
-        _run_live(loaded, world, folder, rerun, options)
+        options = LiveOptions(users, listen, connect, launch=False, record=sinks)
+        _run_live(loaded, world, folder, options)
 
 
 @app.command("access")
@@ -279,12 +302,22 @@ def record(
     run: Annotated[str, typer.Option(help="The name of the run.")],
     out: Annotated[Path, typer.Option(help="The recording to write.")] = Path("recording.rrd"),
     credentials: Annotated[Path | None, typer.Option(help="The observer's credentials file.")] = None,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
     """Watch a run from outside and write a Rerun recording of it."""
     from emulator.observe.watch import record_run  # Rerun is slow to import, and only this command needs it
 
     with one_line_errors():
-        record_run(connect, run, None if credentials is None else Credentials.load(credentials), out)
+        login = None if credentials is None else Credentials.load(credentials)
+        sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port, rerun_vehicle)
+        if sinks is None:
+            raise VnetError("--rerun off: there is nothing to do")
+        if sinks.serve is not None:
+            print(sinks.serve.told(), file=sys.stderr, flush=True)
+        record_run(connect, run, login, replace(sinks, save=out))
 
 
 def _load(
@@ -332,18 +365,26 @@ def _run_live(
     scenario: Scenario,
     world: World,
     folder: RunFolder,
-    rerun: Rerun,
     options: LiveOptions,
     check_determinism: bool = False,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
-    if rerun is Rerun.SAVE:
-        options = replace(options, record=folder.path / "recording.rrd")
+    if options.record is not None:
+        sinks = options.record.inside(folder.path)
+        options = replace(options, record=sinks)
+        if sinks.serve is not None:
+            print(sinks.serve.told(), file=sys.stderr)
     with ProgressLine(emulation) as progress:
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
     _finish(emulation, wall_s, interrupted, "run", check_determinism)
+
+
+def _check_vehicle(sinks: Sinks | None, world: World) -> None:
+    """The vehicle to be looked at closely must be there."""
+    if sinks is not None and sinks.vehicle is not None and sinks.vehicle not in world.node_ids:
+        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no vehicle is called so")
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:

@@ -241,6 +241,11 @@ class Engine:
         arrivals_ns = [self.next_arrival_ns(node) for node in nodes]
         return min([time_ns, *(arrival_ns for arrival_ns in arrivals_ns if arrival_ns is not None)])
 
+    def pending_rows(self) -> list[int]:
+        """The rows of the trace whose frames are on their way."""
+        self._settle()
+        return self._arrivals.rows()
+
     def advance(self, time_ns: int) -> Deliveries:
         """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
         self._access.run(time_ns)

@@ -82,3 +82,7 @@ def test_every_file_opens_with_what_it_is_for() -> None:
         if path.stat().st_size and ast.get_docstring(ast.parse(path.read_text())) is None
     ]
     assert silent == []
+
+
+def test_the_smallest_useful_program_is_small() -> None:
+    assert len((ROOT / "agents" / "beacon.py").read_text().splitlines()) <= 42

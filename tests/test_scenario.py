@@ -159,14 +159,12 @@ def test_a_dumped_scenario_is_the_same_scenario(tmp_path: Path) -> None:
 
 
 def keys(section: BaseModel, prefix: str = "") -> list[str]:
-    """Every key of a scenario, as it stands after --set; the optional ones are left out."""
+    """Every key of a scenario, as it stands after --set; those that have no default are left out."""
     found: list[str] = []
     for name in type(section).model_fields:
         value = getattr(section, name)
-        if isinstance(value, BaseModel):
-            found += keys(value, f"{prefix}{name}.")
-        elif value is not None:
-            found.append(f"{prefix}{name}")
+        inner = keys(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else [f"{prefix}{name}"]
+        found += inner if value is not None else []
     return found
 
 

@@ -22,17 +22,26 @@ LONGEST_S = 86_400.0
 class Selector(Section):
     """Which nodes: all, unless one of these says otherwise.
 
-    `ids`; a `fraction` of all, or `random` so many of them, drawn from the run's seed; those whose first position
-    is in the `disc` (x, y, radius in m) or the `polygon` (corners in m); those with so many others in range
-    (`degree`, least and most).
+    Where vehicles stand their first position counts; where they move, docs/motion.md says which.
     """
 
     ids: tuple[str, ...] | None = None
+    """Those with these names."""
     fraction: Annotated[float, Field(gt=0, le=1)] | None = None
+    """This share of all, drawn from the run's seed."""
     random: Annotated[int, Field(ge=1)] | None = None
+    """So many of all, drawn from the run's seed."""
     disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
+    """Those whose position is in a disc: x, y and radius in m."""
     polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
+    """Those whose position is in a polygon: its corners, [x, y] in m."""
     degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
+    """Those with so many others in range: least and most."""
+
+    @property
+    def by_place(self) -> bool:
+        """Whether it depends on where vehicles are."""
+        return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
 
     @model_validator(mode="after")
     def _at_most_one(self) -> Selector:
@@ -45,37 +54,46 @@ class Selector(Section):
 
 
 class _Fault(Section):
-    """`at_s`: when it starts, in emulated seconds; it ends `duration_s` later."""
+    """Any fault."""
 
     at_s: float = Field(0.0, ge=0, le=LONGEST_S)
+    """When it starts, in emulated time."""
     duration_s: float = Field(gt=0, le=LONGEST_S)
+    """It ends so much later, in emulated time."""
 
 
 class _NodeFault(_Fault):
     """A fault of nodes."""
 
     nodes: Selector = Selector()
+    """Whom it strikes."""
 
 
 class _LinkFault(_Fault):
     """A fault of links: those with an end among `nodes`, from one of `senders`, to one of `receivers`."""
 
     nodes: Selector = Selector()
+    """One end of the link is among these."""
     senders: Selector = Selector()
+    """The sender is among these."""
     receivers: Selector = Selector()
+    """The receiver is among these."""
 
 
 # Processes.
 
 
 class Kill(_NodeFault):
-    """The processes are killed (SIGKILL); when the fault ends they start anew, as new incarnations."""
+    """The processes are killed (SIGKILL); when the fault ends the programs start anew.
+
+    `node.incarnation` is then one higher, and `node.rng` another stream.
+    """
 
     kind: Literal["kill"]
 
 
 class Restart(_NodeFault):
-    """The programs are ended in order (their `finally` blocks run) and start anew when the fault ends."""
+    """As `kill`, but the programs are ended in order: their `finally` blocks run."""
 
     kind: Literal["restart"]
 
@@ -90,14 +108,12 @@ class Pause(_NodeFault):
 
 
 class Partition(_Fault):
-    """Nothing passes between groups. Nodes that no group names are a group of their own.
-
-    `groups`: lists of ids; or `halves` (two, drawn from the seed), `one` (a single node, drawn), `ring` (each node
-    hears only the majority nearest to it on a ring, so that no two agree on who is there).
-    """
+    """Nothing passes between groups. Nodes that no group names are a group of their own."""
 
     kind: Literal["partition"]
     groups: Literal["halves", "one", "ring"] | tuple[tuple[str, ...], ...] = "halves"
+    """Lists of ids; or `halves` (two, drawn from the seed), `one` (a single node, drawn), `ring` (each node hears
+    only the majority nearest to it on a ring, so that no two agree on who is there)."""
 
     @field_validator("groups", mode="before")
     @classmethod
@@ -120,87 +136,100 @@ class Block(_LinkFault):
 
 
 class Loss(_LinkFault):
-    """Pairs are lost with `probability`, beside the radio's own loss."""
+    """Frames are lost, beside the radio's own loss."""
 
     kind: Literal["loss"]
     probability: Probability
+    """Of losing a frame, at each receiver by itself."""
 
 
 class BurstLoss(_LinkFault):
     """Loss in bursts (Gilbert 1960, Elliott 1963): each link is good or bad, frame by frame.
 
-    It turns bad with probability `enter` and good again with `leave`; a bad one loses with `loss_bad`, a good one
-    with `loss_good`. The mean loss is the two weighed by leave and enter.
+    The mean loss is `loss_good` and `loss_bad`, weighed by `leave` and `enter`.
     """
 
     kind: Literal["burst_loss"]
     enter: Probability = 0.05
+    """Probability that a good link turns bad, at each frame."""
     leave: Annotated[float, Field(gt=0, le=1)] = 0.3
+    """Probability that a bad link turns good again, at each frame."""
     loss_bad: Probability = 1.0
+    """Probability that a bad link loses a frame."""
     loss_good: Probability = 0.0
+    """Probability that a good link loses a frame."""
 
 
 class Delay(_LinkFault):
-    """Pairs arrive `delay_ms` later."""
+    """Frames arrive later."""
 
     kind: Literal["delay"]
     delay_ms: float = Field(gt=0, le=60_000)
+    """How much later."""
 
 
 class Jitter(_LinkFault):
-    """Pairs arrive later by up to `jitter_ms`, uniformly."""
+    """Frames arrive later, each by a time of its own."""
 
     kind: Literal["jitter"]
     jitter_ms: float = Field(gt=0, le=60_000)
+    """How much later at most; uniform from 0."""
 
 
 class Reorder(_LinkFault):
-    """With `probability` a pair is held back by `delay_ms`, so that later frames overtake it."""
+    """Some frames are held back, so that later ones overtake them."""
 
     kind: Literal["reorder"]
     probability: Probability = 0.2
+    """Of holding a frame back, at each receiver by itself."""
     delay_ms: float = Field(150.0, gt=0, le=60_000)
+    """How long it is held back."""
 
 
 class Duplicate(_LinkFault):
-    """With `probability` a pair arrives `copies` more times, `delay_ms` apart."""
+    """Some frames arrive again."""
 
     kind: Literal["duplicate"]
     probability: Probability = 0.2
+    """Of repeating a frame, at each receiver by itself."""
     copies: int = Field(1, ge=1, le=20)
+    """How many more times it arrives."""
     delay_ms: float = Field(10.0, gt=0, le=60_000)
+    """Time from one of these arrivals to the next."""
 
 
 class Corrupt(_LinkFault):
-    """With `probability` a pair arrives with `flips` of its bytes changed."""
+    """Some frames arrive with bytes changed."""
 
     kind: Literal["corrupt"]
     probability: Probability = 0.2
+    """Of changing a frame, at each receiver by itself."""
     flips: int = Field(1, ge=1, le=65_000)
+    """How many bytes; all of a shorter frame."""
 
 
 class Throttle(_NodeFault):
-    """The nodes send at `bitrate_mbps` only; their queues fill."""
+    """The nodes send slowly; their queues fill."""
 
     kind: Literal["throttle"]
     bitrate_mbps: float = Field(ge=1e-4, le=1e6)
+    """Their bitrate; the radio's own, if that is less."""
 
 
 class Range(_NodeFault):
-    """The nodes hear and are heard up to `range_m` only."""
+    """The nodes hear and are heard less far."""
 
     kind: Literal["range"]
     range_m: float = Field(gt=0, le=1e9)
+    """Their range."""
 
 
 class Swizzle(_NodeFault):
-    """The nodes are cut off one by one, and then come back in another order, each for half of `over_s`.
-
-    `over_s` is the duration unless it is given.
-    """
+    """The nodes are cut off one by one, and then come back in another order, each for half of `over_s`."""
 
     kind: Literal["swizzle"]
     over_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
+    """How long all of this takes; the duration, unless it is given."""
 
 
 # Sensors and clocks.
@@ -213,17 +242,19 @@ class GnssOutage(_NodeFault):
 
 
 class GnssJump(_NodeFault):
-    """Fixes are off by `offset_m`."""
+    """Fixes are off by a constant."""
 
     kind: Literal["gnss_jump"]
     offset_m: Point
+    """East and north."""
 
 
 class GnssRamp(_NodeFault):
-    """Fixes stray by `rate_m_s`, from 0 at the start."""
+    """Fixes stray, from 0 at the start."""
 
     kind: Literal["gnss_ramp"]
     rate_m_s: Point
+    """East and north."""
 
 
 class GnssFreeze(_NodeFault):
@@ -233,84 +264,99 @@ class GnssFreeze(_NodeFault):
 
 
 class Skew(_NodeFault):
-    """The nodes' clocks are off by `offset_ms`."""
+    """The nodes' clocks are off by a constant.
+
+    `node.now_ns`, the times at which packets are received, and all timers of a program go by them.
+    """
 
     kind: Literal["skew"]
     offset_ms: float = Field(ge=-3.6e6, le=3.6e6)
+    """Positive: the clock is ahead."""
 
 
 class Drift(_NodeFault):
-    """The nodes' clocks run too fast by `rate_ppm` (too slow if negative)."""
+    """The nodes' clocks run too fast or too slow. As `skew`, they are what a program goes by."""
 
     kind: Literal["drift"]
     rate_ppm: float = Field(ge=-500_000, le=500_000)
+    """Positive: too fast."""
 
 
 # Misbehaviour, as VeReMi names it (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020).
 
 
 class ConstPosOffset(_NodeFault):
-    """The nodes' own fixes are off by a constant `offset_m`, and so is what they say."""
+    """The nodes' own fixes are off by a constant, and so is what they say."""
 
     kind: Literal["ConstPosOffset"]
     offset_m: Point = (50.0, 0.0)
+    """East and north."""
 
 
 class RandomPos(_NodeFault):
-    """The nodes' own fixes are anywhere within `radius_m` of where they would be, a new place each time."""
+    """The nodes' own fixes are anywhere in a disc around where they would be, a new place each time."""
 
     kind: Literal["RandomPos"]
     radius_m: float = Field(300.0, gt=0)
+    """Radius of the disc."""
 
 
 class DataReplay(_NodeFault):
-    """With each frame the nodes send one of their own from `age_s` ago again, of those since the fault began."""
+    """With each frame the nodes send an old one of their own again, of those since the fault began."""
 
     kind: Literal["DataReplay"]
     age_s: float = Field(1.0, gt=0, le=60)
+    """How old: the newest that is at least so old."""
 
 
 class StaleMessages(_NodeFault):
-    """In place of each frame the nodes send the one from `age_s` ago, once there is one since the fault began."""
+    """In place of each frame the nodes send an old one of their own, once there is one since the fault began."""
 
     kind: Literal["StaleMessages"]
     age_s: float = Field(1.0, gt=0, le=60)
+    """How old: the newest that is at least so old."""
 
 
 class DoS(_NodeFault):
-    """Each frame goes out `factor` times."""
+    """Each frame goes out many times."""
 
     kind: Literal["DoS"]
     factor: int = Field(10, ge=2, le=200)
+    """How many times in all."""
 
 
 class Sybil(_NodeFault):
-    """Each frame goes out again under `ghosts` other names: ID~1, ID~2, …"""
+    """Each frame goes out again under other names: ID~1, ID~2, …"""
 
     kind: Literal["Sybil"]
     ghosts: int = Field(3, ge=1, le=100)
+    """How many other names."""
 
 
 # Infrastructure.
 
 
 class EmulatorRestart(_Fault):
-    """The emulator's router and sessions close and come back after `down_s` of wall clock; agents are told first.
+    """The emulator's router and sessions close and come back; agents are told first.
 
-    In lockstep no emulated time passes meanwhile, and `duration_s` means nothing.
+    In lockstep no emulated time passes meanwhile.
     """
 
     kind: Literal["emulator_restart"]
     down_s: float = Field(1.0, gt=0, le=60)
+    """How long they are away (wall clock)."""
     duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
+    """Means nothing here."""
 
 
 class RouterRestart(_Fault):
-    """The separate router is ended and started again after `down_s` of wall clock; agents are told first."""
+    """The separate router is ended and started again; agents are told first."""
 
     kind: Literal["router_restart"]
     down_s: float = Field(1.0, gt=0, le=60)
+    """How long it is away (wall clock)."""
     duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
+    """Means nothing here."""
 
 
 ProcessFault = Kill | Restart | Pause

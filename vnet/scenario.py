@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -21,6 +21,7 @@ from vnet.errors import ScenarioError, printable, shown
 from vnet.faults import Fault
 from vnet.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from vnet.sections import Section, first_problem
+from vnet.sumo import input_files
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
 
 NS_PER_S = 1_000_000_000
@@ -31,69 +32,114 @@ FAR_M = 1e9
 WILD_M = 1e5
 """No standard deviation is larger, so that fixes stay near enough for frames to say."""
 MANY = 1_000_000_000
+FAR_S = 1e11
+"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
+"""Keys of `[network]` for vehicles that move."""
+NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
 
 
 class Run(Section):
-    """`[run]`: what the run is called, how long it takes and how patient it is.
-
-    Where there are faults, all have healed `settle_s` before the end, so that the network is judged at rest.
-    """
+    """`[run]`: what the run is called, how long it takes and how patient it is."""
 
     name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    """Names the run's folder, and its keys on Zenoh."""
     seed: int = Field(1, ge=0, lt=2**63)
+    """All that is drawn in the run comes from it: the same seed, the same run."""
     duration_s: float = Field(30.0, gt=0, le=DAY_S)
+    """Length of the run, in emulated time."""
     settle_s: float = Field(5.0, ge=0, le=DAY_S)
+    """All faults have healed so long before the end (emulated time), so that the network is judged at rest."""
     pacing: Literal["lockstep", "realtime"] = "lockstep"
+    """`lockstep` is virtual time, `realtime` the wall clock."""
     nodes_per_process: int = Field(1, ge=1, le=1000)
+    """How many vehicles share an agent process; they start, pause and die together."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
+    """How long the emulator waits for its agents to join, or to come back after a fault (wall clock)."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
+    """A process that does not yield for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
+    """An agent that has lost its emulator for so long (wall clock) ends."""
     spin_limit: int = Field(100_000, ge=100, le=MANY)
+    """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
 
 
 class Network(Section):
-    """`[network]`: which vehicles there are and where, either generated or from a CSV file.
+    """`[network]`: which vehicles there are and where they are, or how they drive."""
 
-    `file` reads `path` (columns id, x_m, y_m, heading_rad; relative to the scenario file). `generated` draws
-    `vehicles` of them: `layout = "urban"` has the degree histogram and components of the published networks,
-    `layout = "dense"` packs them so that degrees exceed 30. `seed` draws the network, and not the run.
-    """
-
-    kind: Literal["generated", "file"] = "generated"
+    kind: Literal["generated", "file", "trips", "sumo"] = "generated"
+    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive, and
+    `sumo` has SUMO drive."""
     path: Path | None = None
+    """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
+    CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
     vehicles: int = Field(38, ge=1, le=10_000)
+    """How many are generated; they are called v01, v02, …"""
     layout: Literal["urban", "dense"] = "urban"
+    """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
     seed: int = Field(1, ge=0, lt=2**63)
+    """Draws the generated network, or SUMO's traffic, and nothing of the run."""
+    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
+    max_vehicles: int | None = Field(None, ge=1, le=10_000)
+    """Trips: no more than so many vehicles, those that enter first."""
+    disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
+    """Trips: vehicles are there only within this disc, x, y, radius in m."""
+    origin_deg: tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]] | None = (
+        None
+    )
+    """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
+    fastest_mps: float = Field(70.0, gt=0, le=1000)
+    """Trips: what is faster is a jump."""
+    longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
+    """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave."""
+        return self.kind in ("trips", "sumo")
 
     @model_validator(mode="after")
-    def _path_goes_with_file(self) -> Network:
-        if (self.kind == "file") != (self.path is not None):
-            raise ValueError('path is required with kind = "file", and only then')
+    def _keys_go_with_their_kind(self) -> Network:
+        if (self.kind != "generated") != (self.path is not None):
+            raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
+        given = [name for name in OF_TRIPS if getattr(self, name) is not None]
+        if given and not self.moves:
+            raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         return self
 
 
 class CommonError(Section):
-    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process (MODEL 1)."""
+    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process."""
 
     sigma_m: float = Field(3.0, ge=0, le=WILD_M)
+    """Its standard deviation in each axis."""
     tau_s: float = Field(600.0, gt=0)
+    """Its correlation time."""
 
 
 class Gnss(Section):
     """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
 
     rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
+    """Fixes a second. The time between two is the period by which states and metrics are recorded."""
     sigma_m: float = Field(1.0, ge=0, le=WILD_M)
+    """Standard deviation of the receiver's noise in each axis."""
     heading: bool = True
+    """Whether fixes bear a heading."""
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)
+    """Standard deviation of that heading."""
 
 
 class Lateral(Section):
     """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
 
     half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    """How far it strays at most; the map tells programs."""
     sigma_m: float = Field(0.4, ge=0, le=WILD_M)
+    """Standard deviation of the offset, before it is reflected at the half-width."""
     tau_s: float = Field(20.0, gt=0)
+    """Correlation time of the offset."""
 
 
 class WorldSection(Section):
@@ -107,30 +153,45 @@ class WorldSection(Section):
 class Radio(Section):
     """`[radio]`: what stands between one vehicle's broadcast and another's reception.
 
-    All within `range_m` hear each other, unless `links` says who hears whom: a matrix of 0 and 1, or a CSV file of
-    one without a header (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in
-    the order of the network's vehicles; the diagonal means nothing.
-
     The subsections make it a physical radio, stage by stage; docs/radio.md says what each of them does.
     """
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
+    """All within it hear each other, unless there are `links`."""
     links: Path | tuple[tuple[int, ...], ...] | None = None
+    """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
+    (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
+    network's vehicles; the diagonal means nothing."""
     max_peers: int = Field(30, ge=1, le=MANY)
+    """Each receiver hears so many senders at most: the nearest that are up."""
     loss: float = Field(0.0, ge=0, le=1)
+    """Probability that a frame is lost, drawn for each receiver by itself."""
     latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
+    """Least time from the end of the transmission to the arrival."""
     jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Added to the latency: uniform up to so much, drawn for each receiver."""
     access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Wait before the transmission: uniform up to so much, drawn for each frame."""
     delivery_tick_us: int = Field(0, ge=0, le=MANY)
+    """Arrivals are rounded up to a multiple of it; 0 rounds nothing."""
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
+    """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
+    """A frame takes its payload's bits over this to send; each sender sends one at a time."""
     queue_frames: int = Field(64, ge=1, le=MANY)
+    """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
     path_loss: PathLoss | None = None
+    """How much weaker signals arrive; in place of the range, the power decides who hears whom."""
     shadowing: Shadowing | None = None
+    """What stands in the way of some signals and not of others."""
     fading: Fading | None = None
+    """How the power of one frame differs from the mean."""
     receiver: Receiver | None = None
+    """Noise, and what is detected; its defaults hold wherever signals have a power."""
     mac: Mac | None = None
+    """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
     congestion: Congestion | None = None
+    """Senders send less where the medium is busy."""
 
     @property
     def is_physical(self) -> bool:
@@ -173,7 +234,9 @@ class OneProgram(Section):
     """A program as `package.module:function`, and the options it is given."""
 
     entry: str = "agents.beacon:main"
+    """An async function of one argument, the `Node`."""
     options: dict[str, Any] = Field(default_factory=dict)
+    """Given to the program as `node.options`; what is allowed is its own business."""
 
     @field_validator("entry")
     @classmethod
@@ -184,15 +247,17 @@ class OneProgram(Section):
 
 
 class ProgramException(OneProgram):
-    """`[[program.exceptions]]`: `nodes` (ids) that run another program than all others, with options of its own."""
+    """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
 
     nodes: tuple[str, ...] = Field(min_length=1)
+    """Their ids."""
 
 
 class Program(OneProgram):
     """`[program]`: what every vehicle runs, but for the `exceptions`."""
 
     exceptions: tuple[ProgramException, ...] = ()
+    """Those that run something else."""
 
     @model_validator(mode="after")
     def _one_program_a_node(self) -> Program:
@@ -215,6 +280,7 @@ class Scenario(Section):
     radio: Radio = Radio()
     program: Program = Program()
     fault: tuple[Fault, ...] = ()
+    """What breaks, and when."""
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:
@@ -281,8 +347,10 @@ def dump_scenario(scenario: Scenario) -> str:
 
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path."""
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
     paths = [path for path in (scenario.network.path, scenario.radio.links) if isinstance(path, Path)]
+    if scenario.network.kind == "sumo" and scenario.network.path is not None:
+        paths += input_files(scenario.network.path)
     return {str(path): _sha256(path) for path in paths}
 
 

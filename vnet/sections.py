@@ -11,9 +11,12 @@ from vnet.errors import printable, shown
 
 
 class Section(BaseModel):
-    """Common behaviour of all sections: immutable, and no key is ignored in silence."""
+    """Common behaviour of all sections: immutable, and no key is ignored in silence.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    The docstring below a key is its description, from which docs/reference is made.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]) -> str:

@@ -70,7 +70,7 @@ class Matrix(_Equal):
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Reach`."""
-        return _without_itself(self._links.T.copy())
+        return _without_itself(self._links.T & np.isfinite(distance_m))
 
 
 class AboveFloor:

@@ -30,7 +30,7 @@ class Surroundings:
 class Topology:
     """The surroundings as they are `now`, made anew when vehicles move or go up or down.
 
-    Positions are (N, 2) in metres. Powers are worked out only with `nakagami`.
+    Positions are (N, 2) in metres, NaN where a vehicle is not there. Powers are worked out only with `nakagami`.
     """
 
     def __init__(self, position_m: Array, reach: Reach, max_peers: int, nakagami: Nakagami | None = None) -> None:

@@ -7,7 +7,7 @@ that is handed over while they last.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,7 @@ class LinkFaults:
 
     def update(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """From now on, at `time_ns`, these act and no others."""
-        random = {p.number: self._random.get(p.number) or self._begin(p) for p in active if p.links is not None}
+        random = {p.number: self._go_on(p) for p in active if p.links is not None}
         self._random = random
         self.effects = LinkEffects(
             cut=[(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None],
@@ -109,6 +109,11 @@ class LinkFaults:
             corrupting=_of(random, Corrupt),
         )
         self._access.throttle(self._throttled(active))
+
+    def _go_on(self, planned: PlannedFault) -> _Random:
+        """What has been drawn for a fault so far, acting from now on where it says."""
+        one = self._random.get(planned.number)
+        return self._begin(planned) if one is None else replace(one, planned=planned)
 
     def _begin(self, planned: PlannedFault) -> _Random:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, BurstLoss) else (0, 0), dtype=bool)

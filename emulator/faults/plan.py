@@ -7,18 +7,34 @@ any order, without leaving anything behind.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from emulator.faults.selectors import Mask, Nodes, links_of, select, severed_by
 from vnet.errors import ScenarioError
-from vnet.faults import Fault, Infrastructure, LinkFault, NodeFault, Partition, Swizzle
+from vnet.faults import (
+    ConstPosOffset,
+    Fault,
+    GnssJump,
+    GnssOutage,
+    GnssRamp,
+    Infrastructure,
+    LinkFault,
+    NodeFault,
+    Partition,
+    RandomPos,
+    Range,
+    Swizzle,
+)
 from vnet.scenario import NS_PER_S, Scenario
 
 NEVER_NS = 0.1
 """Less than an instant: a fault that lasts so long does not act."""
+FOLLOWING = LinkFault | Range | GnssOutage | GnssJump | GnssRamp | ConstPosOffset | RandomPos
+"""Where vehicles move, a region or degree is looked at anew each period for these; others choose as they begin."""
+Places = tuple[Mask, Mask | None]
 
 
 @dataclass(frozen=True)
@@ -26,6 +42,7 @@ class PlannedFault:
     """A fault with its place in the plan, the instants [start, end) between which it acts, and where.
 
     `nodes` (N,) are those selected; `links` (N, N), rows are senders, those it acts on; None for faults of nodes.
+    `moving` tells both anew for each instant, where vehicles drive into a region and out of it.
     """
 
     number: int
@@ -34,6 +51,7 @@ class PlannedFault:
     end_ns: int
     nodes: Mask
     links: Mask | None
+    moving: Callable[[int], Places] | None = None
 
     @property
     def label(self) -> str:
@@ -44,14 +62,30 @@ class PlannedFault:
         """Whether it acts at this instant."""
         return self.start_ns <= time_ns < self.end_ns
 
+    def acts_between(self, start_ns: int, end_ns: int) -> bool:
+        """Whether it acts at any instant in [start, end)."""
+        return max(self.start_ns, start_ns) < min(self.end_ns, end_ns)
+
+    def placed(self, time_ns: int) -> PlannedFault:
+        """The fault with those on whom it acts at this instant."""
+        if self.moving is None:
+            return self
+        nodes, links = self.moving(time_ns)
+        return replace(self, nodes=nodes, links=links)
+
 
 class FaultPlan:
-    """All faults of a run, those that have been and those to come. Raises ScenarioError if one does not fit."""
+    """All faults of a run, those that have been and those to come. Raises ScenarioError if one does not fit.
 
-    def __init__(self, scenario: Scenario, nodes: Nodes) -> None:
+    `nodes_at` tells where the nodes are in a period, if they move; else they are where `nodes` says.
+    """
+
+    def __init__(self, scenario: Scenario, nodes: Nodes, nodes_at: Callable[[int], Nodes] | None = None) -> None:
         self._seed = scenario.run.seed
         self._healed_ns = round(scenario.healed_s * NS_PER_S)
+        self._period_ns = scenario.period_ns
         self._nodes = nodes
+        self._nodes_at = nodes_at
         self._groups = scenario.run.nodes_per_process
         self.faults: list[PlannedFault] = []
         for fault in scenario.fault:
@@ -65,12 +99,18 @@ class FaultPlan:
             limit_s = self._healed_ns / NS_PER_S
             raise ScenarioError(f"{fault.kind}: at_s = {fault.at_s:g}: must be less than {limit_s:g}")
         end_ns = min(start_ns + round(fault.duration_s * NS_PER_S), self._healed_ns)
-        rng = stream(self._seed, number, "select")
+        moving = None
         try:
-            nodes, links = _places(fault, self._nodes, rng)
+            if self._nodes_at is None or not _chooses_by_place(fault):
+                nodes, links = _places(fault, self._nodes, stream(self._seed, number, "select"))
+            else:
+                moving = _MovingPlaces(fault, self._nodes_at, self._period_ns, self._seed, number)
+                nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
-        planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links)
+        if not isinstance(fault, FOLLOWING):
+            moving = None
+        planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
         self.faults.append(planned)
         return planned
@@ -106,13 +146,16 @@ class FaultPlan:
         return max((max(planned.end_ns, planned.start_ns + 1) for planned in self.faults), default=0)
 
     def next_change_ns(self, after_ns: int) -> int | None:
-        """When next, after this instant, a fault starts or ends (a swizzle: or a node of it comes or goes)."""
-        changes = (t for planned in self.faults for t in _changes(planned, self._seed))
-        return min((t for t in changes if t > after_ns), default=None)
+        """When next, after this instant, a fault starts or ends, or may act on others than before."""
+        changes = [t for planned in self.faults for t in _changes(planned, self._seed) if t > after_ns]
+        period_ns = (after_ns // self._period_ns + 1) * self._period_ns
+        if any(planned.moving and planned.start_ns < period_ns < planned.end_ns for planned in self.faults):
+            changes.append(period_ns)
+        return min(changes, default=None)
 
     def active(self, time_ns: int) -> list[PlannedFault]:
-        """Those that act at this instant, in the order of their numbers."""
-        return [planned for planned in self.faults if planned.acts_at(time_ns)]
+        """Those that act at this instant, and on whom, in the order of their numbers."""
+        return [planned.placed(time_ns) for planned in self.faults if planned.acts_at(time_ns)]
 
     def as_written(self) -> tuple[Fault, ...]:
         """The faults as a scenario states them, with the times at which they began and ended."""
@@ -127,7 +170,34 @@ def _as_written(planned: PlannedFault) -> Fault:
     return planned.fault.model_copy(update=update)
 
 
-def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> tuple[Mask, Mask | None]:
+def _chooses_by_place(fault: Fault) -> bool:
+    """Whether it matters to a fault where nodes are."""
+    selectors = (getattr(fault, name, None) for name in ("nodes", "senders", "receivers"))
+    return any(selector is not None and selector.by_place for selector in selectors)
+
+
+class _MovingPlaces:
+    """On whom a fault acts at each instant; the last answer is kept, as all of a period ask for the same."""
+
+    def __init__(
+        self, fault: Fault, nodes_at: Callable[[int], Nodes], period_ns: int, seed: int, number: int
+    ) -> None:
+        self._fault = fault
+        self._nodes_at = nodes_at
+        self._period_ns = period_ns
+        self._seed = seed
+        self._number = number
+        self._last: tuple[int, Places] | None = None
+
+    def __call__(self, time_ns: int) -> Places:
+        period = time_ns // self._period_ns
+        if self._last is None or self._last[0] != period:
+            rng = stream(self._seed, self._number, "select")
+            self._last = period, _places(self._fault, self._nodes_at(period), rng)
+        return self._last[1]
+
+
+def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Places:
     if isinstance(fault, Partition):
         severed = severed_by(fault, nodes, rng)
         return _ends(severed), severed

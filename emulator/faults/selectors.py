@@ -1,4 +1,4 @@
-"""Which nodes and links a fault acts on: decided once, from where the vehicles are at first and the run's seed."""
+"""Which nodes and links a fault acts on, from where the vehicles are and the run's seed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Nodes:
-    """What selectors look at: ids, first positions (N, 2) in metres, and how many others each has in range (N,)."""
+    """What selectors look at: ids, positions (N, 2) in metres, and how many others each has in range (N,).
+
+    Of a vehicle that is not there the position is NaN, and the degree negative.
+    """
 
     ids: Sequence[str]
     position_m: Array

@@ -41,7 +41,9 @@ class BentGnss:
         acting = [
             planned
             for planned in self._faults
-            if planned.acts_at(time_ns) and isinstance(planned.fault, GnssFault) and planned.nodes[number]
+            if planned.acts_at(time_ns)
+            and isinstance(planned.fault, GnssFault)
+            and planned.placed(time_ns).nodes[number]
         ]
         fix = self._world.fix(period, number)
         if not acting:
@@ -58,16 +60,19 @@ class BentGnss:
         instant = self._world.at(period)
         if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
             return instant
-        fixes = [self.fix(period, number) for number in range(len(self._world.node_ids))]
         nothing = np.full(2, np.nan)
+        there = instant.present.tolist()
+        fixes = [self.fix(period, number) if here else None for number, here in enumerate(there)]
         return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
 
     def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
-        """The position that frozen receivers repeat: their last before the earliest freeze."""
+        """The position that frozen receivers repeat: their last before the earliest freeze, or first since."""
         frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
         if not frozen:
             return fix.position_m
         last = max(0, math.ceil(min(frozen) / self._world.period_ns) - 1)
+        while not self._world.present(last)[number]:
+            last += 1
         return self._world.fix(last, number).position_m
 
     def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -58,32 +58,46 @@ _SIZES = {"common_error_m": 2, "common_error_covariance_m2": 4, "mean_m": 2, "st
 class PeriodFigures:
     """One row of the metrics. Lengths in metres; None where no node reported what is needed.
 
-    `common_error_rmse_m` is √(mean‖x_i − c‖²), `deviation_m` √(mean‖x_i − x̄‖²) and `bias_m` ‖x̄ − c‖ over the
-    network; `stacked_…` the same right after fusion, before the map; `component_…` per connected component;
-    `consensus_error_m` is √(mean‖m_i − x̄‖²) with x̄ of the node's component; ANEES are means of
-    εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
+    x_i is vehicle i's estimate of the common error c, x̄ the mean of all x_i, m_i what vehicle i takes for the mean.
+    ANEES are means of εᵀ P⁻¹ ε / 2, so that 1 is consistent (Bar-Shalom, Li, Kirubarajan 2001, 5.4).
     """
 
     period: int
+    """Counts from 0."""
     time_ns: int
+    """Its start."""
     reporting: int
+    """How many vehicles reported in it."""
     common_error_rmse_m: float | None
+    """√(mean‖x_i − c‖²) over the network."""
     deviation_m: float | None
+    """√(mean‖x_i − x̄‖²): how far the vehicles are from agreeing."""
     bias_m: float | None
+    """‖x̄ − c‖."""
     stacked_rmse_m: float | None
+    """As `common_error_rmse_m`, right after fusion, before the map."""
     stacked_deviation_m: float | None
+    """As `deviation_m`, right after fusion, before the map."""
     component_rmse_m: list[float | None]
+    """`common_error_rmse_m` of each connected component of the network: where vehicles move, of the period's."""
     component_deviation_m: list[float | None]
+    """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
+    """Of the vehicles' estimates of their positions."""
     fix_rmse_m: float | None
+    """Of the raw fixes."""
     consensus_error_m: float | None
+    """√(mean‖m_i − x̄‖²), with x̄ of the vehicle's component."""
     common_error_anees: float | None
+    """Of the common error."""
     position_anees: float | None
+    """Of the positions."""
     not_finite: int
+    """How many reports held NaN or infinity."""
 
 
 class Metrics:
-    """Collects reports and truth. `component` (N,) labels each node's connected component."""
+    """Collects reports and truth. `component` (N,) labels each node's connected component; -1 if not there."""
 
     def __init__(self, node_ids: Sequence[str], component: NDArray[np.intp], period_ns: int) -> None:
         self._number = {node: number for number, node in enumerate(node_ids)}
@@ -94,14 +108,20 @@ class Metrics:
         self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
         self._packed: list[pa.Table] = []
 
-    def record(self, instant: Instant, reports: Sequence[Report]) -> PeriodFigures:
-        """Take the last report of each node in one period; returns the period's figures."""
+    def record(
+        self, instant: Instant, reports: Sequence[Report], component: NDArray[np.intp] | None = None
+    ) -> PeriodFigures:
+        """Take the last report of each node in one period; returns the period's figures.
+
+        Where vehicles move, `component` is that of the period.
+        """
+        if component is not None:
+            self._component = component
         last = {report.node: report for report in reports}
-        count = len(self._node_ids)
-        estimate = _collect(count, self._number, last, lambda r: r.estimate_m, 2)
-        covariance = _collect(count, self._number, last, lambda r: r.covariance_m2, 4)
+        estimate = collect(self._number, last, lambda r: r.estimate_m, 2)
+        covariance = collect(self._number, last, lambda r: r.covariance_m2, 4)
         named = {
-            name: _collect(count, self._number, last, lambda r, name=name: r.values.get(name), size)
+            name: collect(self._number, last, lambda r, name=name: r.values.get(name), size)
             for name, size in _SIZES.items()
         }
         self._store(instant, last)
@@ -216,9 +236,9 @@ def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
     return summary
 
 
-def _collect(count: int, number: dict[str, int], last: dict[str, Report], get: Any, size: int) -> Array:
-    """(count, size) with NaN where a node did not report a value of that size."""
-    array = np.full((count, size), np.nan)
+def collect(number: Mapping[str, int], last: Mapping[str, Report], get: Any, size: int) -> Array:
+    """(N, size) of what `get` finds in each node's report; NaN where it finds nothing of that size."""
+    array = np.full((len(number), size), np.nan)
     for node, report in last.items():
         value = get(report)
         if isinstance(value, (list, tuple)) and len(value) == size:

@@ -69,8 +69,12 @@ class RunFolder:
         """Have `write` make a file beside its place, then move it there in one step."""
         part = self.path / f".{name}.part"
         with _disk(self.path):
-            write(part)
-            part.replace(self.path / name)
+            try:
+                write(part)
+                part.replace(self.path / name)
+            except BaseException:
+                part.unlink(missing_ok=True)
+                raise
 
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
@@ -87,9 +91,9 @@ def read_events(folder: Path) -> list[Event]:
     for line in lines:
         try:
             data = json.loads(line)
-        except ValueError:
+            events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
+        except (ValueError, KeyError, AttributeError):
             continue  # the last line of a run that was killed
-        events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
     return events
 
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.observe.checks import Judgement, Verdict
+from emulator.observe.sinks import RECORDING, is_closed, mending_command
 
 _STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 _FIGURES = {
@@ -32,8 +33,10 @@ def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, c
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
-    if (folder / "recording.rrd").exists():
-        following[f"rerun {folder / 'recording.rrd'}"] = "look at it"
+    if (recording := folder / RECORDING).exists():
+        following[f"vnet view {folder}"] = "look at it"
+        if not is_closed(recording):
+            following[mending_command(recording)] = "mend the recording, whose observer was killed"
     for number, (command, why) in enumerate(following.items()):
         heading = "" if number else "next"
         console.print(f"{heading:13}{as_typed(command)}   ({why})", highlight=False, soft_wrap=True)

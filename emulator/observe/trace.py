@@ -25,7 +25,7 @@ NOT_ARRIVING = -1
 FIRST_ROWS = 1 << 22
 """Room from the start: the system hands out zeroed pages only as they are written, and growing means copying."""
 
-_ROW = np.dtype(
+ROW = np.dtype(
     [
         ("sent_ns", "<i8"),
         ("sender", "<i4"),
@@ -43,6 +43,11 @@ _ROW = np.dtype(
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
+def decided_ns(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """When each of these records of type `ROW` is decided: as it arrives, or as it is sent if it does not."""
+    return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["sent_ns"], rows["arrival_ns"]))
+
+
 class Trace:
     """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
@@ -53,7 +58,7 @@ class Trace:
         self._node_ids = list(node_ids)
         self._knows_air = knows_air
         self._causes = [""]
-        self._rows = np.zeros(FIRST_ROWS, dtype=_ROW)
+        self._rows = np.zeros(FIRST_ROWS, dtype=ROW)
         self._count = 0
 
     def __len__(self) -> int:
@@ -67,7 +72,7 @@ class Trace:
         """
         first, end = self._count, self._count + count
         if end > len(self._rows):
-            grown = np.zeros(max(2 * len(self._rows), end), dtype=_ROW)
+            grown = np.zeros(max(2 * len(self._rows), end), dtype=ROW)
             grown[:first] = self._rows[:first]
             self._rows = grown
         rows = self._rows[first:end]
@@ -91,6 +96,10 @@ class Trace:
     def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
         """Give rows their outcome."""
         self._rows["outcome"][rows] = outcome
+
+    def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
+        """These rows as records of type `ROW`, which they are: to be read only."""
+        return self._rows[which]
 
     def to_table(self) -> pa.Table:
         """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).

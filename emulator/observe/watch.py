@@ -1,52 +1,133 @@
-"""The observer process: subscribes to a run over Zenoh and records it. It can never slow a vehicle."""
+"""The observer process: hears a run over Zenoh and records it. It can never slow a vehicle, or the run.
+
+What it has not recorded yet waits in a bounded inbox; periods for which there is no room are left out, and the
+recording says so. It ends with the run, with SIGTERM or SIGINT, or once the emulator has been gone for too long;
+the file is closed cleanly.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import queue
 import signal
-from pathlib import Path
+import sys
+import threading
+import time
+import tomllib
+from collections import deque
 from typing import Any
 
 import zenoh
 
 from emulator.observe.recorder import Recorder
+from emulator.observe.sinks import Sinks
 from vnet.errors import WireError
 from vnet.link import keys, wire
 from vnet.link.access import Credentials
 from vnet.link.session import open_client
 
 LEASE_MS = 60_000
+INBOX_BYTES = 64 * 1024 * 1024
+DEFAULT_PATIENCE_S = 5.0
 
 
-def record_run(endpoint: str, run: str, credentials: Credentials | None, path: Path) -> None:
-    """Record `run` into `path` until its end, or until SIGTERM or SIGINT; the file is closed cleanly.
+class Inbox:
+    """Messages on their way to the recording: Zenoh's threads `put`, and never wait; one thread `get`s.
 
-    Raises LinkError if there is no router at `endpoint` or it refuses.
+    At most `limit_bytes` wait: what finds no room is dropped and counted, but for the end of the run.
     """
-    inbox: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+
+    def __init__(self, limit_bytes: int = INBOX_BYTES) -> None:
+        self._limit_bytes = limit_bytes
+        self._waiting: deque[tuple[str, bytes]] = deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self.dropped = 0
+
+    def put(self, stream: str, data: bytes = b"") -> None:
+        """Add a message, if there is room."""
+        with self._changed:
+            if self._bytes + len(data) > self._limit_bytes and stream != "end":
+                self.dropped += 1
+                return
+            self._waiting.append((stream, data))
+            self._bytes += len(data)
+            self._changed.notify()
+
+    def get(self, timeout_s: float | None = None) -> tuple[str, bytes] | None:
+        """The oldest message; None if there is none within `timeout_s`."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._waiting, timeout_s):
+                return None
+            stream, data = self._waiting.popleft()
+            self._bytes -= len(data)
+            return stream, data
+
+
+def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: Sinks) -> None:
+    """Record `run` into `sinks` until its end; see the module's text.
+
+    Raises LinkError if there is no router at `endpoint` or it refuses, VnetError if the file cannot be written.
+    """
+    inbox = Inbox()
 
     def on_sample(sample: zenoh.Sample) -> None:
-        inbox.put((str(sample.key_expr).rsplit("/", 1)[1], sample.payload.to_bytes()))
+        inbox.put(str(sample.key_expr).rsplit("/", 1)[1], sample.payload.to_bytes())
+
+    def on_alive(sample: zenoh.Sample) -> None:
+        inbox.put("found" if sample.kind == zenoh.SampleKind.PUT else "lost")
 
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with open_client(endpoint, credentials, LEASE_MS) as session, Recorder(path) as recorder:
-        session.declare_subscriber(keys.observe(run, "*"), on_sample)
-        with contextlib.suppress(KeyboardInterrupt):
-            while _record_one(recorder, *inbox.get()):
-                pass
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        open_client(endpoint, credentials, LEASE_MS) as session,
+        Recorder(sinks, run) as recorder,
+    ):
+        liveliness = session.liveliness()
+        alive = liveliness.declare_subscriber(keys.emulator_alive(run), on_alive, history=True)
+        with alive, session.declare_subscriber(keys.observe(run, "*"), on_sample):
+            _record_all(inbox, recorder)
 
 
-def _record_one(recorder: Recorder, stream: str, data: bytes) -> bool:
-    """Record one message; False at the end of the run. What does not decode is left out."""
-    if stream == "end":
-        return False
+def _record_all(inbox: Inbox, recorder: Recorder) -> None:
+    """Record messages until the end of the run, or until the emulator has been gone for too long."""
+    deadline: float | None = None
+    patience_s = DEFAULT_PATIENCE_S
+    said = 0
+    while True:
+        item = inbox.get(None if deadline is None else max(0.0, deadline - time.monotonic()))
+        if item is None:
+            _say(f"the emulator has been gone for {patience_s:g} s; the recording ends")
+            return
+        stream, data = item
+        if stream in ("lost", "found"):
+            deadline = time.monotonic() + patience_s if stream == "lost" else None
+            continue
+        deadline = None  # whoever says something is there
+        if (message := _decode(data)) is not None:
+            recorder.take(stream, message)
+            if stream == "scene":
+                patience_s = _patience_s(message)
+        if recorder.missed > said:
+            _say(f"{recorder.missed - said} periods were left out: the recording could not keep up")
+            said = recorder.missed
+        if stream == "end":
+            return
+
+
+def _decode(data: bytes) -> dict[str, Any] | None:
+    """A message; None if it is none, which is left out."""
     try:
-        message: dict[str, Any] = wire.decode_observation(data)
+        return wire.decode_observation(data)
     except WireError:
-        return True
-    if stream == "scene":
-        recorder.scene(message)
-    elif stream == "period":
-        recorder.period(message)
-    return True
+        return None
+
+
+def _patience_s(scene: dict[str, Any]) -> float:
+    """How long the emulator may be gone: as long as agents wait, and as long as planned faults take it away."""
+    scenario = tomllib.loads(scene["scenario"])
+    away_s = [fault.get("down_s", 0.0) for fault in scenario.get("fault", [])]
+    return float(scenario["run"]["orphan_timeout_s"]) + max(away_s, default=0.0)
+
+
+def _say(text: str) -> None:
+    print(f"vnet record: {text}", file=sys.stderr, flush=True)

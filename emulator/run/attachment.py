@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
+from emulator.observe.sinks import Sinks
 from emulator.run.router import SeparateRouter
 from vnet.link import keys, wire
 from vnet.link.access import EMULATOR, Access
@@ -32,7 +32,7 @@ class LiveOptions:
     listen: str = "tcp/127.0.0.1:0"
     connect: str | None = None
     launch: bool = True
-    record: Path | None = None
+    record: Sinks | None = None
     router: SeparateRouter | None = None
 
 

@@ -11,10 +11,12 @@ import contextlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from emulator.faults.plan import PlannedFault
+from emulator.observe.sinks import ServeAt, Sinks
 from emulator.run.emulation import Emulation
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.faults import parse_fault
@@ -90,12 +92,13 @@ def _described(planned: PlannedFault, emulation: Emulation, now_ns: int) -> dict
 
 
 @contextmanager
-def way_in(folder: Path, endpoint: str, access: Access) -> Iterator[None]:
-    """Keep `control.json` in the run's folder for as long as the block lasts."""
+def way_in(folder: Path, endpoint: str, access: Access, sinks: Sinks | None = None) -> Iterator[None]:
+    """Keep `control.json` in the run's folder for as long as the block lasts; `sinks`: where it can be watched."""
     path = folder / CONTROL_FILE
     try:
         write_private(folder / OPERATOR_FILE, access.credentials(OPERATOR).dumps())
-        write_private(path, json.dumps({"endpoint": endpoint, "run": access.run}) + "\n")
+        place = None if sinks is None or sinks.serve is None else asdict(sinks.serve)
+        write_private(path, json.dumps({"endpoint": endpoint, "run": access.run, "served": place}) + "\n")
     except OSError as error:
         raise VnetError(f"{path}: cannot write: {error.strerror}") from None
     try:
@@ -106,16 +109,28 @@ def way_in(folder: Path, endpoint: str, access: Access) -> Iterator[None]:
                 left.unlink()
 
 
-def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
-    """Put a query to the run whose folder this is. Raises VnetError: no such run, no answer, or what it says."""
+def read_way_in(folder: Path) -> tuple[str, str, ServeAt | None] | None:
+    """Endpoint and name of the run that is going on in `folder`, and where it can be watched; None if none is.
+
+    A run that was killed leaves its file behind. Raises VnetError for what no run writes.
+    """
     path = folder / CONTROL_FILE
     try:
         data = json.loads(path.read_text())
-        endpoint, run = str(data["endpoint"]), str(data["run"])
+        served = data.get("served")
+        return str(data["endpoint"]), str(data["run"]), None if served is None else ServeAt(**served)
     except OSError:
-        raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)") from None
-    except (ValueError, KeyError, TypeError):
+        return None
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise VnetError(f"{path}: not what a run writes") from None
+
+
+def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
+    """Put a query to the run whose folder this is. Raises VnetError: no such run, no answer, or what it says."""
+    way = read_way_in(folder)
+    if way is None:
+        raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)")
+    endpoint, run, _ = way
     login = Credentials.load(folder / OPERATOR_FILE)
     with open_client(endpoint, login, LEASE_MS) as session:
         replies = session.get(

@@ -11,13 +11,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.channel.reach import distances_m, reach_of
-from emulator.engine import Deliveries, Engine
+from emulator.engine import Delivery, Engine
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.faults.sensors import BentGnss, clock_of
 from emulator.observe.metrics import Metrics, PeriodFigures
-from emulator.observe.observation import period_message
 from emulator.observe.run_folder import RunFolder, write_text
 from emulator.world.world import Instant, World, components
 from vnet.faults import Fault, Infrastructure
@@ -34,19 +36,14 @@ class PeriodView:
     reports: list[Report]
     figures: PeriodFigures
     counts: dict[str, int]
-    deliveries: list[Deliveries]
-
-    def message(self, node_ids: Sequence[str]) -> dict[str, Any]:
-        """The period as observers are told it."""
-        return period_message(node_ids, self.instant, self.reports, self.figures, self.counts, self.deliveries)
 
 
 @dataclass(frozen=True)
 class ProcessActions:
     """What processes suffer from an instant on.
 
-    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start anew; `paused`: all
-    that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
+    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start (anew); `paused`:
+    all that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
     """
 
     stop: dict[str, bool]
@@ -69,28 +66,49 @@ class Emulation:
         self.scenario = scenario
         self.world = world
         self.folder = folder
-        radio = scenario.radio
-        reach = reach_of(radio, scenario.run.seed, world.links)
-        in_range = reach.in_range(start.position_m, distances_m(start.position_m))
-        self.faults = FaultPlan(scenario, Nodes(world.node_ids, start.position_m, in_range.sum(axis=0)))
+        self._reach = reach_of(scenario.radio, scenario.run.seed, world.links)
+        self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
-        self._down_by_fault: set[str] = set()
+        self._outside = self._absent(0)  # whom no event says to be there
+        self._newcomers = set(self._outside)
+        self._down = set(self._outside)  # until a fault ends, or they enter
         self._starting: set[str] = set()
         self._ended: set[str] = set()
         self._acting: set[str] = set()
         self._acted_ns = -1
-        self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
+        self._next_change_ns = self._find_next_change_ns()
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
-        component = components(start.position_m, radio.range_m, in_range)
-        self.metrics = Metrics(world.node_ids, component, world.period_ns)
+        self._placed = 0
+        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.up = dict.fromkeys(world.node_ids, True)
+        for node in self._outside:
+            self._take_down(node)
         self._watchers: list[Callable[[PeriodView], None]] = []
         self._period = 0
         self._finished = False
         self._reports: list[Report] = []
-        self._delivered: list[Deliveries] = []
+        self._arrived: list[Delivery] = []
+
+    def _nodes_at(self, period: int) -> Nodes:
+        """What the selectors of faults look at in a period."""
+        world = self.world
+        degree = self._in_range(period).sum(axis=0)
+        return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
+
+    def _in_range(self, period: int) -> NDArray[np.bool_]:
+        position_m = self.world.position_m(period)
+        return self._reach.in_range(position_m, distances_m(position_m))
+
+    def _component(self, period: int) -> NDArray[np.intp]:
+        """Which connected component each vehicle belongs to."""
+        return components(self.world.position_m(period), self.scenario.radio.range_m, self._in_range(period))
+
+    def _absent(self, period: int) -> set[str]:
+        """Who is not in the network."""
+        there = self.world.present(period).tolist()
+        return {node for node, present in zip(self.world.node_ids, there, strict=True) if not present}
 
     def watch(self, watcher: Callable[[PeriodView], None]) -> None:
         """Call `watcher` at the end of every period from now on."""
@@ -137,11 +155,19 @@ class Emulation:
                 frames.setdefault(frame.node, []).append(frame.payload)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
+        if frames:
+            self._place(time_ns // self.world.period_ns)
         for node in sorted(frames, key=self.number.__getitem__):
             if self.up[node]:
                 self.engine.transmit(time_ns, self.number[node], frames[node])
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)
+
+    def _place(self, period: int) -> None:
+        """Frames are sent from where vehicles are at the start of the period."""
+        if self.world.moves and period != self._placed:
+            self.engine.set_positions(self.world.position_m(period))
+            self._placed = period
 
     def _end(self, time_ns: int, ending: wire.Ending) -> None:
         if not self.up[ending.node]:
@@ -164,48 +190,70 @@ class Emulation:
         self.up[node] = False
         self.engine.set_up(self.number[node], False)
 
-    # Faults.
+    # Faults, and vehicles that enter and leave.
 
-    def next_fault_ns(self) -> int | None:
-        """When next a fault starts or ends."""
-        return self._next_fault_ns
+    def next_change_ns(self) -> int | None:
+        """When next a fault starts or ends, or a vehicle enters or leaves."""
+        return self._next_change_ns
+
+    def _find_next_change_ns(self) -> int | None:
+        changes = (self.faults.next_change_ns(self._acted_ns), self.world.next_change_ns(self._acted_ns))
+        return min((time_ns for time_ns in changes if time_ns is not None), default=None)
 
     def act(self, time_ns: int, starts_at_once: bool = True) -> ProcessActions:
-        """Let the faults of `time_ns` act on links and senders; returns what processes are to suffer.
+        """Let the faults of `time_ns` act on links and senders, and vehicles enter and leave.
 
-        The caller has taken all that arrived before `time_ns`. Without `starts_at_once` nodes that start anew are
-        up only when it says that they `come_back`.
+        Returns what processes are to suffer. The caller has taken all that arrived before `time_ns`. Without
+        `starts_at_once` nodes that start are up only when it says that they `come_back`.
         """
+        self.close_periods(time_ns)
         self._acted_ns = time_ns
-        self._next_fault_ns = self.faults.next_change_ns(time_ns)
+        self._next_change_ns = self._find_next_change_ns()
         active = self.faults.active(time_ns)
         self.engine.set_faults(active, time_ns)
         self._log_changes(time_ns, active)
-        down = self._nodes_under(active, "kill", "restart")
+        absent = self._absent(time_ns // self.world.period_ns)
+        down = self._nodes_under(active, "kill", "restart") | absent
         paused = self._nodes_under(active, "pause")
         killed = self._nodes_under(active, "kill")
         living = [node for node in self.world.node_ids if self.up[node] or node in self._starting]
         stop = {node: node in killed for node in living if node in down}
-        start = [n for n in self.world.node_ids if n in self._down_by_fault and n not in down]
+        start = [n for n in self.world.node_ids if n in self._down and n not in down]
         for node in stop:
             self._take_down(node)
+        self._log_departures(time_ns, absent)
         for node in start:
-            self.incarnation[node] += 1
+            self.incarnation[node] += node not in self._newcomers
+        self._newcomers.difference_update(start)
         self._starting = (self._starting - stop.keys()) | set(start)
         if starts_at_once:
             self.come_back(start, time_ns)
-        self._down_by_fault = (self._down_by_fault | stop.keys()) - set(start)
+        self._down = (self._down | stop.keys()) - set(start)
         clocks = [clock_of(active, node, number, time_ns) for node, number in self.number.items()]
         restarts = [p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns]
         return ProcessActions(stop, start, paused, clocks, restarts)
 
     def come_back(self, nodes: Sequence[str], time_ns: int) -> None:
-        """Nodes that were down are up again, but for those whose programs have ended by themselves."""
+        """Nodes that were down are up, but for those whose programs have ended by themselves."""
         self._starting.difference_update(nodes)
         for node in [node for node in nodes if node not in self._ended]:
             self.up[node] = True
             self.engine.set_up(self.number[node], True)
-            self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
+            if node in self._outside:
+                self._outside.discard(node)
+                self.folder.event(time_ns, "entered", node, incarnation=self.incarnation[node])
+            else:
+                self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
+
+    def has_left(self, node: str) -> bool:
+        """Whether a vehicle is not in the network, as events tell it."""
+        return node in self._outside
+
+    def _log_departures(self, time_ns: int, absent: set[str]) -> None:
+        for node in self.world.node_ids:
+            if node in absent and node not in self._outside:
+                self.folder.event(time_ns, "left", node)
+        self._outside |= absent
 
     def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
         chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]
@@ -247,7 +295,7 @@ class Emulation:
         self._rewrite(self.scenario.model_copy(update={"run": shorter}))
 
     def _change_plan(self) -> None:
-        self._next_fault_ns = self.faults.next_change_ns(self._acted_ns)
+        self._next_change_ns = self._find_next_change_ns()
         self._rewrite(self.scenario.model_copy(update={"fault": self.faults.as_written()}))
 
     def _rewrite(self, scenario: Scenario) -> None:
@@ -255,11 +303,11 @@ class Emulation:
         text = dump_scenario(scenario)
         self.folder.put("scenario.toml", lambda path: write_text(path, text))
 
-    def advance(self, time_ns: int) -> Deliveries:
+    def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
-        deliveries = self.engine.advance(time_ns)
-        self._delivered.append(deliveries)
+        deliveries = [*self._arrived, *self.engine.advance(time_ns)]
+        self._arrived = []
         return deliveries
 
     def look_ahead(self, time_ns: int, nodes: Iterable[str]) -> None:
@@ -279,17 +327,22 @@ class Emulation:
             self.engine.drain()
 
     def close_periods(self, time_ns: int) -> None:
-        """Record the periods that end by then; nobody has anything more to report of them."""
-        while (self._period + 1) * self.world.period_ns <= time_ns:
+        """Record the periods that end by then; nobody has anything more to report of them.
+
+        What arrives in them, whether or not anybody waits for it, has arrived by then: `advance` hands it out.
+        """
+        while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
+            self._arrived += self.engine.advance(end_ns - 1)
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
-            figures = self.metrics.record(instant, reports)
+            component = self._component(self._period) if self.world.moves else None
+            figures = self.metrics.record(instant, reports, component)
             self._period += 1
             counts = {outcome.name: count for outcome, count in self.engine.counts.items()}
-            view = PeriodView(instant, reports, figures, counts, self._delivered)
+            view = PeriodView(instant, reports, figures, counts)
             for watcher in self._watchers:
                 watcher(view)
-            self._reports, self._delivered = [], []
+            self._reports = []
 
 
 def node_seed(seed: int, node: str, incarnation: int) -> int:

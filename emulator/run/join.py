@@ -6,7 +6,7 @@ only the holder of that hello's nonce speaks for it afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from vnet.link import wire
@@ -22,17 +22,24 @@ class _Member:
 
 
 class Membership:
-    """The nodes of a run and what they said when they joined."""
+    """The nodes of a run and what they said when they joined.
 
-    def __init__(self, node_ids: Sequence[str]) -> None:
+    Those that come `later` need not have joined before they `enter`, and may. `alone`: each is its own process.
+    """
+
+    def __init__(self, node_ids: Sequence[str], later: Iterable[str] = (), alone: bool = False) -> None:
         self._node_ids = tuple(node_ids)
-        self._members: dict[str, _Member] = {}
+        self.later = set(later)
+        self._alone = alone
+        self._members = {node: _Member(node, None, 0, "") for node in self.later}
         self.closed = False
 
     def hello(self, key_node: str, hello: wire.Hello) -> str | None:
         """Take a hello that came on the key of `key_node`; returns why it is refused, or None."""
         if hello.node != key_node or key_node not in self._node_ids or hello.lead not in self._node_ids:
             return f"{hello.node!r} is not a node of this run"
+        if self._alone and hello.lead != hello.node:
+            return f"{hello.node}: vehicles enter and leave one by one: start an agent for each"
         member = self._members.get(hello.node)
         if member is not None and member.nonce not in (None, hello.nonce):
             return f"{hello.node} is already present"
@@ -50,6 +57,11 @@ class Membership:
         """Forget a node that went away before the start."""
         self._members.pop(node, None)
 
+    def enter(self, node: str) -> bool:
+        """A node that was to come later is due; returns whether it is there already."""
+        self.later.discard(node)
+        return self._is_ready(node)
+
     def expect(self, nodes: Sequence[str]) -> None:
         """These nodes are to join again, from new processes."""
         for node in nodes:
@@ -58,8 +70,8 @@ class Membership:
 
     @property
     def missing(self) -> list[str]:
-        """Nodes that are not ready, or not of their lead's process, in the order of their numbers."""
-        return [node for node in self._node_ids if not self._is_ready(node)]
+        """Nodes that should be there and are not ready, or not of their lead's process, in number order."""
+        return [node for node in self._node_ids if node not in self.later and not self._is_ready(node)]
 
     def _is_ready(self, node: str) -> bool:
         member = self._members.get(node)
@@ -70,7 +82,7 @@ class Membership:
 
     @property
     def joined(self) -> list[str]:
-        """Nodes that have said hello, in the order of their numbers."""
+        """Nodes that have said hello, or will later, in the order of their numbers."""
         return [node for node in self._node_ids if node in self._members]
 
     def speaks_for(self, lead: str, nonce: bytes) -> bool:

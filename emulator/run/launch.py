@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -138,15 +138,22 @@ class Launcher:
         if name in self._processes:
             self._processes[name].send_signal(number)
 
-    def see_off(self, name: str, patience_s: float) -> None:
-        """Wait for a process that has been told to go, and kill it if it does not; `ended` does not report it."""
+    def let_go(self, name: str) -> Callable[[float], None]:
+        """Forget a process that has been told to go: `ended` does not report it.
+
+        Returns what waits so many seconds for its end, and kills it if it does not go.
+        """
         process = self._processes.pop(name, None)
-        if process is not None:
-            try:
-                process.wait(patience_s)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+
+        def see_off(patience_s: float) -> None:
+            if process is not None:
+                try:
+                    process.wait(patience_s)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+        return see_off
 
     def wait_for(self, name: str, timeout_s: float) -> None:
         """Wait for one process to end by itself."""

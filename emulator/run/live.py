@@ -16,18 +16,18 @@ import time
 from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import ExitStack, asynccontextmanager
-from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from emulator.observe.observation import scene_message
+from emulator.observe.sinks import Sinks
 from emulator.run.attachment import Attachment, LiveOptions
 from emulator.run.control import answer, way_in
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
 from emulator.run.memory import MemoryWatch
+from emulator.run.messages import Messages
 from emulator.run.pacing import Lockstep, ProtocolError, RealTime
 from emulator.run.router import ROUTER
 from vnet.errors import LinkError, ProgramError, VnetError, WireError
@@ -111,7 +111,7 @@ async def run_live(
                 options.router.start(launcher)
             run = LiveRun(emulation, options, launcher, gate)
             stack.callback(run.close)
-            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access))
+            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access, options.record))
             return await run.run(on_state)
 
 
@@ -134,7 +134,8 @@ class LiveRun:
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
         self._realtime = emulation.scenario.run.pacing == "realtime"
-        self._members = Membership(emulation.world.node_ids)
+        later = [node for node, up in emulation.up.items() if not up]
+        self._members = Membership(emulation.world.node_ids, later, emulation.world.has_traffic)
         self._pacing: Lockstep | RealTime | None = None
         self._origin_ns = 0
         self._incoming: deque[tuple[str, bytes | bool | zenoh.Query]] = deque()
@@ -142,13 +143,16 @@ class LiveRun:
         self._over = False
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
-        self._returning: set[str] = set()  # nodes whose processes faults have ended
+        self._returning: set[str] = set()  # nodes whose processes faults have ended, or who have left
+        self._going: set[asyncio.Task[None]] = set()  # what sees them off (real time)
         self._expected: set[str] = set()  # leads of processes that were started anew (real time)
         self._paused: set[str] = set()
         self._restarting = False
         self._join_failure: VnetError | None = None
         self._standing: dict[str, str] = {}
         self._refused: dict[str, int] = {}
+        self._messages = Messages(emulation)
+        self._watched = True  # from the first period on, by a recorder of the run's own
         self._memory = MemoryWatch(emulation.duration_ns)
         lease_ms = _lease_ms(emulation.scenario)
         self._link = Attachment(
@@ -278,6 +282,9 @@ class LiveRun:
             self._process_dead(name, how=how.how, log_tail=how.log_tail)
 
     def _token_lost(self, node: str) -> None:
+        if node in self._members.later:
+            self._members.expect([node])
+            return
         away = self._restarting or node in self._returning
         if away or node not in self._members.joined or node in self._launcher.pids:
             return
@@ -333,6 +340,7 @@ class LiveRun:
         run = self._emulation.scenario.run
         node_ids = self._emulation.world.node_ids
         groups = split_into_processes(node_ids, run.nodes_per_process)
+        groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
         endpoint = self._link.endpoint
         deadline = time.monotonic() + run.join_timeout_s
         if self._options.record is not None:
@@ -342,7 +350,7 @@ class LiveRun:
             for nodes in groups:
                 self._launch(nodes)
         else:
-            on_state(f"listening at {endpoint}; waiting for {len(node_ids)} vehicles")
+            on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
         while self._members.missing or not self._recorder_listens():
             if self._join_failure is not None:
                 raise self._join_failure
@@ -355,9 +363,9 @@ class LiveRun:
         nice = REALTIME_AGENT_NICE if self._realtime else 0
         self._launcher.start_agent(self._link.endpoint, self._options.access, nodes, nice)
 
-    def _start_recorder(self, endpoint: str, path: Path) -> None:
+    def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
-        arguments += ["--out", str(path)]
+        arguments += ["--out", str(sinks.save), *sinks.arguments]
         self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
 
     def _recorder_listens(self) -> bool:
@@ -381,7 +389,7 @@ class LiveRun:
 
     async def _course(self) -> None:
         processes = self._members.processes()
-        self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
+        self._link.publish("scene", self._messages.scene())
         if self._emulation.scenario.run.pacing == "lockstep":
             self._pacing = lockstep = Lockstep(self._emulation, processes)
             await self._run_lockstep(lockstep)
@@ -450,13 +458,23 @@ class LiveRun:
             self._launcher.kill(lead)
             return
         self._stand_still(self._paused - {lead})  # or it could not go
-        self._link.send(lead, wire.End(None, "killed by a fault" if killed else "restarted by a fault"))
+        reason = "it has left" if self._emulation.has_left(lead) else "restarted by a fault"
+        self._link.send(lead, wire.End(None, "killed by a fault" if killed else reason))
         if self._options.launch:
-            await asyncio.to_thread(self._launcher.see_off, lead, FAREWELL_S)
+            going = asyncio.create_task(asyncio.to_thread(self._launcher.let_go(lead), FAREWELL_S))
+            if self._realtime:  # nobody waits for it
+                self._going.add(going)
+                going.add_done_callback(self._going.discard)
+            else:
+                await going
 
     def _begin_process(self, lead: str) -> None:
         nodes = self._members.nodes_with(lead)
-        self._members.expect(nodes)
+        if lead in self._members.later:
+            if self._members.enter(lead):
+                return
+        else:
+            self._members.expect(nodes)
         if self._options.launch:
             self._launch(nodes)
 
@@ -567,7 +585,8 @@ class LiveRun:
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
-        self._link.publish("end", {})
+            await asyncio.gather(*self._going)
+        self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
         self._launcher.stop(patience_s)
@@ -579,8 +598,13 @@ class LiveRun:
         self._memory.look(view.instant.time_ns, processes)
 
     def _publish_period(self, view: PeriodView) -> None:
-        if not self._link.is_watched("period"):
+        """Tell who watches. A message is of a whole period: who comes within one hears of the next."""
+        was_watched, self._watched = self._watched, self._link.is_watched("period")
+        if not self._watched:
             return
-        if view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
-            self._link.publish("scene", scene_message(self._emulation.world, self._emulation.scenario))
-        self._link.publish("period", view.message(self._emulation.world.node_ids))
+        if not was_watched or view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
+            self._link.publish("scene", self._messages.scene())
+        if was_watched:
+            self._link.publish("period", self._messages.period(view))
+        else:
+            self._messages.begin()

@@ -18,6 +18,9 @@ from vnet.errors import VnetError
 from vnet.link import wire
 from vnet.link.node import INBOX_LIMIT, Packet
 
+WORST_PROCESSES = 8
+"""How many are named of those to which deliveries came late."""
+
 
 class ProtocolError(VnetError):
     """A message that does not fit what its process was told, or speaks for others."""
@@ -72,7 +75,8 @@ class Lockstep:
         self._emulation = emulation
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
         self._lead = {node: nodes[0] for nodes in processes for node in nodes}
-        self._processes = {nodes[0]: _Process(nodes) for nodes in processes}
+        there = [nodes for nodes in processes if hosts_all or any(emulation.up[node] for node in nodes)]
+        self._processes = {nodes[0]: _Process(nodes) for nodes in there}
         self._hosts_all = hosts_all
         self._actions: list[ProcessActions] = []
         self._woken: set[str] = set()
@@ -83,7 +87,7 @@ class Lockstep:
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
-        if self._emulation.next_fault_ns() == 0:
+        if self._emulation.next_change_ns() == 0:
             self._act(0)
         if first := [lead for lead, process in self._processes.items() if process.running]:
             return self._grant(first)
@@ -131,12 +135,12 @@ class Lockstep:
             self._look_ahead()
             wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
-            fault_ns = emulation.next_fault_ns()
-            if self._hold(next_ns if fault_ns is None else min(next_ns, fault_ns)):
+            change_ns = emulation.next_change_ns()
+            if self._hold(next_ns if change_ns is None else min(next_ns, change_ns)):
                 return {}
-            if fault_ns is None or fault_ns > next_ns or fault_ns >= emulation.duration_ns:
+            if change_ns is None or change_ns > next_ns or change_ns >= emulation.duration_ns:
                 break
-            self._act(fault_ns)
+            self._act(change_ns)
         if next_ns >= emulation.duration_ns:
             emulation.finish(emulation.duration_ns)
             return {}
@@ -150,7 +154,7 @@ class Lockstep:
         Arrivals depend on what others send before; so far nobody will, but for those whom an arrival wakes.
         """
         emulation = self._emulation
-        stops_ns = [emulation.duration_ns, emulation.next_fault_ns(), self.horizon_ns]
+        stops_ns = [emulation.duration_ns, emulation.next_change_ns(), self.horizon_ns]
         stops_ns += [self._wake_ns(process, by_radio=False) for process in self._processes.values()]
         waiting = [n for p in self._processes.values() for n in p.waiting_radio if n not in p.paused]
         emulation.look_ahead(min(time_ns for time_ns in stops_ns if time_ns is not None), waiting)
@@ -270,8 +274,8 @@ class RealTime:
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
-        self._present = set(self._nodes)
-        self._awaited = set(self._nodes)
+        self._present = {lead for lead, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)}
+        self._awaited = set(self._present)
         self._paused: set[str] = set()
         self._was_paused: set[str] = set()
         self._actions: list[ProcessActions] = []
@@ -284,16 +288,16 @@ class RealTime:
         self.gaps = 0
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
-        """The batches that start every process; time 0 is `origin_ns` on the machine's monotonic clock."""
+        """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
         self._origin_ns = origin_ns
-        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes}
+        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes if lead in self._present}
 
     def next_time_ns(self) -> int | None:
         """When `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
             self._emulation.fix_time_ns(self._next_period),
-            self._emulation.next_fault_ns(),
+            self._emulation.next_change_ns(),
         ]
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return min(due) if due else None
@@ -332,9 +336,9 @@ class RealTime:
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """What has become due by `now_ns`, by process."""
-        while (fault_ns := self._emulation.next_fault_ns()) is not None and fault_ns <= now_ns:
-            self._collect(fault_ns - 1)
-            self._act(fault_ns)
+        while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
+            self._collect(change_ns - 1)
+            self._act(change_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
         return {
@@ -418,15 +422,20 @@ class RealTime:
             self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
         if sum(counts):
-            self._emulation.folder.event(
-                self._emulation.duration_ns, "late_deliveries", None, **lateness_figures(counts)
-            )
+            figures = lateness_figures(counts)
+            worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
+            figures["worst"] = {f"{lead}.{start}": _late(self._lateness[lead, start]) for lead, start in worst}
+            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
+
+
+def _late(counts: Sequence[int]) -> int:
+    """How many deliveries of a lateness histogram are over the limit."""
+    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
     """Figures of a lateness histogram: deliveries, how many over the limit, percentiles in ms."""
     total = sum(counts)
-    limit_bin = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
     cumulative = list(accumulate(counts))
 
     def percentile_ms(share: float) -> float:
@@ -439,7 +448,7 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
 
     return {
         "total": total,
-        "count": sum(counts[limit_bin:]),
+        "count": _late(counts),
         "p50_ms": percentile_ms(0.5),
         "p99_ms": percentile_ms(0.99),
         "max_ms": percentile_ms(1.0),

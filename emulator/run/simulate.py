@@ -10,6 +10,8 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 
+from msgspec.structs import replace
+
 from emulator.run.emulation import Emulation, ProcessActions
 from emulator.run.pacing import Lockstep
 from vnet.link import wire
@@ -54,6 +56,7 @@ class _Simulation:
         self._seq = 0
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
+        welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
         self._programs = load_programs(welcomes)
         self._host = Host(welcomes, lambda: self.loop.now_ns)
 

@@ -73,7 +73,7 @@ def run_apart(scenario: Scenario) -> Emulation:
         nodes[0]: nodes for nodes in split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     }
     lockstep = Lockstep(emulation, list(groups.values()))
-    processes = {lead: _Process(emulation, nodes) for lead, nodes in groups.items()}
+    processes = {lead: _Process(emulation, nodes) for lead, nodes in groups.items() if emulation.up[lead]}
     try:
         grants = lockstep.start()
         while grants:

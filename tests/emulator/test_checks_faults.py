@@ -167,6 +167,17 @@ def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None
     assert result(evidence, "bit:kill-0") == NotExercised("bit:kill-0", "it was healed before it began")
 
 
+@pytest.mark.parametrize("kind", ["DoS", "Sybil", "DataReplay", "StaleMessages"])
+@pytest.mark.parametrize("holding", ["kill", "pause"])
+def test_a_vehicle_that_other_faults_keep_down_need_not_be_seen_to_misbehave(kind: str, holding: str) -> None:
+    whom = {"nodes": {"ids": ["v01"]}}
+    held = simulated(fault(kind, **whom), fault(holding, at_s=1.5, duration_s=1.0, **whom), fault(holding, **whom))
+    assert not_valid(held) == {}
+    assert isinstance(result(held, f"bit:{kind}-0"), NotExercised)
+    freed = simulated(fault(kind, **whom), fault(holding, at_s=1.5, duration_s=2.4, **whom))
+    assert not isinstance(result(freed, f"bit:{kind}-0"), NotExercised)
+
+
 @pytest.mark.parametrize("kind", ["partition", "block", "range", "swizzle"])
 def test_a_pair_that_passed_a_cut_is_found(kind: str) -> None:
     evidence = with_fault(kind)

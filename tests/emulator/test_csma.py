@@ -1,6 +1,7 @@
 """The shared medium: nothing depends on how time is cut, and access goes by the rules of 802.11p."""
 
 from collections import Counter
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,9 @@ def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
             asked.transmit(time_ns, node, [bytes([node]) * size])
         while True:
             asked.look_ahead(until_ns, [2, 3])
-            first_ns = min((t for node in (2, 3) if (t := asked.next_arrival_ns(node)) is not None), default=until_ns)
+            first_ns = min(
+                (t for node in (2, 3) if (t := asked.next_arrival_ns(node)) is not None), default=until_ns
+            )
             if first_ns >= until_ns:
                 break
             told.append(first_ns)
@@ -192,7 +195,7 @@ def test_a_backoff_stands_still_while_others_send() -> None:
     aifsn, window = AIFSN_AND_CW["BE"]
     waited = [
         (start_ns - before_ns - length_ns - SIFS_NS - aifsn * SLOT_NS) / SLOT_NS
-        for (before_ns, length_ns), (start_ns, _) in zip(ends, ends[1:], strict=False)
+        for (before_ns, length_ns), (start_ns, _) in pairwise(ends)
     ]
     assert all(slots == round(slots) >= 0 for slots in waited)
     assert sum(waited) <= window, "what has been counted down stays counted down"
@@ -298,7 +301,5 @@ def test_the_same_frames_alone_show_what_would_have_arrived() -> None:
     lonely.drain()
     alone = {(row["sender"], row["seq"], row["receiver"]): row["outcome"] for row in rows(lonely)}
     assert set(alone.values()) == {"delivered", "faded"}
-    seen = Counter(
-        (alone[row["sender"], row["seq"], row["receiver"]], row["outcome"]) for row in rows(crowd)
-    )
+    seen = Counter((alone[row["sender"], row["seq"], row["receiver"]], row["outcome"]) for row in rows(crowd))
     assert set(seen) == {("faded", "faded"), ("delivered", "delivered"), ("delivered", "collided")}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.observe.metrics import Metrics, summarize
-from emulator.observe.observation import pack, period_message, unpack
+from emulator.observe.observation import beliefs_of, pack
 from emulator.world.world import Instant
 from vnet.link.node import Report
 
@@ -33,9 +33,7 @@ def test_a_covariance_that_is_not_positive_definite_takes_no_part_in_the_anees(c
 @pytest.mark.parametrize("cloud", [1.0, [1.0], [1.0, 2.0, 3.0]])
 def test_a_cloud_that_is_not_made_of_points_is_not_shown(cloud: object) -> None:
     reports = [Report(0, "a", None, None, {"cloud_m": cloud}), Report(0, "b", None, None, {"cloud_m": [1.0, 2.0]})]
-    message = period_message(["a", "b"], INSTANT, reports, metrics().record(INSTANT, reports), {}, [])
-    assert list(message["clouds"]) == ["b"]
-    assert unpack(message["clouds"]["b"], 2).tolist() == [[1.0, 2.0]]
+    assert beliefs_of({"a": 0, "b": 1}, reports).clouds == {"b": [1.0, 2.0]}
 
 
 def test_the_hash_is_of_the_content() -> None:

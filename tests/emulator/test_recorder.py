@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.observe.observation import pack, scene_message, unpack
+from emulator.observe.observation import pack, unpack
 from emulator.observe.recorder import Recorder
 from emulator.observe.run_folder import RunFolder
 from emulator.run.emulation import Emulation
+from emulator.run.messages import Messages
 from emulator.run.simulate import simulate
 from emulator.world.world import build_world
 from vnet.link import wire
@@ -51,8 +52,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         return wire.decode_observation(wire.encode_observation(message))
 
     with Recorder(path) as recorder:
-        recorder.scene(crossed(scene_message(emulation.world, scenario)))
-        emulation.watch(lambda view: recorder.period(crossed(view.message(emulation.world.node_ids))))
+        messages = Messages(emulation)
+        recorder.scene(crossed(messages.scene()))
+        emulation.watch(lambda view: recorder.period(crossed(messages.period(view))))
         simulate(emulation)
     return path
 

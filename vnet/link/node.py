@@ -127,7 +127,11 @@ class Mailbox(Generic[T]):
 
 
 class Radio:
-    """The vehicle's radio: broadcast to whoever is in range, hear whoever was."""
+    """The vehicle's radio: broadcast to whoever is in range, hear whoever was.
+
+    Attributes:
+        max_payload: the most bytes of a frame.
+    """
 
     def __init__(self, node_id: str, link: NodeLink, max_payload: int) -> None:
         self.max_payload = max_payload

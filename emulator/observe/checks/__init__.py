@@ -31,6 +31,7 @@ from emulator.observe.checks.course import (
     check_kept_up,
     check_liveness,
     check_memory,
+    check_presence,
     check_progress,
     check_transport,
 )
@@ -80,6 +81,7 @@ OF_FRAMES: tuple[Check, ...] = (
     check_gnss,
 )
 OF_BELIEFS: tuple[Check, ...] = (
+    check_presence,
     check_liveness,
     check_consensus_mean,
     check_convergence,

@@ -8,12 +8,13 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import changed_bytes
-from emulator.observe.checks.evidence import Evidence, Mask
+from emulator.observe.checks.evidence import Evidence
 from emulator.observe.checks.faults import CUTTING, LOSING, SENDING
 from emulator.observe.checks.latency import bounds
+from emulator.observe.checks.places import Mask
 from emulator.observe.checks.senders import is_noise
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault
+from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault, SenderFault
 
 IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate")
 DELAYING = ("delay", "jitter", "reorder", "throttle")
@@ -29,6 +30,8 @@ def check_bits(evidence: Evidence) -> Iterator[Finding]:
             yield NotExercised(name, "it was healed before it began")
         elif planned.start_ns >= evidence.closed_ns:
             yield unknown(name, "the run ended before it began")
+        elif isinstance(planned.fault, SenderFault) and _held_down(evidence, planned):
+            yield NotExercised(name, "other faults kept its vehicles from sending all the while")
         else:
             yield _bit(evidence, planned, name)
 
@@ -53,6 +56,22 @@ def _bit(evidence: Evidence, planned: PlannedFault, name: str) -> Finding:
         return _clocks(evidence, planned, name)
     assert isinstance(planned.fault, Infrastructure), planned.fault
     return _restarts(evidence, planned, name)
+
+
+def _held_down(evidence: Evidence, planned: PlannedFault) -> bool:
+    """Whether each of a fault's nodes was down or stood still, by other faults, from its start to its end."""
+    spans = [(span.node, span.start_ns, span.end_ns) for span in evidence.down if span.planned]
+    for pause in evidence.plan:
+        if pause.fault.kind == "pause":
+            spans += [(node, pause.start_ns, pause.end_ns) for node in np.flatnonzero(pause.nodes).tolist()]
+    for node in np.flatnonzero(planned.nodes).tolist():
+        free_ns = planned.start_ns
+        for _, start_ns, end_ns in sorted(span for span in spans if span[0] == node):
+            if start_ns <= free_ns:
+                free_ns = max(free_ns, end_ns)
+        if free_ns < planned.end_ns:
+            return False
+    return True
 
 
 def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
@@ -97,16 +116,15 @@ def _unheard(evidence: Evidence, planned: PlannedFault) -> Mask:
 
 def _bent(evidence: Evidence, planned: PlannedFault) -> int:
     """Fixes that show the fault: none, the same again, or all in all too far from the truth."""
-    acting = evidence.acting(planned, evidence.period_starts_ns())
-    fix_m = evidence.vectors("fix_m")[:, planned.nodes]
+    struck = evidence.struck(planned) & np.isfinite(evidence.vectors("position_m")[..., 0])
+    fix_m = evidence.vectors("fix_m")
     if planned.fault.kind == "gnss_outage":
-        return int((~np.isfinite(fix_m[acting]).all(axis=2)).sum())
+        return int((~np.isfinite(fix_m[struck]).all(axis=1)).sum())
     if planned.fault.kind == "gnss_freeze":
         again = (fix_m[1:] == fix_m[:-1]).all(axis=2)
-        return int(again[acting[1:]].sum())
-    truth_m = (evidence.vectors("position_m") + evidence.vectors("common_error_m"))[:, planned.nodes]
-    error_m = (fix_m - truth_m)[acting]
-    error_m = error_m[np.isfinite(error_m).all(axis=2)]
+        return int(again[struck[1:]].sum())
+    error_m = (fix_m - evidence.vectors("position_m") - evidence.vectors("common_error_m"))[struck]
+    error_m = error_m[np.isfinite(error_m).all(axis=1)]
     sound = not len(error_m) or is_noise(error_m, evidence.scenario.world.gnss.sigma_m)
     return 0 if sound else len(error_m)
 

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import binom
 
 from emulator.channel.outcomes import Outcome
-from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, Evidence, Mask, Whole
+from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, Evidence
+from emulator.observe.checks.places import Mask, Whole
 from emulator.observe.checks.verdicts import Finding, NotExercised, result, unknown
 from vnet.faults import SenderFault, StaleMessages
 from vnet.roads.lanes import Array
@@ -21,7 +22,7 @@ IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.o
 
 def nothing_seen(name: str, evidence: Evidence, text: str) -> Finding:
     """Nothing observed is unknown, unless there was nobody to observe it."""
-    if not evidence.in_range.any():
+    if not evidence.places.most_in_range:
         return NotExercised(name, "no vehicle has another in range")
     return unknown(name, text)
 
@@ -34,7 +35,7 @@ def check_conservation(evidence: Evidence) -> Finding:
     broken: dict[str, Mask] = {
         "repeated": _repeated(evidence),
         "wrong_count": _in_frames_of_wrong_size(evidence),
-        "not_in_range": ~evidence.in_range[evidence.sender, evidence.receiver],
+        "not_in_range": evidence.placed & ~evidence.in_range,
         "undecided": ~evidence.outcome_is(*IN_TRACE),
         "orphans": _orphans(evidence),
         "disordered": _out_of_order(evidence),
@@ -72,7 +73,8 @@ def _in_frames_of_wrong_size(evidence: Evidence) -> Mask:
     first, inverse, rows = np.unique(evidence.emission, return_index=True, return_inverse=True, return_counts=True)[
         1:
     ]
-    wrong = rows != evidence.in_range.sum(axis=1)[evidence.sender[first]]
+    in_range = evidence.places.receivers_in_range(evidence.sender[first], evidence.sent_ns[first])
+    wrong = evidence.placed[first] & (rows != in_range)
     received_twice = evidence.caused_by("duplicate") & (evidence.copy > 0)
     sent = np.bincount(inverse, weights=~received_twice, minlength=len(first)) > 0
     return np.asarray((wrong & sent)[inverse])
@@ -106,14 +108,20 @@ def _mistimed(evidence: Evidence) -> Mask:
 
 
 def _missing_numbers(evidence: Evidence) -> int:
-    """How many numbers are missing below the last: of each sender's frames, and of each frame's copies."""
+    """How many numbers are missing below the last: of each sender's frames, and of each frame's copies.
+
+    What a vehicle sends while nobody is near has no rows, so that its numbers may be missing.
+    """
     first = np.unique(evidence.emission, return_index=True)[1]
     originals = first[evidence.copy[first] == 0]
     missing = 0
-    for sender in np.unique(evidence.sender[originals]):
-        seqs = evidence.seq[originals[evidence.sender[originals] == sender]]
-        missing += int(seqs.max()) + 1 - len(seqs)
+    for sender in np.unique(evidence.sender[originals]).tolist():
+        rows = originals[evidence.sender[originals] == sender]
+        seqs = np.concatenate([[-1], evidence.seq[rows]])
+        lonely = evidence.places.was_lonely(sender, np.concatenate([[0], evidence.sent_ns[rows]]))
+        missing += int((np.diff(seqs) - 1)[~lonely].sum())
     copies = first[evidence.copy[first] > 0]
+    copies = copies[~evidence.places.ever_lonely[evidence.sender[copies]]]
     frame, place = np.unique(evidence.frame[copies], return_inverse=True)
     last = np.zeros(len(frame), dtype=np.int64)
     np.maximum.at(last, place, evidence.copy[copies])
@@ -126,7 +134,7 @@ def check_range(evidence: Evidence) -> Finding:
     delivered = evidence.outcome_is("delivered")
     if not delivered.any():
         return nothing_seen(name, evidence, "nothing was delivered")
-    beyond = delivered & ~evidence.in_range[evidence.sender, evidence.receiver]
+    beyond = delivered & evidence.placed & ~evidence.in_range
     broken, count = int(beyond.sum()), int(delivered.sum())
     text = f"all {count:,} deliveries within range"
     broken_text = f"{broken} deliveries beyond range"
@@ -137,7 +145,7 @@ def check_peer_cap(evidence: Evidence) -> Finding:
     """Each receiver hears its nearest `max_peers` live senders in range, and no other."""
     name = "peer_cap"
     cap = evidence.scenario.radio.max_peers
-    largest = int(evidence.in_range.sum(axis=0).max(initial=0))
+    largest = evidence.places.most_in_range
     if largest <= cap:
         return NotExercised(name, f"no receiver has more than {cap} senders in range (at most {largest})")
     if not len(evidence.trace):
@@ -158,27 +166,31 @@ def check_peer_cap(evidence: Evidence) -> Finding:
 def _wrongly_capped(evidence: Evidence, capped: Mask) -> Mask:
     # What was sent at the very instant of a death may have come before or after it: it is not judged.
     judged = capped | evidence.outcome_is("lost", "fault", *ARRIVED)
-    judged &= ~evidence.is_unsure(evidence.sent_ns)
+    judged &= evidence.placed & ~evidence.is_unsure(evidence.sent_ns)
     everybody = np.arange(len(evidence.node_ids))
-    edges = sorted({0, NEVER_NS} | {edge for span in evidence.down for edge in (span.start_ns, span.end_ns)})
+    edges = {0, NEVER_NS} | {edge for span in evidence.down for edge in (span.start_ns, span.end_ns)}
+    if evidence.moves:
+        edges |= set(evidence.period_starts_ns().tolist())
     wrong = np.zeros(len(capped), dtype=bool)
-    for start_ns, end_ns in pairwise(edges):
-        up = ~evidence.is_down(everybody, np.full(len(everybody), start_ns))
-        admitted = admitted_by_cap(evidence, up)
-        rows = judged & (start_ns <= evidence.sent_ns) & (evidence.sent_ns < end_ns)
-        wrong |= rows & (admitted[evidence.sender, evidence.receiver] == capped)
+    for start_ns, end_ns in pairwise(sorted(edges)):
+        rows = evidence.sent_between(start_ns, end_ns)
+        if len(rows):
+            up = ~evidence.is_down(everybody, np.full(len(everybody), start_ns))
+            admitted = admitted_by_cap(evidence, up, start_ns)
+            wrong[rows] = judged[rows] & (admitted[evidence.sender[rows], evidence.receiver[rows]] == capped[rows])
     return wrong
 
 
-def admitted_by_cap(evidence: Evidence, up: Mask) -> Mask:
+def admitted_by_cap(evidence: Evidence, up: Mask, time_ns: int) -> Mask:
     """(N, N), rows are senders: whom each receiver's cap admits when these nodes (N,) are up."""
-    distance_m: Array = np.where(evidence.in_range & up[:, None], evidence.distance_m, np.inf)
-    admitted = np.zeros_like(evidence.in_range)
-    for receiver in range(len(up)):
-        nearest = sorted(range(len(up)), key=lambda s, r=receiver: (distance_m[s, r], s))  # type: ignore[misc]
-        some = nearest[: evidence.scenario.radio.max_peers]
-        admitted[[s for s in some if np.isfinite(distance_m[s, receiver])], receiver] = True
-    return admitted
+    index = int(evidence.places.index(np.array([time_ns]))[0])
+    in_range = evidence.places.in_range(index) & up[:, None]
+    distance_m: Array = np.where(in_range, evidence.places.distance_m(index), np.inf)
+    # The nearest first, of equally near ones those of lower number; who is out of range is last.
+    nearest = np.argsort(distance_m, axis=0, kind="stable")[: evidence.scenario.radio.max_peers]
+    admitted = np.zeros_like(in_range)
+    np.put_along_axis(admitted, nearest, True, axis=0)
+    return np.asarray(admitted & in_range)
 
 
 def check_loss_rate(evidence: Evidence) -> Finding:

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from emulator.observe.checks.channel import admitted_by_cap
-from emulator.observe.checks.evidence import Evidence, Mask
+from emulator.observe.checks.evidence import Evidence
+from emulator.observe.checks.places import Mask
 from emulator.observe.checks.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import GnssFault
 from vnet.roads.lanes import Array
@@ -40,9 +41,9 @@ def ups(evidence: Evidence) -> Mask:
     return up
 
 
-def _components(evidence: Evidence, among: Mask) -> list[Mask]:
+def _components(evidence: Evidence, among: Mask, time_ns: int) -> list[Mask]:
     """The parts of the network in which all hear of each other, links in both directions, among some nodes (N,)."""
-    linked = admitted_by_cap(evidence, among)
+    linked = admitted_by_cap(evidence, among, time_ns)
     linked &= linked.T & among[:, None]
     count, label = connected_components(linked, directed=False)
     parts = [np.asarray((label == number) & among) for number in range(count)]
@@ -81,7 +82,7 @@ def _off_the_mean(evidence: Evidence, mean_m: Array, common_m: Array) -> Array:
     up: Mask = np.asarray(ups(evidence)[last].all(axis=0))
     known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
     off_m = np.full(len(up), np.nan)
-    for part in _components(evidence, up):
+    for part in _components(evidence, up, int(evidence.period_starts_ns()[-1])):
         if (honest(evidence) & known)[part].all():
             centre = common_m[last, part].mean(axis=1)[:, None]
             off_m[part] = np.hypot(*np.median(mean_m[last, part] - centre, axis=0).T)
@@ -127,14 +128,19 @@ def _deviation(evidence: Evidence, common_m: Array) -> Array:
     worst = np.full(len(common_m), np.nan)
     up = ups(evidence)
     everybody = np.ones(len(evidence.node_ids), dtype=bool)
-    for part in _components(evidence, everybody):
-        values = np.where((up & part & honest(evidence))[..., None], common_m, np.nan)
-        known = np.isfinite(values).all(axis=2)
-        several = known.sum(axis=1) > 1
-        mean = np.nansum(values, axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
-        squares = np.nansum(np.sum((values - mean[:, None]) ** 2, axis=2) * 1.0, axis=1)
-        deviation = np.sqrt(squares / np.maximum(known.sum(axis=1), 1))
-        worst[several] = np.fmax(worst[several], deviation[several])
+    period_ns = evidence.scenario.period_ns
+    # Where vehicles move, each period has components of its own, among those that are there.
+    pieces = [slice(k, k + 1) for k in range(len(common_m))] if evidence.moves else [slice(None)]
+    for piece in pieces:
+        among = up[piece.start] if evidence.moves else everybody
+        for part in _components(evidence, among, (piece.start or 0) * period_ns):
+            values = np.where((up[piece] & part & honest(evidence))[..., None], common_m[piece], np.nan)
+            known = np.isfinite(values).all(axis=2)
+            several = known.sum(axis=1) > 1
+            mean = np.nansum(values, axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
+            squares = np.nansum(np.sum((values - mean[:, None]) ** 2, axis=2) * 1.0, axis=1)
+            deviation = np.sqrt(squares / np.maximum(known.sum(axis=1), 1))
+            worst[piece][several] = np.fmax(worst[piece][several], deviation[several])
     return worst
 
 
@@ -185,5 +191,6 @@ def _deceived(evidence: Evidence) -> Mask:
         if isinstance(planned.fault, GnssFault):
             start_ns = evidence.period_starts_ns()
             when = (planned.start_ns <= start_ns) & (start_ns < planned.end_ns + round(WITHIN_S * NS_PER_S))
-            deceived |= when[:, None] & planned.nodes[None, :]
+            # Where it follows a region, whoever has been within it.
+            deceived |= when[:, None] & (np.logical_or.accumulate(evidence.struck(planned)) | planned.nodes)
     return deceived

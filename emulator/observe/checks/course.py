@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator.observe.checks.evidence import NEVER_NS, Evidence, Mask
+from emulator.observe.checks.evidence import NEVER_NS, Evidence
+from emulator.observe.checks.places import Mask
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
 from emulator.observe.run_folder import Event
 from vnet.scenario import NS_PER_S
@@ -125,16 +126,17 @@ def check_liveness(evidence: Evidence) -> Finding:
         return NotExercised(name, "less than a second is left after the last fault")
     silent: list[dict[str, Any]] = []
     for node in np.flatnonzero(judged).tolist():
-        from_ns, until_ns = _up_from_to(evidence, node)
-        mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
-        reports = mine[evidence.reported[mine, node]]
-        if not evidence.plan:  # it may take its time at the start
-            mine = mine[mine >= reports.min(initial=evidence.periods)]
-        edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
-        gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
-        if gaps:
-            before, after = gaps[0]
-            silent.append({"node": evidence.node_ids[node], "last_period": before, "next_period": after})
+        for from_ns, until_ns in _times_up(evidence, node):
+            mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
+            reports = mine[evidence.reported[mine, node]]
+            if not evidence.plan and (len(reports) or len(mine) < START_UP_NS // evidence.scenario.period_ns):
+                mine = mine[mine >= reports.min(initial=evidence.periods)]  # it may take its time at the start
+            edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
+            gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
+            if gaps:
+                before, after = gaps[0]
+                silent.append({"node": evidence.node_ids[node], "last_period": before, "next_period": after})
+                break
     count = int(judged.sum())
     text = f"{count} nodes reported at least once a second after the last fault"
     if not evidence.plan:
@@ -162,16 +164,78 @@ def _expected_to_report(evidence: Evidence, window: int) -> Mask:
     return np.asarray(able | (taken & elsewhere))
 
 
-def _up_from_to(evidence: Evidence, node: int) -> tuple[int, int]:
-    """Between which instants a node is up at the end of the run; none if it is down then."""
-    from_ns, until_ns = 0, NEVER_NS
-    for span in evidence.down:
-        if span.node == node:
-            if span.end_ns == NEVER_NS:
-                until_ns = min(until_ns, span.start_ns)
-            elif evidence.scenario.run.pacing == "realtime":
-                from_ns = max(from_ns, span.end_ns + START_UP_NS)
-    return from_ns, until_ns
+def _times_up(evidence: Evidence, node: int) -> list[tuple[int, int]]:
+    """From when until when a node is up, each time; in real time not before its process has had time to start."""
+    start_up_ns = START_UP_NS if evidence.scenario.run.pacing == "realtime" else 0
+    times, from_ns = [], 0
+    for span in sorted((span for span in evidence.down if span.node == node), key=lambda span: span.start_ns):
+        if span.start_ns > from_ns:
+            times.append((from_ns, span.start_ns))
+        from_ns = max(from_ns, NEVER_NS if span.end_ns == NEVER_NS else span.end_ns + start_up_ns)
+    return [*times, (from_ns, NEVER_NS)] if from_ns < NEVER_NS else times
+
+
+def check_presence(evidence: Evidence) -> Finding:
+    """Vehicles enter and leave when their trips say so."""
+    name = "presence"
+    if not evidence.moves:
+        return NotExercised(name, "vehicles stand where they are")
+    there = evidence.places.present()
+    changes = _changes(evidence, there)
+    if not changes and not evidence.event("entered", "left"):
+        return NotExercised(name, "all vehicles are there from the beginning to the end")
+    known_ns = len(there) * evidence.scenario.period_ns  # of what came later no states are kept
+    events = [event for event in evidence.event("entered", "left") if event.time_ns < known_ns]
+    told = {(event.kind, str(event.node), event.time_ns) for event in events}
+    missing = [change for change in changes if not _is_told(evidence, change, told)]
+    due = set(changes)
+    odd = [one for one in told if one not in due and not _may_come_late(evidence, one, there)]
+    rows = [{"what": what, "node": node, "time_ns": t, "event": "missing"} for what, node, t in missing]
+    rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
+    entered = sum(kind == "entered" for kind, _, _ in changes)
+    text = f"vehicles entered {entered} times and left {len(changes) - entered} times, as their trips say"
+    return result(name, len(rows), text, f"{len(rows)} events do not fit the trips", rows, changes=len(changes))
+
+
+Change = tuple[str, str, int]
+"""What happened (entered, left), to whom, and when in ns."""
+
+
+def _changes(evidence: Evidence, there: Mask) -> list[Change]:
+    """Who enters and leaves when, as the true positions have it."""
+    period, node = np.nonzero(there[1:] != there[:-1])
+    kinds = np.where(there[1:][period, node], "entered", "left").tolist()
+    times_ns = ((period + 1) * evidence.scenario.period_ns).tolist()
+    names = [evidence.node_ids[number] for number in node.tolist()]
+    return list(zip(kinds, names, times_ns, strict=True))
+
+
+def _is_told(evidence: Evidence, change: Change, told: set[Change]) -> bool:
+    """Whether an event tells of a change, or need not: of whom an event has not told that it is there."""
+    kind, node, time_ns = change
+    if change in told:
+        return True
+    if kind == "left":
+        before = [one for one in told if one[1] == node and one[2] < time_ns]
+        last = max(before, key=lambda one: one[2], default=None)
+        absent_at_first = not evidence.places.present()[0][evidence.number[node]]
+        return last[0] == "left" if last else absent_at_first
+    number = evidence.number[node]
+    if evidence.deaths_ns.get(number, NEVER_NS) <= time_ns or evidence.scenario.run.pacing == "realtime":
+        return True
+    ended = [p for p in evidence.plan if p.fault.kind in ("kill", "restart") and p.nodes[number]]
+    return any(planned.acts_at(time_ns) for planned in ended)
+
+
+def _may_come_late(evidence: Evidence, one: Change, there: Mask) -> bool:
+    """Whether a vehicle may enter at an instant at which it has been there for some time.
+
+    In real time its process has to start first, and one that a fault has taken waits until it ends.
+    """
+    kind, node, time_ns = one
+    if kind == "left" or not there[time_ns // evidence.scenario.period_ns, evidence.number_of(node)]:
+        return False
+    return evidence.scenario.run.pacing == "realtime" or any(planned.end_ns == time_ns for planned in evidence.plan)
 
 
 def check_memory(evidence: Evidence) -> Finding:

@@ -1,6 +1,6 @@
 """What the checks look at: a run's files as arrays, who was up when, and which fault acted where and when.
 
-The faults' plan is made anew from the scenario and the first positions, so that a run is judged from its files.
+The faults' plan is made anew from the scenario and the true positions, so that a run is judged from its files.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.channel.reach import Reach, distances_m, reach_of
-from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
+from emulator.channel.reach import reach_of
+from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
+from emulator.observe.checks.places import Mask, Places, Whole
 from emulator.observe.checks.verdicts import MOST_ROWS
 from emulator.observe.run_folder import Event
 from emulator.world.links import load_links
@@ -25,9 +26,6 @@ from vnet.errors import VnetError
 from vnet.faults import Range, SenderFault, Swizzle
 from vnet.roads.lanes import Array
 from vnet.scenario import Scenario
-
-Mask = NDArray[np.bool_]
-Whole = NDArray[np.int64]
 
 NO_FAULT, UNHEARD_OF = -1, -2
 NEVER_NS = np.iinfo(np.int64).max
@@ -60,6 +58,8 @@ class Evidence:
     states: pa.Table
     metrics: pa.Table
     events: Sequence[Event]
+    known_m: Array | None = None
+    """True positions (periods, N, 2), where the states have not got them all."""
 
     # Nodes and where they are.
 
@@ -80,31 +80,19 @@ class Evidence:
             raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
         return self.number[node]
 
-    def positions(self) -> Array:
-        """First true positions (N, 2). Vehicles stand still but for their place in the lane."""
-        return np.asarray(self.vectors("position_m")[0])
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave; else they stand but for their place in the lane."""
+        return self.scenario.network.moves
 
     @cached_property
-    def distance_m(self) -> Array:
-        """(N, N) between first positions."""
-        return distances_m(self.positions())
-
-    @cached_property
-    def links(self) -> Mask | None:
-        """(N, N), who (row) hears whom (column), or None where the range decides. Raises ScenarioError."""
-        return load_links(self.scenario.radio, len(self.node_ids))
-
-    @cached_property
-    def law_of_reach(self) -> Reach:
-        """The law of who is in range of whom. Raises ScenarioError."""
-        return reach_of(self.scenario.radio, self.scenario.run.seed, self.links)
-
-    @cached_property
-    def in_range(self) -> Mask:
-        """(N, N), rows are senders: who is in range of whom."""
-        if not self.node_ids:  # a run that ended before its first period did
-            return np.zeros((0, 0), dtype=bool)
-        return self.law_of_reach.in_range(self.positions(), self.distance_m)
+    def places(self) -> Places:
+        """Where the vehicles were. Raises ScenarioError if the scenario's links do not fit them."""
+        radio = self.scenario.radio
+        reach = reach_of(radio, self.scenario.run.seed, load_links(radio, len(self.node_ids)))
+        position_m = self.vectors("position_m") if self.known_m is None else self.known_m
+        some = position_m if self.moves else position_m[:1]
+        return Places(some, self.moves, self.scenario.period_ns, reach)
 
     # The trace, column by column.
 
@@ -177,6 +165,28 @@ class Evidence:
         return np.isin(self.cause, [planned.number for planned in self.plan if planned.fault.kind in kinds])
 
     @cached_property
+    def placed(self) -> Mask:
+        """Whether it is known where the vehicles were when a row's frame was sent."""
+        return self.places.known(self.sent_ns)
+
+    @cached_property
+    def in_range(self) -> Mask:
+        """Whether a row's sender and receiver were then in range of each other, as far as that is known."""
+        return self.places.pairs_in_range(self.sender, self.receiver, self.sent_ns)
+
+    @cached_property
+    def _by_time(self) -> tuple[NDArray[np.intp], Whole]:
+        """The rows in the order in which their frames were sent, and when that was."""
+        order = np.argsort(self.sent_ns, kind="stable")
+        return order, self.sent_ns[order]
+
+    def sent_between(self, start_ns: int, end_ns: int) -> NDArray[np.intp]:
+        """The rows whose frames were sent in [start, end)."""
+        order, sent_ns = self._by_time
+        first, last = np.searchsorted(sent_ns, (start_ns, end_ns))
+        return order[first:last]
+
+    @cached_property
     def frame(self) -> Whole:
         """One number for each (sender, seq)."""
         return np.asarray(self.sender * (int(self.seq.max(initial=0)) + 1) + self.seq)
@@ -224,7 +234,7 @@ class Evidence:
     @cached_property
     def reported(self) -> Mask:
         """(periods, N), who reported anything in which period."""
-        values = self.states["values"].combine_chunks().cast(_AS_LIST)
+        values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
         something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
         for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
             something |= np.asarray(self.states[name].combine_chunks().is_valid())
@@ -265,36 +275,61 @@ class Evidence:
 
     @cached_property
     def down(self) -> list[Span]:
-        """When nodes were down: taken by a fault until it ended, or for good."""
+        """When nodes were down: taken by a fault until it ended, not in the network, or for good."""
         spans = []
         for planned in self.plan:
             if planned.fault.kind in ("kill", "restart") and planned.start_ns < min(self.closed_ns, planned.end_ns):
                 for node in np.flatnonzero(planned.nodes).tolist():
                     if self.deaths_ns.get(node, NEVER_NS) > planned.start_ns:
                         spans.append(Span(node, planned.start_ns, self._back_ns(node, planned.end_ns), True))
-        return spans + [Span(node, time_ns, NEVER_NS, False) for node, time_ns in self.deaths_ns.items()]
+        deaths = [Span(node, time_ns, NEVER_NS, False) for node, time_ns in self.deaths_ns.items()]
+        return [*spans, *self._absences(), *deaths]
+
+    def _absences(self) -> Iterator[Span]:
+        """When nodes were not in the network, as the events tell it."""
+        if not self.moves or not self.node_ids:
+            return
+        since = dict.fromkeys(np.flatnonzero(~self.places.present()[0]).tolist(), 0)
+        for event in self.event("left", "entered"):
+            node = self.number_of(event.node)
+            if event.kind == "left":
+                since.setdefault(node, event.time_ns)
+            elif node in since:
+                yield Span(node, since.pop(node), event.time_ns, True)
+        for node, start_ns in since.items():
+            yield Span(node, start_ns, NEVER_NS, True)
 
     def _back_ns(self, node: int, end_ns: int) -> int:
         """When a node was up again after a fault: at its end, or in real time as soon as its process was there."""
         if self.scenario.run.pacing == "realtime":
-            there = (e.time_ns for e in self.event("restarted") if e.node == self.node_ids[node])
+            there = (e.time_ns for e in self.event("restarted", "entered") if e.node == self.node_ids[node])
             return min((time_ns for time_ns in there if time_ns >= end_ns), default=NEVER_NS)
         return end_ns if end_ns < self.closed_ns else NEVER_NS
 
     def is_down(self, node: NDArray[np.intp], time_ns: Whole) -> Mask:
         """Which of these nodes are down at these instants."""
+        nodes = np.array([span.node for span in self.down], dtype=np.intp)
+        edges_ns = np.array([(span.start_ns, span.end_ns) for span in self.down], dtype=np.int64).reshape(-1, 2)
         down = np.zeros(len(node), dtype=bool)
-        for span in self.down:
-            down |= (node == span.node) & span.holds(time_ns)
+        for number in np.unique(nodes).tolist():
+            mine = np.flatnonzero(node == number)
+            begun, ended = (
+                np.searchsorted(np.sort(edges_ns[nodes == number, edge]), time_ns[mine], side="right")
+                for edge in (0, 1)
+            )
+            down[mine] = begun > ended
         return down
 
     def is_unsure(self, time_ns: Whole) -> Mask:
-        """Instants of which nobody can say who was up: those of a death, and in real time those near a fault's."""
+        """Instants of which nobody can say who was up: those of a death, in real time those near a change."""
         unsure = np.isin(time_ns, list(self.deaths_ns.values()))
-        if self.guard_ns:
-            for span in self.down:
-                for edge_ns in (span.start_ns, span.end_ns):
-                    unsure |= np.abs(time_ns.astype(float) - edge_ns) <= self.guard_ns
+        if self.guard_ns and self.down:
+            edges_ns = np.unique([edge for span in self.down for edge in (span.start_ns, span.end_ns)]).astype(
+                float
+            )
+            after = np.searchsorted(edges_ns, time_ns)
+            for near in (np.maximum(after - 1, 0), np.minimum(after, len(edges_ns) - 1)):
+                unsure |= np.abs(time_ns - edges_ns[near]) <= self.guard_ns
         return np.asarray(unsure)
 
     # Faults.
@@ -304,21 +339,45 @@ class Evidence:
         """The faults and whom they chose. Raises ScenarioError if they do not fit the run's nodes."""
         if not self.node_ids or not self.scenario.fault:
             return []
-        nodes = Nodes(self.node_ids, self.positions(), self.in_range.sum(axis=0))
-        return FaultPlan(self.scenario, nodes).faults
+        return FaultPlan(self.scenario, self._nodes_at(0), self._nodes_at if self.moves else None).faults
+
+    def _nodes_at(self, period: int) -> Nodes:
+        position_m = self.places.position_m(period)
+        degree = np.where(np.isfinite(position_m[:, 0]), self.places.senders_in_range(period), -1)
+        return Nodes(self.node_ids, position_m, degree)
 
     def acting(self, planned: PlannedFault, time_ns: Whole, widen_ns: int = 0) -> Mask:
         """At which instants a fault acts; `widen_ns` before its start and after its end as well."""
         return np.asarray((planned.start_ns - widen_ns <= time_ns) & (time_ns < planned.end_ns + widen_ns))
 
+    def struck(self, planned: PlannedFault) -> Mask:
+        """(periods, N), on whose receivers a fault acts at the start of which period."""
+        start_ns = self.period_starts_ns()
+        struck = self.acting(planned, start_ns)[:, None] & planned.nodes[None, :]
+        if planned.moving is not None:
+            for period in np.flatnonzero(self.acting(planned, start_ns)).tolist():
+                struck[period] = planned.placed(period * self.scenario.period_ns).nodes
+        return np.asarray(struck)
+
     def reach(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
         """The links (N, N), rows are senders, whose rows may name a fault, and from when until when."""
+        if not self.moves or not isinstance(planned.fault, FOLLOWING):
+            yield from self._reach(planned)
+            return
+        period_ns = self.scenario.period_ns
+        for period in range(planned.start_ns // period_ns, min(-(-planned.end_ns // period_ns), self.periods)):
+            start_ns = max(planned.start_ns, period * period_ns)
+            for _, _, links in self._reach(planned.placed(start_ns), period):
+                yield start_ns, min(planned.end_ns, (period + 1) * period_ns), links
+
+    def _reach(self, planned: PlannedFault, period: int = 0) -> Iterator[tuple[int, int, Mask]]:
+        """The same, for a fault that acts on the same nodes all the time, with the distances of a period."""
         fault, start_ns, end_ns = planned.fault, planned.start_ns, planned.end_ns
         if planned.links is not None:
             yield start_ns, end_ns, planned.links
         elif isinstance(fault, Range):
             touched = planned.nodes[:, None] | planned.nodes[None, :]
-            yield start_ns, end_ns, touched & (self.distance_m > fault.range_m)
+            yield start_ns, end_ns, touched & (self.places.distance_m(period) > fault.range_m)
         elif isinstance(fault, SenderFault):
             yield start_ns, end_ns, np.repeat(planned.nodes[:, None], len(self.node_ids), axis=1)
         elif isinstance(fault, Swizzle):
@@ -327,11 +386,18 @@ class Evidence:
                 yield off_ns, min(back_ns, end_ns), one[:, None] | one[None, :]
 
     def reached(self, planned: PlannedFault, widen_ns: int = 0) -> Mask:
-        """Which rows of the trace were sent on a link while a fault acted there."""
+        """Which rows of the trace were sent on a link while a fault acted there; those near a change count as well,
+        or not if `widen_ns` is negative.
+        """
+        late, early = self._reached(planned, widen_ns), self._reached(planned, -widen_ns)
+        return early | late | self._reached(planned, 0) if widen_ns > 0 else early & late
+
+    def _reached(self, planned: PlannedFault, later_ns: int) -> Mask:
+        """The same, as if every row had been sent so much later."""
         reached = np.zeros(len(self.trace), dtype=bool)
         for start_ns, end_ns, links in self.reach(planned):
-            when = (start_ns - widen_ns <= self.sent_ns) & (self.sent_ns < end_ns + widen_ns)
-            reached |= when & links[self.sender, self.receiver]
+            rows = self.sent_between(start_ns - later_ns, end_ns - later_ns)
+            reached[rows] |= links[self.sender[rows], self.receiver[rows]]
         return reached
 
     @cached_property
@@ -340,4 +406,4 @@ class Evidence:
         return max((planned.end_ns for planned in self.plan), default=0)
 
 
-_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
+VALUES_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))

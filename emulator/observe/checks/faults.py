@@ -10,7 +10,8 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import binomial_band, received_twice
-from emulator.observe.checks.evidence import ARRIVED, NO_FAULT, UNHEARD_OF, Evidence, Mask
+from emulator.observe.checks.evidence import ARRIVED, NO_FAULT, UNHEARD_OF, Evidence
+from emulator.observe.checks.places import Mask
 from emulator.observe.checks.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import BurstLoss, Corrupt, Loss, StaleMessages
 from vnet.roads.lanes import Array
@@ -152,12 +153,13 @@ def check_outage_respected(evidence: Evidence) -> Finding:
     """A receiver has no fix exactly while an outage acts on it."""
     name = "outage_respected"
     outages = of_kinds(evidence, ["gnss_outage"])
-    without = np.isnan(evidence.vectors("fix_m")[..., 0])
+    there = np.isfinite(evidence.vectors("position_m")[..., 0])
+    without = there & np.isnan(evidence.vectors("fix_m")[..., 0])
     if not outages and not without.any():
         return NotExercised(name, "no fault takes the fixes" if evidence.plan else NO_FAULTS)
     due = np.zeros_like(without)
     for planned in outages:
-        due |= evidence.acting(planned, evidence.period_starts_ns())[:, None] & planned.nodes[None, :]
+        due |= evidence.struck(planned) & there
     period, node = np.nonzero(due != without)
     rows = [
         {"node": evidence.node_ids[n], "period": p, "fix": "none" if without[p, n] else "given"}

@@ -10,7 +10,8 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import nothing_seen, received_twice
-from emulator.observe.checks.evidence import Evidence, Mask, Whole
+from emulator.observe.checks.evidence import Evidence
+from emulator.observe.checks.places import Mask, Whole
 from emulator.observe.checks.verdicts import Finding, result
 from vnet.faults import Delay, Duplicate, Jitter, Reorder, Throttle
 from vnet.roads.lanes import Array

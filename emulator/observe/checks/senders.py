@@ -10,7 +10,8 @@ from scipy.stats import chi2
 
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import received_twice
-from emulator.observe.checks.evidence import Evidence, Mask, Whole
+from emulator.observe.checks.evidence import Evidence
+from emulator.observe.checks.places import Mask, Whole
 from emulator.observe.checks.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import ConstPosOffset, DataReplay, DoS, GnssFault, GnssJump, GnssRamp, Sybil
 from vnet.roads.lanes import Array
@@ -114,7 +115,7 @@ def check_gnss(evidence: Evidence) -> Finding:
     groups = {"no fault": usable.copy()}
     for planned in evidence.plan:
         if isinstance(planned.fault, GnssFault):
-            mine = evidence.acting(planned, evidence.period_starts_ns())[:, None] & planned.nodes[None, :]
+            mine = evidence.struck(planned)
             groups["no fault"] &= ~mine
             if isinstance(planned.fault, GnssJump | GnssRamp | ConstPosOffset):
                 groups[planned.label] = mine & usable
@@ -141,8 +142,7 @@ def _displaced(evidence: Evidence, planned: PlannedFault) -> Array:
             moved = np.outer((start_ns - planned.start_ns) / NS_PER_S, rate_m_s)
         case _:
             return np.zeros((len(start_ns), len(planned.nodes), 2))
-    moved = np.where(evidence.acting(planned, start_ns)[:, None], moved, 0.0)
-    return np.asarray(moved[:, None] * planned.nodes[None, :, None])
+    return np.asarray(moved[:, None] * evidence.struck(planned)[:, :, None])
 
 
 def is_noise(error_m: Array, sigma_m: float) -> bool:

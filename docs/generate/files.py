@@ -1,0 +1,176 @@
+"""docs/reference/files.md: what a run leaves. Names and types come from the code, and each has its text here."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+import pyarrow as pa
+
+from docs.generate.keys import unit
+from docs.generate.markdown import attribute_docstrings, docstring, table
+from docs.generate.markdown import page as whole_page
+from emulator.channel.outcomes import Outcome
+from emulator.observe.metrics import STATES, Metrics, PeriodFigures
+from emulator.observe.trace import Trace
+
+INTRODUCTION = """
+A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`
+points to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
+[How to read the tables](../how-to/read-tables.md) has examples.
+"""
+FOLDER = {
+    "scenario.toml": "the scenario with every default and the digests of its input files; it reproduces the run",
+    "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
+    "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
+    "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
+    "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
+    "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
+    "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
+    "recording.rrd": "a Rerun recording, if one was asked for",
+    "control.json, operator.json": "the way in for `vnet fault` and `vnet status`; there while a live run is on",
+    "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
+    "again/": "the second run, with `--check-determinism`",
+}
+OUTCOMES = {
+    Outcome.delivered: "it arrived, at `arrival_ns`",
+    Outcome.out_of_range: "counted in `verdict.json`, and has no row",
+    Outcome.peer_cap: "the receiver hears `radio.max_peers` nearer senders",
+    Outcome.lost: "by `radio.loss`",
+    Outcome.queue_full: "the sender's queue was full",
+    Outcome.oversize: "longer than `radio.max_payload_bytes`",
+    Outcome.fault: "cut or lost by the fault in `cause`",
+    Outcome.receiver_down: "it arrived at a vehicle that was down, at `arrival_ns`",
+    Outcome.transport: "lost between emulator and agent; in real time only, and the run is then unknown",
+}
+TRACE = {
+    "sent_ns": "when the program handed it to the radio",
+    "sender": "id of the vehicle",
+    "seq": "number of the frame, of this sender, from 0",
+    "receiver": "id of the vehicle",
+    "size_bytes": "length of the payload",
+    "payload_digest": "BLAKE2b of what arrives, 8 bytes, little-endian",
+    "outcome": "[what became of it](#outcomes)",
+    "cause": "the fault behind an outcome `fault`, a copy or changed bytes, as `loss-0`; else empty",
+    "arrival_ns": "when it arrived; null if it did not",
+    "copy": "0; 1, 2, … for what a fault sends, or lets arrive, again",
+}
+STATE = {
+    "period": "counts from 0",
+    "time_ns": "start of the period",
+    "node": "id of the vehicle",
+    "position_m": "truth; NaN of a vehicle that is not there",
+    "heading_rad": "truth, counter-clockwise from east; NaN of one that is not there, or that nobody knows",
+    "fix_m": "what the receiver gave; NaN in an outage",
+    "common_error_m": "truth: the error that all receivers share",
+    "estimate_m": "the position that the vehicle reported last in this period; null if it reported none",
+    "covariance_m2": "of `estimate_m`, as it reported: a 2 × 2 matrix by rows",
+    "common_error_estimate_m": "`common_error_m` of its report",
+    "common_error_covariance_m2": "of its report: a 2 × 2 matrix by rows",
+    "mean_m": "of its report: what it takes for the mean of all estimates of the common error",
+    "stacked_common_error_m": "of its report: the common error right after fusion, before the map",
+    "cloud_m": "of its report: some hypotheses of the common error, x and y in turns",
+    "values": "everything else that it reported, by name",
+}
+EVENTS = {
+    "started": ("", "`start_up_s`", "all have joined; time 0"),
+    "ended": ("", "`wall_s`", "the run is over"),
+    "interrupted": ("", "", "Ctrl-C or SIGTERM"),
+    "finished": ("vehicle", "", "its program returned"),
+    "crashed": ("vehicle", "`error`, `where`", "its program raised; the traceback"),
+    "spun": ("vehicle", "`error`, `where`", "its program went on for ever at one instant; where its tasks stood"),
+    "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
+    "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),
+    "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
+    "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
+    "left": ("vehicle", "", "it is not in the network any more"),
+    "fault_started": ("", "`fault`, `nodes`", "a fault begins to act, and on whom"),
+    "fault_ended": ("", "`fault`", "it has healed"),
+    "emulator_restarted": ("", "`down_s`", "the emulator's connection is back"),
+    "router_restarted": ("", "`down_s`", "the separate router is back"),
+    "refused": ("vehicle", "`key`, `reason`", "the first message on this key that was not believed"),
+    "refused_total": ("", "`key`, `count`", "how many there were"),
+    "observer_ended": ("process", "`how`", "a recorder ended before the run did"),
+    "memory": ("process", "`time_s`, `rss_kb`", "what it held, as two lists"),
+    "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
+    "late_deliveries": (
+        "",
+        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`",
+        "real time: all deliveries, those over 20 ms late, how late they were, and the processes with most of them",
+    ),
+}
+VERDICT = {
+    "format": "1; counts up when the meaning of a key changes",
+    "verdict": "`valid`, `invalid` or `unknown`",
+    "checks": "list of {`name`, `verdict`, `text`, `figures`}; `figures.rows` are the first offending rows",
+    "not_exercised": "list of {`name`, `reason`}",
+    "trace_sha256": "of the trace's content, however it is stored",
+    "metrics_sha256": "of the metrics' content",
+    "emulated_s": "how far the run came",
+    "start_up_s": "how long the processes took to start and join; 0 if simulated",
+    "wall_s": "wall-clock time from time 0 to the end",
+    "real_time_factor": "emulated by wall-clock time",
+    "seed": "`run.seed`",
+    "vehicles": "how many",
+    "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
+    "figures": "means of some metrics, after the first fifth of the run",
+    "reproduce": "the command that has the run again",
+    "versions": "of vnet, Python and numpy",
+}
+
+
+def page() -> str:
+    """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
+    trace, metrics = Trace(["v01"]).to_table().schema, _metrics_schema()
+    assert {**OUTCOMES, Outcome.pending: ""}.keys() == set(Outcome), "an outcome without a text"
+    parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
+    parts += [
+        "## `trace.parquet`",
+        "In the order of `sent_ns`, sender, `seq`, receiver, `copy`.",
+        columns(trace, TRACE),
+    ]
+    parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
+    parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", what] for outcome, what in OUTCOMES.items())))
+    parts += ["## `states.parquet`", columns(STATES, STATE)]
+    parts += [
+        "## `metrics.parquet`",
+        docstring(PeriodFigures),
+        columns(metrics, attribute_docstrings(PeriodFigures)),
+    ]
+    parts += [
+        "## `events.jsonl`",
+        "Each line is an object with `time_ns`, `kind`, `node` (or null) and what is named here.",
+    ]
+    rows = ([f"`{kind}`", *words] for kind, words in EVENTS.items())
+    parts.append(table(["kind", "node", "besides", "what happened"], rows))
+    parts += ["## `verdict.json`", "[checks.md](../checks.md) says what each check claims."]
+    parts.append(table(["key", "what"], ([f"`{key}`", what] for key, what in VERDICT.items())))
+    return whole_page("What a run leaves", *parts)
+
+
+def _metrics_schema() -> pa.Schema:
+    schema = Metrics(["v01"], np.zeros(1, dtype=np.intp), 1).metrics_table().schema
+    assert schema.names == [field.name for field in dataclasses.fields(PeriodFigures)]
+    return schema
+
+
+def columns(schema: pa.Schema, said: Mapping[str, str]) -> str:
+    """The columns of a table with their types and units. Raises LookupError where the texts do not fit them."""
+    if wrong := set(schema.names) ^ said.keys():
+        raise LookupError(f"columns without a text, or texts without a column: {', '.join(sorted(wrong))}")
+    rows = ([f"`{field.name}`", f"`{_type(field.type)}`", unit(field.name), said[field.name]] for field in schema)
+    return table(["column", "type", "unit", "what"], rows)
+
+
+def _type(kind: pa.DataType) -> str:
+    """An Arrow type in short: a dictionary is how its values are stored, and not what they are."""
+    if pa.types.is_dictionary(kind):
+        return str(kind.value_type)
+    if pa.types.is_fixed_size_list(kind):
+        return f"{kind.value_type}[{kind.list_size}]"
+    if pa.types.is_list(kind):
+        return f"{kind.value_type}[]"
+    if pa.types.is_map(kind):
+        return f"map of {kind.key_type} to {_type(kind.item_type)}"
+    return str(kind)

@@ -1,0 +1,124 @@
+"""The keys of a section of the scenario, as a table: from the JSON schema that pydantic makes of its model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator
+from typing import Any
+
+from pydantic import BaseModel
+
+from docs.generate.markdown import table
+
+HEADER = ("key", "type", "default", "unit", "allowed", "what")
+UNITS = {
+    "m_s": "m/s",
+    "mbps": "Mbit/s",
+    "bytes": "bytes",
+    "ppm": "ppm",
+    "rad": "rad",
+    "hz": "Hz",
+    "ns": "ns",
+    "us": "µs",
+    "ms": "ms",
+    "m2": "m²",
+    "m": "m",
+    "s": "s",
+}
+"""By the end of a name; of two that fit the longer one."""
+_TYPES = {
+    "integer": "whole number",
+    "number": "number",
+    "boolean": "true or false",
+    "object": "table",
+    "string": "text",
+}
+_BOUNDS = {
+    "exclusiveMinimum": "> {}",
+    "minimum": "≥ {}",
+    "exclusiveMaximum": "< {}",
+    "maximum": "≤ {}",
+    "minItems": "at least {}",
+    "pattern": "`{}`",
+}
+
+
+def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
+    """The keys of `model`, but for those that are sections themselves or that are named; "" if none is left."""
+    schema = model.model_json_schema()
+    required = schema.get("required", ())
+    rows = []
+    for name, key in schema.get("properties", {}).items():
+        if name not in without and name not in subsections(model):
+            if "description" not in key:
+                raise LookupError(f"{model.__name__}.{name} has no docstring")
+            default = "required" if name in required else _default(key)
+            rows.append([f"`{name}`", _type(key), default, unit(name), _allowed(key), key["description"]])
+    return table(HEADER, rows)
+
+
+def subsections(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
+    """The keys of a model that are models themselves, but for selectors, which are written in one line."""
+    kinds = {name: field.annotation for name, field in model.model_fields.items()}
+    return {
+        name: kind
+        for name, kind in kinds.items()
+        if isinstance(kind, type) and issubclass(kind, BaseModel) and kind.__name__ != "Selector"
+    }
+
+
+def unit(name: str) -> str:
+    """The unit that a name ends in, or nothing."""
+    fitting = [suffix for suffix in UNITS if name.endswith(f"_{suffix}")]
+    return UNITS[max(fitting, key=len)] if fitting else ""
+
+
+def _type(key: dict[str, Any], many: bool = False) -> str:
+    """What kind of value a key takes, in words; of `many` such values, if they stand in a list."""
+    if "$ref" in key:
+        return "[selector](faults.md#selectors)"
+    if "anyOf" in key:
+        return " or ".join(_type(part) for part in key["anyOf"] if part["type"] != "null")
+    if "enum" in key:
+        return " or ".join(f"`{json.dumps(value)}`" for value in key["enum"])
+    if "prefixItems" in key:
+        return f"[{', '.join(_type(part) for part in key['prefixItems'])}]"
+    if key["type"] == "array":
+        return f"{'lists' if many else 'list'} of {_type(key['items'], many=True)}"
+    name = "file name" if key.get("format") == "path" else _TYPES[key["type"]]
+    return f"{name}s" if many else name
+
+
+def _default(key: dict[str, Any]) -> str:
+    value = key.get("default")
+    if "$ref" in key:
+        return "all"
+    if value is None or value in ([], {}):
+        return "none"
+    return f"`{number(value)}`" if isinstance(value, (int, float)) else f"`{json.dumps(value)}`"
+
+
+def _allowed(key: dict[str, Any]) -> str:
+    """The bounds of a key, in words."""
+    return ", ".join(_bounds(key))
+
+
+def _bounds(key: dict[str, Any]) -> Iterator[str]:
+    for part in [key, *key.get("anyOf", ())]:
+        for name, words in _BOUNDS.items():
+            if name in part and (name != "minItems" or "prefixItems" not in part):
+                yield words.format(number(part[name]))
+
+
+def number(value: object) -> str:
+    """A number as one would write it: 86400 and 0.1, but 1e9; anything else as it is."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if not isinstance(value, (int, float)):
+        return str(value)
+    if value == 2**63:
+        return "2⁶³"
+    if value == int(value) and abs(value) < 1e7:
+        return str(int(value))
+    digits, e, power = f"{value:g}".partition("e")
+    return f"{digits}{e}{int(power)}" if e else digits

@@ -1,0 +1,95 @@
+"""docs/reference/node.md: what a vehicle program sees, from the docstrings of `vnet`."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Iterator
+
+import vnet
+from docs.generate.keys import unit
+from docs.generate.markdown import docstring, sentence, table
+from docs.generate.markdown import page as whole_page
+from vnet.errors import PayloadTooLargeError
+from vnet.link.node import INBOX_LIMIT, GnssReceiver, Radio
+from vnet.roads.lanes import LaneMap
+
+INTRODUCTION = """
+A program is one async function of one argument. It needs `from vnet import Node`, and nothing else of vnet; `Fix`
+and `Packet` are there for annotations.
+
+```python
+from vnet import Node
+
+
+async def main(node: Node) -> None:
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here I am")
+        node.report(fix.position_m, fix.covariance_m2, heard=len(node.radio.drain()))
+```
+
+[How time passes in it](../virtual-time.md), and [what else it may do](../how-to/threads-and-libraries.md). Arrays
+are numpy's, of float64.
+"""
+PARTS = {
+    "Node": vnet.Node,
+    "node.radio": Radio,
+    "node.gnss": GnssReceiver,
+    "Packet": vnet.Packet,
+    "Fix": vnet.Fix,
+    "node.map": LaneMap,
+}
+HOSTS_ONLY = {"sever", "to_wire", "from_wire"}
+"""Public, but none of a program's business."""
+WAITING = f"""
+`async for` waits for the next one, and goes on until the run ends. The newest {INBOX_LIMIT} that the program has
+not read are kept.
+"""
+ERRORS = f"""
+`{PayloadTooLargeError.__name__}` is in `vnet.errors`; it has `size_bytes` and `max_payload_bytes`. A program that
+lets an error through has crashed: its vehicle is down from then on, and the run is invalid.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [part for title, thing in PARTS.items() for part in _part(title, thing)]
+    return whole_page("What a program sees", INTRODUCTION, *parts, "## Errors", ERRORS)
+
+
+def _part(title: str, thing: type) -> Iterator[str]:
+    yield f"## `{title}`"
+    said, _, attributes = docstring(thing).partition("\nAttributes:\n")
+    yield said
+    yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
+    if dataclasses.is_dataclass(thing):
+        rows = ([f"`{each.name}`", _plain(each.type), unit(each.name)] for each in dataclasses.fields(thing))
+        yield table(["attribute", "type", "unit"], rows)
+    for name, member in _members(thing):
+        yield f"**`{name}`**: {docstring(member)}"
+    if hasattr(thing, "__aiter__"):
+        yield WAITING
+
+
+def _listed(attributes: str) -> list[tuple[str, str]]:
+    """The `name: text` of a docstring's section; further lines of a text are indented."""
+    return re.findall(r"^    (\w+): (.*(?:\n {5,}.*)*)", attributes, re.MULTILINE)
+
+
+def _members(thing: type) -> Iterator[tuple[str, object]]:
+    """Public methods, as they are called, and properties, in the order of the source."""
+    for name, member in vars(thing).items():
+        if name.startswith("_") or name in HOSTS_ONLY:
+            continue
+        if isinstance(member, property):
+            yield name, member
+        elif inspect.isfunction(member):
+            parameters = list(inspect.signature(member).parameters.values())[1:]
+            called = f"{name}({', '.join(_plain(parameter) for parameter in parameters)})"
+            yield f"await {called}" if inspect.iscoroutinefunction(member) else called, member
+
+
+def _plain(annotated: object) -> str:
+    """A type, or a parameter with one, as a reader needs it."""
+    return str(annotated).replace("'", "").replace("ArrayLike", "array").replace("Array", "array")

@@ -1,0 +1,71 @@
+"""docs/reference/scenario.md: every section and key of a scenario, and the options of the flagship."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+
+from pydantic import BaseModel
+
+from agents import cooperative_options
+from docs.generate.keys import HEADER, key_table, number, subsections, unit
+from docs.generate.markdown import attribute_docstrings, docstring, sentence, table
+from docs.generate.markdown import page as whole_page
+from vnet.scenario import ProgramException, Scenario
+
+INTRODUCTION = """
+A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is
+refused. `--set SECTION.KEY=VALUE` changes one key at the command line, and each run writes all of them, defaults
+included, into its own `scenario.toml`, with `[inputs]` besides: the SHA-256 of each file that it read, so that a
+changed one is noticed. [scenarios/](../../scenarios) has examples.
+"""
+OPTIONS = """
+What `agents.cooperative:main` and `agents.centralized:main` take; [estimator.md](../estimator.md) explains what
+they do. Other programs have options of their own, in `node.options`.
+"""
+CHOICES = {
+    "profile": tuple(cooperative_options.PROFILES),
+    "fusion": cooperative_options.FUSIONS,
+    "exchange": cooperative_options.EXCHANGES,
+    "consensus": cooperative_options.CONSENSUSES,
+}
+_TYPES = {"str": "text", "bool": "true or false", "int": "whole number", "float": "number"}
+
+
+def page() -> str:
+    """The whole page."""
+    return whole_page("The scenario file", INTRODUCTION, *_sections("", Scenario), *_options())
+
+
+def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
+    """The section at `path` and all below it."""
+    if path:
+        yield from _section(f"[{path}]", model, without=("exceptions",))
+    for name, section in subsections(model).items():
+        yield from _sections(f"{path}.{name}" if path else name, section)
+    if path == "program":
+        yield from _section("[[program.exceptions]]", ProgramException)
+    if not path:
+        yield "## `[[fault]]`"
+        yield "What breaks, where, from when and for how long: [faults.md](faults.md)."
+
+
+def _section(heading: str, model: type[BaseModel], without: tuple[str, ...] = ()) -> Iterator[str]:
+    yield f"## `{heading}`"
+    yield sentence(docstring(model).partition("`: ")[2])
+    yield key_table(model, without)
+
+
+def _options() -> Iterator[str]:
+    yield "## `[program.options]` of the cooperative programs"
+    yield OPTIONS
+    said = attribute_docstrings(cooperative_options.Options)
+    rows = []
+    for field in dataclasses.fields(cooperative_options.Options):
+        value = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+        choices = " or ".join(f"`{json.dumps(choice)}`" for choice in CHOICES.get(field.name, ()))
+        kind = choices or _TYPES.get(str(field.type), "table" if value == {} else "[number, number]")
+        default = number(value) if isinstance(value, (int, float)) else json.dumps(value)
+        rows.append([f"`{field.name}`", kind, f"`{default}`", unit(field.name), "", said[field.name]])
+    yield table(HEADER, rows)

@@ -1,0 +1,148 @@
+"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; the load."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from emulator.channel.outcomes import Outcome
+from emulator.observe.drawing import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    OUTCOME_COLOURS,
+    SKY,
+    Canvas,
+    Floats,
+    Period,
+    bars,
+    outcome_title,
+)
+from emulator.observe.observation import LATENCY_BIN_NS
+
+WINDOW_S = 5.0
+"""Shares, histograms and loads are those of so many last seconds."""
+EVERY_S = 1.0
+DISTANCE_BINS = 20
+STROKES = 4
+"""The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
+LEAST_LATENCY_BINS = 8
+LARGEST_MATRIX = 400
+"""Vehicles of which the matrix of links is drawn."""
+
+
+class Window:
+    """Sums of arrays over the last periods."""
+
+    def __init__(self, periods: int) -> None:
+        self._kept: deque[NDArray[Any]] = deque(maxlen=max(1, periods))
+
+    def add(self, array: NDArray[Any]) -> None:
+        """Take one period's."""
+        self._kept.append(array)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    @property
+    def total(self) -> NDArray[Any]:
+        """The sum."""
+        return np.asarray(np.sum(self._kept, axis=0))
+
+
+class RadioScene:
+    """Draws what concerns the radio below `/radio`, from the scene and period messages of a run."""
+
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
+        self._canvas = canvas
+        self._count = len(scene["node_ids"])
+        self._period_s = scene["period_ns"] / 1e9
+        self._range_m: float | None = scene["range_m"]
+        periods = round(WINDOW_S / self._period_s)
+        self._tried, self._delivered = Window(periods), Window(periods)
+        self._latency, self._sent, self._received = Window(periods), Window(periods), Window(periods)
+        self._latency_bins = LEAST_LATENCY_BINS
+        self._announced: set[str] = set()
+        self._next_s = 0.0
+        loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
+        canvas.series("radio/load", [*loads, ("received: most", ORANGE, 1.0)])
+
+    def period(self, period: Period) -> None:
+        """Draw a period."""
+        self._stack(period)
+        self._load(period)
+        if self._count <= LARGEST_MATRIX:
+            self._tried.add(period.counts())
+            self._delivered.add(period.counts(Outcome.delivered))
+        self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
+        self._sent.add(period.numbers("sent_bytes"))
+        self._received.add(period.numbers("received_bytes"))
+        if period.time_s >= self._next_s:
+            self._next_s = period.time_s + EVERY_S
+            self._charts(period)
+
+    def _stack(self, period: Period) -> None:
+        """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back."""
+        times = period.time_s + self._period_s * np.arange(2 * STROKES) / (2 * STROKES)
+        lower = 0.0
+        for outcome, colour in OUTCOME_COLOURS.items():
+            count = period.message["outcomes"].get(outcome.name, 0)
+            entity = f"radio/frames/{outcome.name}"
+            if count and entity not in self._announced:
+                self._announced.add(entity)
+                style = rr.SeriesLines(
+                    names=outcome_title(outcome), colors=[colour], widths=[2.5], aggregation_policy="MinMax"
+                )
+                self._canvas.log(entity, style, static=True)
+            if entity in self._announced:
+                layer = [lower, lower + count] * STROKES if count else [np.nan]
+                self._canvas.plot_at(entity, times[: len(layer)].tolist(), layer)
+            lower += count
+
+    def _load(self, period: Period) -> None:
+        rates = [period.numbers(name) / self._period_s / 1e3 for name in ("sent_bytes", "received_bytes")]
+        self._canvas.plot("radio/load", *(float(value) for rate in rates for value in (rate.mean(), rate.max())))
+
+    def _charts(self, period: Period) -> None:
+        canvas, span_s = self._canvas, len(self._latency) * self._period_s
+        latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
+        self._latency_bins = max(self._latency_bins, int(np.flatnonzero(latency).max(initial=0)) + 2)
+        latency = latency[: self._latency_bins]
+        canvas.log("radio/latency", bars(latency, (np.arange(len(latency)) + 0.5) * width_ms, width_ms, SKY))
+        for side, name, window, colour in ((-1, "sent", self._sent, SKY), (1, "received", self._received, GREEN)):
+            rate = window.total / span_s / 1e3
+            canvas.log(f"radio/bytes/{name}", bars(rate, np.arange(self._count) + 0.2 * side, 0.4, colour))
+        if self._count <= LARGEST_MATRIX:
+            self._links(period)
+
+    def _links(self, period: Period) -> None:
+        """Delivery by link, and by distance."""
+        tried, delivered = self._tried.total, self._delivered.total
+        share = np.divide(delivered, tried, out=np.full(tried.shape, np.nan), where=tried > 0)
+        axes = ("receiver", "sender")
+        self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))
+        position = period.points("position_m").astype(float)
+        distance_m = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
+        tried = np.where(np.isfinite(distance_m), tried, 0)  # who has left is nowhere
+        farthest_m = self._range_m or float(distance_m[tried > 0].max(initial=1.0))
+        shares, middles_m, width_m = delivery_by_distance(distance_m, tried, delivered, farthest_m)
+        chart = bars(100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
+        self._canvas.log("radio/distance", chart)
+
+
+def delivery_by_distance(
+    distance_m: NDArray[np.float64], tried: NDArray[Any], delivered: NDArray[Any], farthest_m: float
+) -> tuple[Floats, Floats, float]:
+    """Shares delivered by distance: (DISTANCE_BINS,), NaN where nobody tried; the bins' middles and width (m)."""
+    width_m = farthest_m / DISTANCE_BINS
+    place = np.minimum((distance_m / width_m).astype(int), DISTANCE_BINS - 1)[tried > 0]
+    tries = np.bincount(place, tried[tried > 0], DISTANCE_BINS)
+    hits = np.bincount(place, delivered[tried > 0], DISTANCE_BINS)
+    share = np.divide(hits, tries, out=np.full(DISTANCE_BINS, np.nan), where=tries > 0)
+    middles_m = (np.arange(DISTANCE_BINS) + 0.5) * width_m
+    return share.astype(np.float32), middles_m.astype(np.float32), width_m

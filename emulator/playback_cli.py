@@ -1,0 +1,96 @@
+"""`vnet render` and `vnet play`: a run that is over, drawn anew from its files alone."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import track
+
+from emulator.observe.pace import play as play_scheduled
+from emulator.observe.pace import schedule
+from emulator.observe.playback import Message, messages
+from emulator.observe.run_folder import RunFolder
+from emulator.observe.sinks import RECORDING, Sinks, has_display, place_to_serve
+from emulator.terminal import one_line_errors
+from emulator.viewing_cli import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
+from vnet.errors import VnetError
+from vnet.scenario import NS_PER_S
+
+if TYPE_CHECKING:  # Rerun is slow to import, and only those who draw need it
+    from emulator.observe.recorder import Recorder
+
+
+def render(
+    run: RunArgument = LATEST,
+    out: Annotated[
+        Path | None, typer.Option(help=f"The recording to write; the default is RUN/{RECORDING}.")
+    ] = None,
+    rerun_vehicle: RerunVehicleOption = None,
+) -> None:
+    """Make a run's recording anew, from its files alone."""
+    with one_line_errors():
+        played = messages(run)
+        recording = out or run / RECORDING
+        if not recording.parent.is_dir():
+            raise VnetError(f"{recording}: there is no folder {recording.parent}")
+        RunFolder(recording.parent).put(
+            recording.name, lambda part: _write_recording(played, Sinks(part, vehicle=rerun_vehicle))
+        )
+        print(recording)
+
+
+def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:
+    stream, scene = next(played)
+    with _recorder(sinks, scene["name"]) as recorder:
+        recorder.take(stream, scene)
+        console = Console(stderr=True)
+        total = scene["duration_ns"] / scene["period_ns"]
+        for stream, message in track(
+            played, "drawing", total, console=console, transient=True, disable=not console.is_terminal
+        ):
+            recorder.take(stream, message)
+
+
+def play(
+    run: RunArgument = LATEST,
+    speed: Annotated[float, typer.Option(help="How many times as fast as real time.")] = 1.0,
+    start: Annotated[float, typer.Option("--from", min=0.0, help="Emulated second to begin at.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", help="Emulated second to stop at.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
+) -> None:
+    """Play a run into a viewer here, or serve it as it plays, until Ctrl-C."""
+    with one_line_errors():
+        if not speed > 0:
+            raise VnetError(f"--speed {speed:g}: more than 0 is needed")
+        if end is not None and not end > start:
+            raise VnetError(f"--to {end:g}: must come after --from {start:g}")
+        played = messages(run)
+        stream, scene = next(played)
+        if start >= (over_s := scene["duration_ns"] / NS_PER_S):
+            raise VnetError(f"--from {start:g}: the run is over at {over_s:g} s")
+        scheduled = schedule(played, speed, round(start * NS_PER_S), None if end is None else round(end * NS_PER_S))
+        place = place_to_serve(rerun_bind, rerun_port)
+        sinks = Sinks(serve=place, spawn=has_display() and not serve, vehicle=rerun_vehicle)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
+            recorder.take(stream, scene)
+            print(f"playing {run} at {speed:g}× real time\n{place.told()}", flush=True)
+            if play_scheduled(scheduled, lambda message: recorder.take(*message)) == 0:
+                raise VnetError(f"{run}: there is nothing to play from {start:g} s on")
+            print("played; it can be looked at until Ctrl-C", flush=True)
+            signal.pause()
+
+
+def _recorder(sinks: Sinks, name: str) -> Recorder:
+    from emulator.observe.recorder import Recorder
+
+    return Recorder(sinks, name)

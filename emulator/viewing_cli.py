@@ -1,0 +1,69 @@
+"""`vnet view`: looking at runs, in a window where there is a display, else from a browser."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from emulator.observe.sinks import RECORDING, has_display, place_to_serve, serve_file, viewer_command
+from emulator.run.control import read_way_in
+from emulator.terminal import one_line_errors
+from vnet.errors import VnetError
+
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
+RerunBindOption = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Where to serve; the default is 127.0.0.1, this machine only.")
+]
+RerunPortOption = Annotated[
+    int | None, typer.Option(help="Viewers connect here, browsers to the next port; by default 9876, if free.")
+]
+RerunVehicleOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="The vehicle that has a tab of its own; by default the first.")
+]
+LATEST = Path("runs/latest")
+
+
+def view(
+    run: RunArgument = LATEST,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve it even where there is a display.")] = False,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+) -> None:
+    """Look at a run: opens its recording, or serves it until Ctrl-C; says where one that is on can be watched."""
+    with one_line_errors():
+        if _is_on(run):
+            _tell_where(run)
+            return
+        recording = run / RECORDING
+        if not recording.exists():
+            raise VnetError(f"{run}: has no {RECORDING}: it is made by vnet run --rerun save")
+        if has_display() and not serve and rerun_bind is None and rerun_port is None:
+            with contextlib.suppress(KeyboardInterrupt):
+                subprocess.run(viewer_command("--new", str(recording)))
+            return
+        place = place_to_serve(rerun_bind, rerun_port)
+        print(f"serving {recording} until Ctrl-C\n{place.told()}", flush=True)
+        serve_file(recording, place)
+
+
+def _is_on(run: Path) -> bool:
+    """Whether a run is going on in this folder."""
+    way = read_way_in(run)
+    if way is None:
+        return False
+    host, _, port = way[0].partition("/")[2].rpartition(":")
+    with contextlib.suppress(OSError), socket.create_connection((host.strip("[]"), int(port)), 2.0):
+        return True
+    return False  # it was killed
+
+
+def _tell_where(run: Path) -> None:
+    way = read_way_in(run)
+    if way is None or way[2] is None:
+        raise VnetError(f"{run}: the run is on, and is not served: only vnet run --rerun serve can be watched")
+    print(f"the run is on\n{way[2].told()}")

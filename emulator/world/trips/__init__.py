@@ -1,0 +1,1 @@
+"""Trips: how vehicles drive, read from what others recorded or simulated."""

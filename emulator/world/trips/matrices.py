@@ -1,0 +1,88 @@
+"""Trips from matrices: NPZ with `lat_deg`, `lon_deg` or `x_m`, `y_m` (N, K), a vehicle a row, and `rate_hz`.
+
+Column k is the time k / rate_hz. NaN in both is: not there. `id` (N,), `heading_rad` and `speed_mps` (N, K) may be
+given; without ids vehicles are v1, v2, …, with zeros in front so that they sort.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from emulator.world.trips.samples import DEGREES, METRES, MOST_SAMPLES, OPTIONAL, Samples
+from vnet.errors import ScenarioError, printable
+from vnet.roads.lanes import Array
+
+_LARGEST_BYTES = (len(METRES) + len(OPTIONAL)) * 8 * MOST_SAMPLES + (1 << 20)
+
+
+def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
+    """The samples of an NPZ file; rows, which are vehicles, are counted from 1. Raises ScenarioError."""
+    arrays = _load(path)
+    where = METRES if set(METRES) <= arrays.keys() else DEGREES
+    for name in (*where, "rate_hz"):
+        if name not in arrays:
+            raise ScenarioError(f"{path}: no array {name!r}; needed are rate_hz, and lat_deg, lon_deg or x_m, y_m")
+    first, second = (arrays[name] for name in where)
+    count, length = _shape(path, where, first, second)
+    rate_hz = arrays["rate_hz"]
+    if rate_hz.ndim or not 0 < rate_hz <= 10_000:
+        raise ScenarioError(f"{path}: rate_hz = {printable(str(rate_hz))}: a number in (0, 10000] is needed")
+    time_s = np.arange(length) / float(rate_hz)
+    columns = [*where, *(name for name in OPTIONAL if name in arrays)]
+    for name in columns:
+        if arrays[name].shape != (count, length):
+            raise ScenarioError(f"{path}: {name} is {arrays[name].shape}, and {where[0]} {(count, length)}")
+    samples = Samples(path, "row", window_s)
+    for row, node_id in enumerate(_ids(path, arrays, count)):
+        there = ~(np.isnan(first[row]) & np.isnan(second[row]))
+        if not there.any():
+            continue
+        values = {"time_s": time_s[there], **{name: arrays[name][row, there] for name in columns}}
+        place = np.full(int(there.sum()), row + 1)
+        samples.add(pa.array([node_id]).take(pa.array(np.zeros(len(place), np.int64))), place, values)
+    return samples
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > _LARGEST_BYTES:
+            raise ScenarioError(f"{path}: {size:,} bytes of arrays; at most {_LARGEST_BYTES:,} are taken")
+        with np.load(path, allow_pickle=False) as file:
+            wanted = {*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"}
+            arrays = {name: file[name] for name in file.files if name in wanted}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ScenarioError(f"{path}: not an NPZ file: {printable(str(error), 300)}") from None
+    for name, array in arrays.items():
+        if name != "id":
+            if array.dtype.kind not in "fiu":
+                raise ScenarioError(f"{path}: {name} holds {array.dtype}: numbers are needed")
+            arrays[name] = array.astype(float)
+    return arrays
+
+
+def _shape(path: Path, where: tuple[str, str], first: Array, second: Array) -> tuple[int, int]:
+    if first.ndim != 2 or first.shape != second.shape or not first.size:
+        shapes = f"{where[0]} is {first.shape}, {where[1]} {second.shape}"
+        raise ScenarioError(f"{path}: {shapes}: matrices of one shape are needed, a row for each vehicle")
+    return first.shape
+
+
+def _ids(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> list[str]:
+    if "id" not in arrays:
+        width = len(str(count))
+        return [f"v{number:0{width}d}" for number in range(1, count + 1)]
+    ids = [str(name) for name in arrays["id"].ravel()]
+    if len(ids) != count:
+        raise ScenarioError(f"{path}: {len(ids)} ids for {count} rows")
+    if len(set(ids)) != count:
+        twice = next(name for number, name in enumerate(ids) if name in ids[:number])
+        raise ScenarioError(f"{path}: id = {printable(twice)} appears twice; ids must differ")
+    return ids

@@ -1,0 +1,59 @@
+"""The Markdown of the documentation: its pages, their fenced blocks, links and headings."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+_parser = MarkdownIt("commonmark").enable("table")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block: its language, the further words after it, what it holds, and where it stands."""
+
+    language: str
+    name: str
+    text: str
+    place: str
+
+
+def blocks(text: str, page: str) -> list[Block]:
+    """All fenced blocks of a page, in order."""
+    found = []
+    for token in _parser.parse(text):
+        if token.type == "fence":
+            assert token.map is not None
+            language, _, name = token.info.strip().partition(" ")
+            found.append(Block(language, name, token.content, f"{page}:{token.map[0] + 1}"))
+    return found
+
+
+def links(text: str) -> Iterator[str]:
+    """The targets of all links and pictures of a page."""
+    for token in _inline(text):
+        target = token.attrGet("href") or token.attrGet("src")
+        if token.type in ("link_open", "image") and target:
+            yield str(target)
+
+
+def anchors(text: str) -> set[str]:
+    """The names that GitHub gives the headings of a page."""
+    tokens = _parser.parse(text)
+    headings = [after.content for token, after in pairwise(tokens) if token.type == "heading_open"]
+    return {re.sub(r"[^\w\- ]", "", _plain(heading).lower()).replace(" ", "-") for heading in headings}
+
+
+def _plain(heading: str) -> str:
+    return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+
+
+def _inline(text: str) -> Iterator[Token]:
+    for token in _parser.parse(text):
+        yield from token.children or ()

@@ -1,0 +1,105 @@
+"""Every fenced block of the README and of docs/ is what it says: read, run, and compared with what it prints."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.docs.commands import DocsError
+from tests.docs.markdown import PAGES, ROOT, blocks
+from tests.docs.pages import Page, check_workflow, shows
+
+
+@pytest.fixture
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
+    """A reader with an empty folder, a terminal 100 columns wide, and no colours."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("PYTHONHASHSEED", "0")  # otherwise commands start themselves anew
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("PYTEST_DEBUG_TEMPROOT", str(tmp_path))
+    monkeypatch.delenv("FORCE_COLOR", raising=False)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # a file may be written twice within a second
+    return Page(tmp_path)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_page_is_what_it_says(path: Path, page: Page) -> None:
+    page.follow(path.read_text(encoding="utf-8"), str(path.relative_to(ROOT)))
+
+
+def test_there_are_pages_and_blocks() -> None:
+    found = [block for path in PAGES for block in blocks(path.read_text(encoding="utf-8"), path.name)]
+    assert len(PAGES) > 20
+    assert {"python", "toml", "csv", "sh", "text", "yaml"} <= {block.language for block in found}
+
+
+PROGRAM = "```python\n# hello.py\nfrom vnet import Node\n\n\nasync def main(node: Node) -> None:\n    {}\n```\n"
+BROKEN = {
+    "no language": ("```\nls\n```\n", "language ''"),
+    "an unknown language": ("```console\n$ ls\n```\n", "language 'console'"),
+    "Python that is none": ("```python\nprint(\n```\n", "SyntaxError"),
+    "Python that fails": ("```python\nassert 1 + 1 == 3\n```\n", "AssertionError"),
+    "output that is another": ("```python\nprint(2)\n```\n\nprints\n\n```text\n3\n```\n", "this is not an excerpt"),
+    "a test that fails": ("```python\ndef test_it():\n    assert False\n```\n", "1 failed"),
+    "a program that crashes": (PROGRAM.format("node.gnss.nothing()"), "invalid"),
+    "a program without its import": (PROGRAM.format("pass").replace("from vnet", "from venet"), "venet"),
+    "a file that is written twice, and never run": (2 * PROGRAM.format("pass"), "never run"),
+    "a key that a scenario has not": ("```toml\n[radio]\nlos = 0.1\n```\n", "radio.los"),
+    "a scenario that is not there": ("```sh\nvnet simulate nowhere.toml\n```\n", "nowhere.toml"),
+    "an option that a command has not": ("```sh\nvnet simulate scenarios/beacon.toml --sed 2\n```\n", "--sed"),
+    "an option of a command that is not run": ("```sh\nvnet-agent --nod v01\n```\n", "--nod"),
+    "an option of a long run": ("```sh\nvnet run scenarios/quickstart.toml --pacing fast\n```\n", "fast"),
+    "another exit status": ("```sh\nvnet simulate town.toml   # status 3\n```\n", "exit status 2, and not 3"),
+    "a command that is not there": ("```sh\nvnet simulated scenarios/beacon.toml\n```\n", "vnet simulated"),
+    "a program that nobody has spoken of": ("```sh\nrm -rf town\n```\n", "rm: say"),
+    "a target that the Makefile has not": ("```sh\nmake dema\n```\n", "dema"),
+    "JSON that is none": ("```json\n{,}\n```\n", "JSONDecodeError"),
+    "a CSV file without a name": ("```csv\na,b\n```\n", "needs its name"),
+    "a workflow with a wrong command": (
+        "```yaml\non: push\njobs:\n  a:\n    runs-on: x\n    steps:\n      - run: vnet simulate\n```\n",
+        "SCENARIO",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_block_that_is_broken_fails(name: str, page: Page) -> None:
+    text, complaint = BROKEN[name]
+    with pytest.raises(DocsError) as failed:
+        page.follow(f"# A page\n\n{text}", "page.md")
+    assert str(failed.value).startswith("page.md:3: ") or "excerpt" in complaint or "never run" in complaint
+    assert complaint in str(failed.value)
+
+
+@pytest.mark.parametrize(
+    ("shown", "is_excerpt"),
+    [
+        ("b\nc", True),
+        ("b", True),
+        ("a\n…\nd e", True),
+        ("…\nd e\n…", True),
+        ("d …", True),
+        ("a\nc", False),
+        ("c\n…\nb", False),
+        ("d", False),
+    ],
+)
+def test_an_excerpt_is_told_from_what_is_none(shown: str, is_excerpt: bool) -> None:
+    assert shows("a\nb  \nc\nd e\n", shown) is is_excerpt
+
+
+@pytest.mark.parametrize(
+    "workflow",
+    [
+        {"jobs": {"a": {"runs-on": "x", "steps": [{"run": "make lint"}]}}},
+        {"on": "push", "jobs": {"a": {"steps": [{"run": "make lint"}]}}},
+        {"on": "push", "jobs": {"a": {"runs-on": "x", "steps": [{"run": "make lint", "uses": "a/b@v1"}]}}},
+        {"on": "push", "jobs": {"a": {"runs-on": "x", "steps": [{"uses": "checkout"}]}}},
+    ],
+    ids=["no trigger", "no machine", "two things at once", "no action"],
+)
+def test_a_workflow_that_is_none_fails(workflow: dict[str, Any]) -> None:
+    with pytest.raises(DocsError):
+        check_workflow(workflow)

@@ -1,0 +1,115 @@
+"""The reference pages are what `make docs` makes of the code as it is, and leave nothing out."""
+
+import ast
+import json
+import re
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+from docs.generate import PAGES, REFERENCE, faults, files
+from docs.generate.keys import key_table
+from docs.generate.markdown import attribute_docstrings
+from emulator.channel.outcomes import Outcome
+from emulator.observe.checks import OF_BELIEFS, OF_FRAMES, OF_THE_RADIO, OF_THE_RUN
+from emulator.observe.metrics import STATES
+from emulator.observe.run_folder import RunFolder
+from emulator.run.conclude import conclude
+from emulator.run.emulation import Emulation
+from emulator.run.simulate import simulate
+from emulator.world.world import build_world
+from tests.docs.markdown import ROOT
+from vnet.faults import KINDS
+from vnet.scenario import Scenario
+from vnet.sections import Section
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_is_made_from_the_code_as_it_is(name: str) -> None:
+    assert (REFERENCE / name).read_text(encoding="utf-8") == PAGES[name](), "stale: make docs"
+
+
+def test_there_is_no_page_that_nothing_makes() -> None:
+    assert {path.name for path in REFERENCE.glob("*.md")} == set(PAGES)
+
+
+def test_pages_do_not_depend_on_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = PAGES["commands.md"]()
+    for name, value in {"COLUMNS": "40", "TERMINAL_WIDTH": "40", "NO_COLOR": "1", "TERM": "dumb"}.items():
+        monkeypatch.setenv(name, value)
+    assert PAGES["commands.md"]() == wide
+
+
+def test_every_kind_of_fault_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert all(f"`{kind}`" in faults.page() for kind in KINDS)
+    monkeypatch.delitem(faults.GROUPS, "Clocks")
+    with pytest.raises(LookupError, match="drift, skew"):
+        faults.page()
+
+
+def test_a_key_without_a_docstring_is_refused() -> None:
+    class Silent(Section):
+        said: int = 1
+        """Something."""
+        silent_s: float = 0.0
+
+    with pytest.raises(LookupError, match="silent_s"):
+        key_table(Silent)
+
+
+def test_docstrings_of_attributes_are_found() -> None:
+    assert attribute_docstrings(Example) == {"first": "Of\nthe first."}
+
+
+class Example:
+    """A class."""
+
+    first: int = 1
+    """Of
+    the first."""
+    second: int = 2
+    third = 3
+    """Of no annotation."""
+
+
+def test_a_column_without_a_text_is_refused() -> None:
+    with pytest.raises(LookupError, match="cloud_m"):
+        files.columns(STATES, {name: text for name, text in files.STATE.items() if name != "cloud_m"})
+
+
+def event_kinds() -> set[str]:
+    """The kinds of events that the emulator's code names; f-strings aside."""
+    found = set()
+    for path in (ROOT / "emulator" / "run").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(func=ast.Attribute(attr="event"), args=[_, ast.Constant(value=str(kind)), *_]):
+                    found.add(kind)
+    return found
+
+
+def test_every_event_is_there() -> None:
+    of_programs = {"finished", "crashed", "spun", "emulator_restarted", "router_restarted"}  # named by variables
+    assert event_kinds() | of_programs == set(files.EVENTS)
+
+
+def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
+    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 3}})
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    conclude(emulation, simulate(emulation)[0], "simulate")
+    left = {path.name + "/" * path.is_dir() for path in (tmp_path / "run").iterdir()}
+    assert left <= set(files.FOLDER)
+    verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
+    assert verdict.keys() == files.VERDICT.keys()
+    assert verdict["frames_by_outcome"].keys() == {outcome.name for outcome in Outcome} - {"pending"}
+    for name, said in (("trace", files.TRACE), ("states", files.STATE)):
+        assert pq.read_schema(tmp_path / "run" / f"{name}.parquet").names == list(said)
+
+
+def test_every_check_is_explained() -> None:
+    page = (ROOT / "docs" / "checks.md").read_text()
+    names = {
+        check.__name__.removeprefix("check_") for check in (*OF_THE_RADIO, *OF_FRAMES, *OF_BELIEFS, *OF_THE_RUN)
+    }
+    assert names <= set(re.findall(r"^\| `(\w+)`", page, re.MULTILINE))

@@ -1,0 +1,240 @@
+"""What of trips is believed, and where that puts vehicles: stands, held samples, jumps, gaps, headings."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from emulator.world.trips.clean import Rules, clean
+from emulator.world.trips.course import Course, Frame, courses
+from emulator.world.trips.samples import Trip
+from vnet.errors import ScenarioError
+
+RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0)
+TENTH_NS = 100_000_000
+
+
+def trip(time_s: object, x_m: object, y_m: object = 0.0, name: str = "a", **known: np.ndarray) -> Trip:
+    time = np.asarray(time_s, dtype=float)
+    position_m = np.column_stack([np.broadcast_to(x_m, time.shape), np.broadcast_to(y_m, time.shape)])
+    return Trip(name, time, position_m.astype(float), **known)
+
+
+def drive(*trips: Trip, seconds: float = 10.0, start_s: float = 0.0, **frame: object) -> Course:
+    periods = round(seconds * 10) + 1
+    return courses(list(trips), Frame(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
+
+
+def x_of(course: Course, vehicle: int = 0) -> np.ndarray:
+    return course.position_m[:, vehicle, 0]
+
+
+def there(course: Course, vehicle: int = 0) -> tuple[float, float]:
+    """From when until when, in seconds, a vehicle is there."""
+    periods = np.flatnonzero(np.isfinite(x_of(course, vehicle)))
+    assert len(periods) == periods[-1] - periods[0] + 1, "without a break"
+    return periods[0] / 10, periods[-1] / 10
+
+
+# Held samples, and stands.
+
+
+def test_samples_that_are_repeated_to_reach_a_rate_are_not_stands() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    true_m = 20 * time_s
+    held_m = np.repeat(true_m[::2], 2)  # 5 Hz, written at 10 Hz
+    assert x_of(drive(trip(time_s, held_m)))[:98] == pytest.approx(true_m[:98])
+
+
+def test_a_receiver_that_held_its_position_is_bridged_and_the_jump_at_its_end_is_a_drive() -> None:
+    """As in the Ann Arbor trips: 5.7 s at one place, and 130 m further on within the next 0.3 s."""
+    time_s = np.arange(0, 20, 0.1)
+    true_m = 22 * time_s
+    said_m = np.where((time_s > 5) & (time_s < 10.75), 22 * 5.0, true_m)
+    said_m[107:110] = np.linspace(110, true_m[110], 5)[1:-1]  # a filter smooths the jump
+    x_m = x_of(drive(trip(time_s, said_m), seconds=20))
+    assert x_m[:199] == pytest.approx(true_m[:199], abs=0.1)
+
+
+def test_a_stand_is_a_stand_if_the_vehicle_then_starts_as_vehicles_do() -> None:
+    time_s = np.arange(0, 30, 0.1)
+    moving_s = np.maximum(time_s - 20, 0)
+    said_m = np.where(time_s < 5, 10 * time_s, 50 + 1.5 * moving_s**2)  # 3 m/s²
+    x_m = x_of(drive(trip(time_s, said_m), seconds=29))
+    assert x_m[60:200] == pytest.approx(np.full(140, 50.0), abs=1e-9)
+
+
+def test_a_position_held_for_longer_than_a_gap_is_believed() -> None:
+    time_s = np.arange(0, 40, 0.1)
+    said_m = np.where(time_s < 5, 10 * time_s, np.where(time_s < 25, 50.0, 50 + 10 * (time_s - 25 + 0.5)))
+    x_m = x_of(drive(trip(time_s, said_m), seconds=39))
+    assert x_m[60:249] == pytest.approx(np.full(189, 50.0))
+
+
+# Jumps.
+
+
+def test_an_outlier_is_left_out_wherever_it_is() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    for place in (0, 1, 50, 98, 99):
+        said_m = 15 * time_s
+        said_m[place] += 500
+        course = drive(trip(time_s, said_m))
+        first, last = there(course)
+        assert (first, last) == (0.1 if place == 0 else 0.0, 9.8 if place == 99 else 9.9)
+        known = slice(round(first * 10), round(last * 10) + 1)
+        assert x_of(course)[known] == pytest.approx(15 * time_s[known])
+
+
+def test_after_a_jump_to_stay_the_vehicle_gets_there_as_fast_as_the_fastest() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    said_m = np.where(time_s < 4.95, 10 * time_s, 10 * time_s + 140)
+    x_m = x_of(drive(trip(time_s, said_m)))
+    assert x_m[:50] == pytest.approx(said_m[:50])
+    assert x_m[80:100] == pytest.approx(said_m[80:100])
+    assert np.nanmax(np.abs(np.diff(x_m))) <= 7.0 + 1e-9, "70 m/s"
+
+
+def test_a_jump_too_far_for_the_longest_gap_is_leaving_and_entering() -> None:
+    time_s = np.arange(0, 40, 0.1)
+    said_m = np.where(time_s < 9.95, 10 * time_s, 10 * time_s + 1000)
+    x_m = x_of(drive(trip(time_s, said_m), seconds=39))
+    gone = np.flatnonzero(np.isnan(x_m[:390])) / 10
+    assert gone[0] == pytest.approx(10.0)
+    assert gone[-1] == pytest.approx(19.9, abs=0.11), "it is away for the longest gap"
+
+
+def test_what_is_mostly_jumps_is_no_trip() -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: wrong units"):
+        drive(trip(np.arange(100) / 10, rng.uniform(0, 1e4, 100)))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(0.05, 3.0), st.floats(-300, 300)), min_size=2, max_size=40),
+    st.floats(5, 100),
+    st.floats(0.5, 20),
+)
+def test_what_is_believed_has_no_jump_and_no_gap(steps: list, fastest_mps: float, gap_s: float) -> None:
+    rules = Rules(fastest_mps, gap_s)
+    time_s, x_m = np.cumsum(np.array(steps), axis=0).T
+    one = trip(time_s, x_m)
+    jumps = np.sum(np.abs(np.diff(x_m)) > fastest_mps * np.diff(time_s))
+    assume(jumps <= 10)
+    parts = clean(one, rules)
+    for part in parts:
+        assert len(part) > 1 and (np.diff(part) > 0).all()
+        assert (np.diff(time_s[part]) <= gap_s).all()
+        assert (np.abs(np.diff(x_m[part])) <= fastest_mps * np.diff(time_s[part]) + 1e-9).all()
+    if jumps == 0 and (np.diff(time_s) <= gap_s).all() and (np.diff(x_m) != 0).all():
+        assert np.concatenate(parts).tolist() == list(range(len(time_s))), "nothing is wrong with it"
+
+
+# Gaps, entering and leaving.
+
+
+def test_short_gaps_are_driven_through_and_long_ones_are_absences() -> None:
+    time_s = np.array([0, 1, 2, 9, 10, 25, 26, 27.0])
+    x_m = x_of(drive(trip(time_s, 5 * time_s), seconds=27))
+    present = np.isfinite(x_m)
+    assert present[:101].all() and not present[101:250].any() and present[250:271].all()
+    assert x_m[:101] == pytest.approx(np.arange(101) / 2)
+
+
+def test_vehicles_are_numbered_as_they_enter_and_the_first_ones_take_part() -> None:
+    late, early, first = trip([5, 9], [0, 9], name="late"), trip([1, 9], [0, 9], name="early"), trip([0, 9], [0, 9])
+    assert drive(late, early, first).node_ids == ("a", "early", "late")
+    course = drive(late, early, first, most=2)
+    assert course.node_ids == ("a", "early")
+    assert there(course, 1) == (1.0, 9.0)
+
+
+def test_the_run_begins_where_it_is_told_to() -> None:
+    course = drive(trip(1e9 + np.arange(101), np.arange(101)), start_s=1e9 + 50)
+    assert x_of(course)[:100] == pytest.approx(50 + np.arange(100) / 10)
+
+
+def test_who_is_there_for_less_than_a_second_takes_no_part() -> None:
+    course = drive(trip([0, 10], [0, 10]), trip([4, 4.8], [0, 1], name="b"), trip([9.5, 20], [0, 9], name="c"))
+    assert course.node_ids == ("a",)
+    with pytest.raises(ScenarioError, match="no vehicle is there for 1 s of 10 s from 0 s"):
+        drive(trip([4, 4.8], [0, 1]))
+    with pytest.raises(ScenarioError, match="no vehicle is there"):
+        drive(trip([50, 60], [0, 1]))
+    assert drive(trip([0, 10], [0, 10]), seconds=0.4).node_ids == ("a",), "a short run is as long as it is"
+
+
+def test_a_disc_is_entered_and_left_and_short_excursions_do_not_count() -> None:
+    through = trip(np.arange(41), -200 + 10 * np.arange(41))
+    course = drive(through, seconds=40, disc=(0.0, 0.0, 100.0))
+    assert there(course) == (10.0, 30.0)
+    time_s = np.arange(0, 40.1, 0.1)
+    out_and_back = trip(time_s, np.where(np.abs(time_s - 20) < 4, 110.0 - np.abs(time_s - 20) * 5, 90.0))
+    assert there(drive(out_and_back, seconds=40, disc=(0.0, 0.0, 100.0))) == (0.0, 40.0)
+    with pytest.raises(ScenarioError, match="no vehicle is there within the disc"):
+        drive(through, seconds=40, disc=(0.0, 900.0, 100.0))
+
+
+def test_what_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulator.world.trips.course.MOST_STATES", 150)
+    with pytest.raises(ScenarioError, match="2 vehicles for 101 periods: at most 150 states; set max_vehicles"):
+        drive(trip([0, 10], [0, 10]), trip([0, 10], [0, 10], name="b"))
+
+
+# Headings.
+
+
+def test_headings_are_those_of_the_way_and_a_stand_keeps_the_last() -> None:
+    """East for 5 s, a stand of 5 s with a receiver that drifts, north for 5 s."""
+    time_s = np.arange(0, 15, 0.1)
+    drift = np.random.default_rng(1).normal(0, 0.01, (2, len(time_s))) * ((time_s > 5) & (time_s < 10))
+    x_m = 10 * np.minimum(time_s, 5) + drift[0]
+    y_m = 10 * np.maximum(time_s - 10, 0) + drift[1]
+    heading = drive(trip(time_s, x_m, y_m), seconds=14.9).heading_rad[:, 0]
+    assert heading[:45] == pytest.approx(np.zeros(45), abs=1e-9)
+    assert heading[105:149] == pytest.approx(np.full(44, math.pi / 2), abs=1e-9)
+    assert len(np.unique(heading[56:95])) == 1, "it stands"
+    assert math.cos(heading[60]) > 0.99, "and looks where it drove last"
+
+
+def test_before_it_ever_moves_a_vehicle_looks_where_it_will_drive_and_one_that_never_does_nowhere() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    waits = trip(time_s, 0.0, -10 * np.maximum(time_s - 5, 0), name="waits")
+    course = drive(waits, trip(time_s, 0.01 * np.sin(time_s), name="parked"), seconds=9.9)
+    assert course.heading_rad[:99, 0] == pytest.approx(np.full(99, 1.5 * math.pi), abs=1e-9)
+    assert np.isnan(course.heading_rad[:, 1]).all()
+
+
+def test_given_headings_are_taken_and_go_the_short_way_round() -> None:
+    turning = trip([0, 1, 2], [0, 0, 0], heading_rad=np.array([6.2, 0.1, 0.3]))
+    heading = drive(turning, seconds=2.0).heading_rad[:20, 0]
+    assert heading[0] == pytest.approx(6.2) and heading[10] == pytest.approx(0.1)
+    assert heading[5] == pytest.approx((6.2 + 0.1 + 2 * math.pi) / 2 % (2 * math.pi))
+
+
+def test_a_given_speed_says_who_stands() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    crawling = {"x_m": 0.4 * time_s, "y_m": 0.0 * time_s}
+    stands = drive(trip(time_s, **crawling), seconds=9.9).heading_rad[:99, 0]
+    drives = drive(trip(time_s, **crawling, speed_mps=np.full(100, 0.6)), seconds=9.9).heading_rad[:99, 0]
+    assert np.isnan(stands).all() and drives == pytest.approx(np.zeros(99))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0, 2 * math.pi), st.floats(1, 40), st.integers(0, 30), st.integers(40, 90))
+def test_a_straight_drive_is_straight_wherever_its_samples_are(
+    heading: float, speed_mps: float, first: int, last: int
+) -> None:
+    rng = np.random.default_rng(first)
+    time_s = np.sort(np.concatenate([[first / 10, last / 10], rng.uniform(first / 10, last / 10, 20)]))
+    assume((np.diff(time_s) > 1e-6).all())
+    course = drive(trip(time_s, speed_mps * time_s * math.cos(heading), speed_mps * time_s * math.sin(heading)))
+    assert there(course) == (first / 10, last / 10)
+    at_s = np.arange(first, last + 1) / 10
+    along = np.hypot(*course.position_m[first : last + 1, 0].T)
+    assert along == pytest.approx(speed_mps * at_s, abs=1e-6)
+    difference = np.angle(np.exp(1j * (course.heading_rad[first : last + 1, 0] - heading)))
+    assert np.abs(difference).max() < 1e-6

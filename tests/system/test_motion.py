@@ -1,0 +1,94 @@
+"""Vehicles that drive in whole runs: five of them, of which one enters late and one leaves early."""
+
+import re
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from tests.emulator.motion import along, still, write_trips
+from tests.system.conftest import AGENT, ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
+
+PROGRAM = "tests.emulator.fault_programs:minds_the_order"
+VEHICLES = {
+    "v1": [(0, 4, along(0, 10))],
+    "v2": [(0, 4, still(0, 50))],
+    "v3": [(0, 4, along(80, -10, 10))],
+    "v4": [(1.2, 4, along(-30, 10, 20))],  # enters
+    "v5": [(0, 2, still(100, 20))],  # leaves
+}
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> str:
+    write_trips(tmp_path / "trips.csv", VEHICLES)
+    data: dict[str, Any] = {
+        "run": {"name": "driving", "duration_s": 3.5, "settle_s": 0.5},
+        "network": {"kind": "trips", "path": "trips.csv", "longest_gap_s": 1.0},
+        "world": {"gnss": {"rate_hz": 5}},
+        "radio": {"loss": 0.1},
+        "program": {"entry": PROGRAM},
+    }
+    path = tmp_path / "driving.toml"
+    path.write_text(tomli_w.dumps(data))
+    return str(path)
+
+
+def comings_and_goings(run: Finished) -> list[tuple[str, str, int]]:
+    events = [*run.events_of("entered"), *run.events_of("left")]
+    return [(event["kind"], event["node"], event["time_ns"]) for event in events]
+
+
+def test_processes_that_come_and_go_do_the_same_as_their_simulation(vnet: Vnet, scenario: str) -> None:
+    live, simulated = vnet("run", scenario), vnet("simulate", scenario)
+    for run in (live, simulated):
+        assert run.status == 0, run.stderr + run.stdout
+        assert comings_and_goings(run) == [("entered", "v4", 1_200_000_000), ("left", "v5", 2_200_000_000)]
+    assert live.fingerprint == simulated.fingerprint
+    assert not running_agents(live.folder)
+    again = vnet("run", str(live.folder / "scenario.toml"))
+    assert again.fingerprint == live.fingerprint
+
+
+def test_with_faults_as_well(vnet: Vnet, scenario: str) -> None:
+    kill = '[[fault]]\nkind = "kill"\nat_s = 0.9\nduration_s = 0.7\nnodes = { ids = ["v4", "v2"] }\n'
+    Path(scenario).write_text(Path(scenario).read_text() + kill)
+    live, simulated = (vnet(command, scenario) for command in ("run", "simulate"))
+    assert live.status == simulated.status == 0, live.stderr + live.stdout
+    assert live.fingerprint == simulated.fingerprint
+    assert ("entered", "v4", 1_600_000_000) in comings_and_goings(live)
+
+
+def test_on_the_wall_clock_vehicles_come_and_go_as_well(vnet: Vnet, scenario: str) -> None:
+    run = vnet("run", scenario, "--pacing", "realtime")
+    assert run.status in (0, 3), run.stderr + run.stdout  # the machine may not keep up
+    assert not [check for check in run.verdict["checks"] if check["verdict"] == "invalid"]
+    left = [event for event in comings_and_goings(run) if event[0] == "left"]
+    assert left == [("left", "v5", 2_200_000_000)]
+    assert not running_agents(run.folder)
+
+
+def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str, tmp_path: Path) -> None:
+    folder = tmp_path / "by hand"
+    command = [*VNET, "emulator", scenario, "--out", str(folder), "--listen", "tcp/127.0.0.1:0"]
+    with ExitStack() as stack:
+        emulator = stack.enter_context(
+            subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        )
+        stack.callback(emulator.kill)
+        assert emulator.stderr is not None
+        found = next(filter(None, (re.search(r"at (tcp\S+); waiting for 4", line) for line in emulator.stderr)))
+        agents = {}
+        for node in VEHICLES:
+            credentials = folder / "access" / "credentials" / f"{node}.json"
+            agent = [*AGENT, "--connect", found[1], "--run", "driving", "--node", node]
+            agent += ["--credentials", str(credentials)]
+            agents[node] = stack.enter_context(subprocess.Popen(agent, cwd=ROOT))
+        stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
+        by_hand = Finished(emulator.returncode, stdout, stderr, folder)
+        assert {node: agent.wait(TIMEOUT_S) for node, agent in agents.items()} == dict.fromkeys(VEHICLES, 0)
+    assert by_hand.status == 0, stderr + stdout
+    assert by_hand.fingerprint == vnet("simulate", scenario).fingerprint
