@@ -17,11 +17,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.arrivals import NEVER_NS, Arrivals, Deliveries, Delivery
 from emulator.channel.csma import Csma
 from emulator.channel.frames import Frame, Pairs, Stage
+from emulator.channel.medium import WINDOW_NS
 from emulator.channel.outcomes import Outcome
 from emulator.channel.queue import Access, TransmitQueue
 from emulator.channel.reach import reach_of
@@ -192,8 +194,9 @@ class Engine:
         cause: NDArray[np.int16] | np.int16,
     ) -> None:
         """The pairs of frame `place` and `receiver`, (n,) each, as rows of the trace and perhaps in flight."""
-        named = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns")
+        named = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
         columns = {name: np.array([getattr(frame, name) for frame in frames])[place] for name in named}
+        columns["left_ns"] = columns.pop("end_ns")
         first = self._trace.append(
             len(place),
             receiver=receiver,
@@ -264,6 +267,32 @@ class Engine:
         self._counts[Outcome.receiver_down] += len(row) - heard
         self._counts[Outcome.pending] -= len(row)
         return self._arrivals.deliveries(table[:, up], self._trace)
+
+    def busy_ratios(self, time_ns: int) -> list[NDArray[np.float64]]:
+        """How busy each vehicle found the medium, (N,) each, in all windows that are over by `time_ns`.
+
+        Nothing handed over from now on may be sent before that. None where senders share no medium.
+        """
+        if self._csma is None:
+            return []
+        self._csma.run(time_ns)
+        self._csma.medium.count(time_ns)
+        return self._csma.medium.windows[: time_ns // WINDOW_NS]
+
+    def busy_table(self, time_ns: int) -> pa.Table | None:
+        """The same as a table, a row for each window and vehicle; None where senders share no medium."""
+        if self._csma is None:
+            return None
+        ratios = np.array(self.busy_ratios(time_ns)).reshape(-1, len(self._node_ids))
+        windows, count = ratios.shape
+        node = pa.array(np.tile(np.arange(count, dtype=np.int32), windows))
+        return pa.table(
+            {
+                "time_ns": pa.array(np.repeat(np.arange(windows, dtype=np.int64) * WINDOW_NS, count)),
+                "node": pa.DictionaryArray.from_arrays(node, pa.array(self._node_ids, pa.string())),
+                "busy_ratio": pa.array(ratios.ravel()),
+            }
+        )
 
     def lose(self, delivery: Delivery) -> None:
         """A delivery that never reached its process (real time only); once for each."""

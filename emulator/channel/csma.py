@@ -30,6 +30,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
+from typing import NamedTuple
 
 from emulator.channel.congestion import Gate, gate_of
 from emulator.channel.dot11p import AIFSN_AND_CW, DETECTION_NS, SIFS_NS, SLOT_NS, airtime_ns
@@ -77,12 +78,24 @@ class _Station:
         return self.from_ns + self.slots * SLOT_NS
 
 
+class Times(NamedTuple):
+    """Of an access category: how long the medium must be idle (ns), and the largest backoff (slots)."""
+
+    aifs: int
+    window: int
+
+
+def times_ns(mac: Mac) -> Times:
+    """The times of the access category that a scenario chooses."""
+    aifsn, window = AIFSN_AND_CW[mac.access_category]
+    return Times(SIFS_NS + aifsn * SLOT_NS, window)
+
+
 class Csma:
     """Access to one medium that all `count` vehicles share; see the module's text."""
 
     def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int) -> None:
-        aifsn, self._window = AIFSN_AND_CW[mac.access_category]
-        self._aifs_ns = SIFS_NS + aifsn * SLOT_NS
+        self._aifs_ns, self._window = times_ns(mac)
         self._signals = signals
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._bitrate_mbps = radio.bitrate_mbps

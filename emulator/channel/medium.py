@@ -103,7 +103,9 @@ class Medium:
         self._total_mw, self.sensed = total_mw, sensed
 
     def count(self, time_ns: int) -> None:
-        """Add up for how long the medium has been busy, until `time_ns`, which is no earlier than the last."""
+        """Add up for how long the medium has been busy, until `time_ns`."""
+        if time_ns <= self._counted_ns:
+            return
         while time_ns - len(self.windows) * WINDOW_NS >= WINDOW_NS:
             self._count((len(self.windows) + 1) * WINDOW_NS)
             self.windows.append(self._busy_for_ns / WINDOW_NS)

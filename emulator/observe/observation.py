@@ -183,7 +183,7 @@ def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> d
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
     bins = np.minimum((delivered["arrival_ns"] - delivered["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1)
-    sent = _one_each(rows[(start_ns <= rows["sent_ns"]) & (rows["sent_ns"] < end_ns)])
+    sent = _one_each(rows[(start_ns <= rows["left_ns"]) & (rows["left_ns"] < end_ns)])
     return {
         "pairs": pairs.astype("<i4").tobytes(),
         "outcomes": {Outcome(kind).name: number for kind, number in enumerate(outcomes) if number},

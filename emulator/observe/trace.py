@@ -38,20 +38,21 @@ ROW = np.dtype(
         ("arrival_ns", "<i8"),
         ("copy", "<i2"),
         ("on_air_ns", "<i8"),
+        ("left_ns", "<i8"),
     ]
 )
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
 def decided_ns(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """When each of these records of type `ROW` is decided: as it arrives, or as it is sent if it does not."""
-    return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["sent_ns"], rows["arrival_ns"]))
+    """When each of these records of type `ROW` is decided: as it arrives, or else as it leaves its sender."""
+    return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["left_ns"], rows["arrival_ns"]))
 
 
 class Trace:
     """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
-    `knows_air` says that frames have a time at which they went on air.
+    `knows_air` says that frames have times at which they went on air and left it; else they leave as they are sent.
     """
 
     def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
@@ -78,6 +79,8 @@ class Trace:
         rows = self._rows[first:end]
         for name, values in columns.items():
             rows[name] = values
+        if not self._knows_air:
+            rows["left_ns"] = rows["sent_ns"]
         rows["cause"] -= NO_CAUSE
         rows["arrival_ns"][rows["outcome"] != Outcome.pending] = NOT_ARRIVING
         self._count = end
@@ -104,7 +107,8 @@ class Trace:
     def to_table(self) -> pa.Table:
         """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
 
-        Where senders share the air there is a last column, `on_air_ns`: when a frame began, null if it never did.
+        Where senders share the air there are two columns more: `on_air_ns`, when a frame's transmission began (null
+        if it never did), and `left_ns`, when it ended, or the frame was given up.
         """
         rows = self._rows[: self._count]
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -130,7 +134,7 @@ class Trace:
                 "cause": named("cause", self._causes).cast(pa.string()),
                 "arrival_ns": arrival,
                 "copy": pa.array(rows["copy"]),
-                **({"on_air_ns": on_air} if self._knows_air else {}),
+                **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
             }
         )
 

@@ -43,7 +43,10 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     folder.put("trace.parquet", lambda path: pq.write_table(trace, path, compression="zstd"))
     folder.put("states.parquet", lambda path: pq.write_table(states, path, compression="zstd"))
     folder.put("metrics.parquet", lambda path: pq.write_table(metrics, path, compression="zstd"))
-    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events))
+    busy = emulation.engine.busy_table(emulation.emulated_ns)
+    if busy is not None:
+        folder.put("busy.parquet", lambda path: pq.write_table(busy, path, compression="zstd"))
+    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
     verdict = {
         "format": FORMAT,
         **_judged(judgement),

@@ -332,6 +332,7 @@ class Emulation:
         What arrives in them, whether or not anybody waits for it, has arrived by then: `advance` hands it out.
         """
         while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
+            self.engine.look_ahead(end_ns, ())
             self._arrived += self.engine.advance(end_ns - 1)
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))

@@ -45,6 +45,7 @@ from emulator.observe.checks.faults import (
     check_pause_respected,
 )
 from emulator.observe.checks.latency import check_latency
+from emulator.observe.checks.radio import check_fading, check_medium
 from emulator.observe.checks.replay import ONCE, check_replay
 from emulator.observe.checks.senders import check_copies, check_gnss
 from emulator.observe.checks.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
@@ -70,6 +71,8 @@ Checks = Callable[[Evidence], Iterable[Finding]]
 OF_THE_RADIO: tuple[Check, ...] = (check_conservation, check_range, check_peer_cap, check_loss_rate)
 """These need to know where the vehicles are; so do those of the other tuples but the last."""
 OF_FRAMES: tuple[Check, ...] = (
+    check_fading,
+    check_medium,
     check_latency,
     check_isolation,
     check_causes,
@@ -166,10 +169,12 @@ def check_run(folder: Path) -> Judgement:
         trace = read_trace(folder / "trace.parquet")
         states = pq.read_table(folder / "states.parquet")
         metrics = pq.read_table(folder / "metrics.parquet")
+        busy = pq.read_table(folder / "busy.parquet") if (folder / "busy.parquet").exists() else None
     except (OSError, pa.ArrowInvalid, ValueError) as error:
         raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
     recorded = recorded_verdict(folder)["trace_sha256"]
-    judgement = judge(Evidence(load_scenario(folder / "scenario.toml"), trace, states, metrics, events))
+    scenario = load_scenario(folder / "scenario.toml")
+    judgement = judge(Evidence(scenario, trace, states, metrics, events, busy=busy))
     judgement.put(check_replay(folder))
     if judgement.trace_sha256 != recorded:
         text = f"the trace is not the one that verdict.json speaks of ({recorded[:12]}…)"

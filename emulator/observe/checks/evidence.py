@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.channel.dot11p import airtimes_ns
 from emulator.channel.reach import reach_of
 from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
@@ -32,6 +33,8 @@ NEVER_NS = np.iinfo(np.int64).max
 REALTIME_GUARD_NS = 50_000_000
 """In real time nobody can say on which side of a fault's start or end a frame was that close to it."""
 ARRIVED = ("delivered", "receiver_down", "transport")
+ON_AIR = ("lost", "faded", "collided", *ARRIVED)
+"""What becomes of pairs that come as far as the radio."""
 ENDINGS = ("died", "crashed", "finished", "spun")
 
 
@@ -60,6 +63,8 @@ class Evidence:
     events: Sequence[Event]
     known_m: Array | None = None
     """True positions (periods, N, 2), where the states have not got them all."""
+    busy: pa.Table | None = None
+    """How busy each vehicle found the medium, where they share one."""
 
     # Nodes and where they are.
 
@@ -126,6 +131,21 @@ class Evidence:
     def arrival_ns(self) -> Whole:
         """When it arrived; -1 where it did not."""
         return self.column("arrival_ns")
+
+    @cached_property
+    def shares_air(self) -> bool:
+        """Whether the trace tells when frames were on air."""
+        return "on_air_ns" in self.trace.column_names
+
+    @cached_property
+    def on_air_ns(self) -> Whole:
+        """When its transmission began; -1 where it never did."""
+        return self.column("on_air_ns")
+
+    @cached_property
+    def airtime_ns(self) -> Whole:
+        """How long its transmission takes, but for throttles."""
+        return airtimes_ns(self.scenario.radio, self.column("size_bytes"))
 
     @cached_property
     def seq(self) -> Whole:
