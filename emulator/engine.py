@@ -15,6 +15,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pyarrow as pa
@@ -47,6 +48,10 @@ from emulator.observe.trace import Trace
 from vnet.scenario import Radio
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
+
+_COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
+_OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
+"""What a frame has for these columns of the trace."""
 
 
 class Engine:
@@ -132,10 +137,11 @@ class Engine:
         for payload in payloads:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
+            if not self._senders.misbehave:
+                self._hand_over(time_ns, node, Outgoing(payload, seq))
+                continue
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
                 self._hand_over(time_ns, node, outgoing)
-                if self._links.effects.copying:  # its copies are numbered before the next frame's
-                    self._settle()
 
     def _hand_over(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
         frame = Frame(
@@ -156,6 +162,8 @@ class Engine:
             self._access.sent.append(frame)
         else:
             self._access.hand_over(frame)
+        if frame.effects.copying:  # its copies are numbered before the next frame's
+            self._settle()
 
     # What has been sent.
 
@@ -194,9 +202,7 @@ class Engine:
         cause: NDArray[np.int16] | np.int16,
     ) -> None:
         """The pairs of frame `place` and `receiver`, (n,) each, as rows of the trace and perhaps in flight."""
-        named = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
-        columns = {name: np.array([getattr(frame, name) for frame in frames])[place] for name in named}
-        columns["left_ns"] = columns.pop("end_ns")
+        columns = np.array([_OF_FRAME(frame) for frame in frames], np.int64)[place].T
         first = self._trace.append(
             len(place),
             receiver=receiver,
@@ -204,10 +210,10 @@ class Engine:
             outcome=outcome,
             cause=cause,
             arrival_ns=arrival_ns,
-            **columns,
+            **dict(zip(_COLUMNS, columns, strict=True)),
         )
-        for kind, number in enumerate(np.bincount(outcome).tolist()):
-            self._counts[Outcome(kind)] += number
+        for kind in Outcome:
+            self._counts[kind] += int(np.count_nonzero(outcome == kind))
         flying = np.flatnonzero(outcome == Outcome.pending)
         self._arrivals.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
 

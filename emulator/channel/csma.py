@@ -39,7 +39,7 @@ from emulator.channel.medium import Medium
 from emulator.channel.outcomes import Outcome
 from emulator.channel.queue import Throttle
 from emulator.channel.reception import Threshold, milliwatts
-from emulator.channel.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals
+from emulator.channel.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
 from vnet.radio import Mac, Receiver
 from vnet.scenario import Radio
 
@@ -120,8 +120,8 @@ class Csma:
         station = self._stations.get(frame.sender)
         if station is None:
             station = self._stations[frame.sender] = _Station(frame.sender)
-        frame.signal = signal = self._signals.of(frame)
-        ready_ns = frame.sent_ns + int(self._jitter_ns * signal.luck[frame.sender, JITTER])
+        frame.signal = self._signals.of(frame)
+        ready_ns = frame.sent_ns + int(self._jitter_ns * sender_draw(frame, JITTER))
         if self._throttle.slows(frame.sender):
             slow_ns = self._throttle.put(frame, ready_ns, self._limit)
             if slow_ns is None:
@@ -143,8 +143,9 @@ class Csma:
         station.plans += 1
         if kind == ACCESS:
             station.access = station.plans
-        # What was sent over a network may come a little after its time.
-        heappush(self._instants, (max(time_ns, self._now_ns), kind, station.node, station.plans, frame))
+        if time_ns < self._now_ns:  # what was sent over a network may come a little after its time
+            time_ns = self._now_ns
+        heappush(self._instants, (time_ns, kind, station.node, station.plans, frame))
 
     def next_ns(self) -> int | None:
         """When something happens next."""
@@ -218,8 +219,7 @@ class Csma:
             self._plan(station.from_ns, ACCESS, station)
 
     def _draw(self, frame: Frame, which: int) -> int:
-        assert frame.signal is not None
-        return int(frame.signal.luck[frame.sender, which] * (self._window + 1))
+        return int(sender_draw(frame, which) * (self._window + 1))
 
     def _begin(self, station: _Station, now_ns: int) -> None:
         """A frame goes on air."""
@@ -249,10 +249,11 @@ class Csma:
     def _look(self, now_ns: int) -> None:
         """Every station whose backoff counts looks whether the medium is still what it was."""
         over = []
+        sensed = self.medium.sensed
         for station in self._counting.values():
-            busy = self.medium.is_sensed(station.node)
+            busy = sensed is not None and bool(sensed[station.node])
             if busy == station.busy:
-                if not (busy or station.wants) and station.access_ns <= now_ns:
+                if not busy and not station.wants and station.from_ns + station.slots * SLOT_NS <= now_ns:
                     over.append(station.node)
                 continue
             station.busy = busy

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
@@ -69,6 +71,21 @@ def cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:
     A frame arrives with probability exp(-cost · time). The bit error rates are those of the NIST model (Pei and
     Henderson 2010): union bounds of the Viterbi decoder with hard decisions.
     """
+    costs = np.zeros(snr.shape, np.int64)
+    costly = snr < _free_snr(bitrate_mbps)
+    if costly.any():
+        costs[costly] = _cost(snr[costly], bitrate_mbps)
+    return costs
+
+
+@lru_cache
+def _free_snr(bitrate_mbps: float) -> float:
+    """From which ratio on a nanosecond costs nothing, in whole steps."""
+    ratios = 10 ** (np.arange(-10, 60, 0.125) / 10)
+    return float(ratios[np.flatnonzero(_cost(ratios, bitrate_mbps))[-1] + 1])
+
+
+def _cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:
     bits, numerator, denominator = _MODES[bitrate_mbps]
     raw = _raw_error_rate(snr, bits)
     first, step, weights = _EVENTS[numerator, denominator]

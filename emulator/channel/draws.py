@@ -30,13 +30,21 @@ class Draws:
 
     def uniform(self, sender: int, seq: int, count: int, copy: int = 0) -> NDArray[np.float64]:
         """`count` draws in [0, 1) for one frame, or a copy of it, to be indexed by receiver number."""
+        self._go_to(sender, seq, copy)
+        return self._generator.random(count)
+
+    def words(self, sender: int, seq: int, count: int, copy: int = 0) -> NDArray[np.uint64]:
+        """The same as words of 64 random bits, of which several draws can be made."""
+        self._go_to(sender, seq, copy)
+        return np.asarray(self._bits.random_raw(count))
+
+    def _go_to(self, sender: int, seq: int, copy: int) -> None:
         # Setting the counter of one generator is four times as fast as making one for each frame.
         counter, state = self._counter, self._state
         counter[0], counter[1], counter[2], counter[3] = 0, seq, sender, copy
         state["buffer_pos"] = 4
         state["has_uint32"] = 0
         self._bits.state = state
-        return self._generator.random(count)
 
     def of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
         """(K, count): the draws of each frame."""

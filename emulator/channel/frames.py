@@ -28,14 +28,14 @@ NOT_ON_AIR = -1
 class Signal:
     """A frame as it arrives at the receivers, (N,) each; at its own sender, with the power that it was sent with.
 
-    `luck` (N, 3) are draws in [0, 1): of the fading, of the reception, and of the latency. Those at the sender,
-    which receives nothing, are of its access to the medium. `power_mw` is 0 where the sender is out of range.
+    `luck` are words of 64 random bits, of which the draws are made that decide about the frame. `power_mw` is 0 where
+    the sender is out of range.
 
     `locked` is where a receiver has set itself on this frame, or None where nothing kept it from doing so.
     `pieces` are the times until which the sum of all powers on air was so much (N,); none if it was alone.
     """
 
-    luck: NDArray[np.float64]
+    luck: NDArray[np.uint64]
     power_mw: NDArray[np.float64]
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)

@@ -34,6 +34,7 @@ class Medium:
         self.busy_ns = np.full(count, LONG_AGO_NS)
         self.idle_ns = np.full(count, LONG_AGO_NS)
         self._counted_ns = 0
+        self._window_ends_ns = WINDOW_NS
         self._busy_for_ns = np.zeros(count, np.int64)
         self.windows: list[Array] = []
         """The channel busy ratios (N,) of the windows that are over."""
@@ -104,13 +105,13 @@ class Medium:
 
     def count(self, time_ns: int) -> None:
         """Add up for how long the medium has been busy, until `time_ns`."""
-        if time_ns <= self._counted_ns:
-            return
-        while time_ns - len(self.windows) * WINDOW_NS >= WINDOW_NS:
-            self._count((len(self.windows) + 1) * WINDOW_NS)
+        while time_ns >= self._window_ends_ns:
+            self._count(self._window_ends_ns)
             self.windows.append(self._busy_for_ns / WINDOW_NS)
             self._busy_for_ns[:] = 0
-        self._count(time_ns)
+            self._window_ends_ns += WINDOW_NS
+        if time_ns > self._counted_ns:
+            self._count(time_ns)
 
     def _count(self, time_ns: int) -> None:
         if self.sensed is not None:

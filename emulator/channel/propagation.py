@@ -114,21 +114,21 @@ def _quantiles(m: float) -> Array:
 class Nakagami:
     """Fading: the factor that a frame's power has at a receiver is gamma distributed, of shape m and mean one.
 
-    Nakagami 1960. Draws become factors by a table of quantiles at the middles of equally likely steps, so that no
-    factor is above the one of a probability of 1 in 2¹⁷ (11.9 dB with m = 0.75).
+    Nakagami 1960. Factors are those of a table of quantiles, at the middles of `QUANTILES` equally likely steps, so
+    that none is above the one of a probability of 1 in 2¹⁷ (11.6 dB with m = 0.75).
     """
 
     def __init__(self, fading: Fading | None) -> None:
         self._until_m = np.array(fading.until_m if fading is not None else ())
         self._factor = np.concatenate([_quantiles(m) for m in fading.m]) if fading is not None else np.ones(1)
 
-    def shape(self, distance_m: Array) -> NDArray[np.int64]:
+    def shape(self, distance_m: Array) -> NDArray[np.uint64]:
         """Which shape belongs to distances, as `factor` wants it."""
-        return np.searchsorted(self._until_m, distance_m).astype(np.int64) * QUANTILES
+        return np.searchsorted(self._until_m, distance_m).astype(np.uint64) * np.uint64(QUANTILES)
 
-    def factor(self, shape: NDArray[np.int64], draws: Array) -> Array:
-        """The factors of pairs by their shapes and draws in [0, 1)."""
+    def factor(self, shape: NDArray[np.uint64], step: NDArray[np.uint64]) -> Array:
+        """The factors of pairs by their shapes and the numbers of their steps."""
         if len(self._factor) == 1:
-            return np.ones_like(draws)
-        factor: Array = self._factor[(draws * QUANTILES).astype(np.int64) + shape]
+            return np.ones(step.shape)
+        factor: Array = self._factor[step + shape]
         return factor

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from emulator.channel.dot11p import COST_STEPS, PREAMBLE_NS, airtime_ns, cost
 from emulator.channel.frames import Frame, Pairs, Signal
 from emulator.channel.outcomes import Outcome
-from emulator.channel.signals import RECEPTION, Signals
+from emulator.channel.signals import Signals, reception_draws
 from vnet.radio import Receiver
 from vnet.roads.lanes import Array
 from vnet.scenario import Radio
@@ -55,18 +55,20 @@ class Reception:
         if not sent:
             return
         signals = [self._signal(frames[place]) for place in sent]
-        power_mw = np.stack([signal.power_mw for signal in signals])
-        # -ln(1 - draw): a frame arrives if what its time costs is less.
-        limit = -np.log1p(-np.stack([signal.luck[:, RECEPTION] for signal in signals])) * COST_STEPS
-        payload_ns = [airtime_ns(frames[place].size_bytes, self._bitrate_mbps) - PREAMBLE_NS for place in sent]
-        spent = self._cost(power_mw / self._threshold.noise_mw) * np.array(payload_ns)[:, None]
-        alone = (power_mw >= self._threshold.alone_mw) & (spent < limit)
+        power_mw = np.array([signal.power_mw for signal in signals])
+        # A frame arrives if what its time costs is less.
+        limit = -np.log(reception_draws(np.array([signal.luck for signal in signals]))) * COST_STEPS
+        on_air_ns = np.array([airtime_ns(frames[place].size_bytes, self._bitrate_mbps) for place in sent])
+        heard = power_mw >= self._threshold.alone_mw
+        snr = power_mw[heard] / self._threshold.noise_mw
+        alone = heard.copy()
+        alone[heard] = self._cost(snr) * (on_air_ns - PREAMBLE_NS)[np.nonzero(heard)[0]] < limit[heard]
         faded, collided = np.zeros_like(pairs.outcome, bool), np.zeros_like(pairs.outcome, bool)
         faded[sent] = ~alone
-        for number in [number for number, signal in enumerate(signals) if signal.pieces]:
-            frame, signal = frames[sent[number]], signals[number]
-            assert signal.locked is not None
-            collided[sent[number]] = ~(signal.locked & (self._among_others(frame, signal) < limit[number]))
+        met = [number for number, signal in enumerate(signals) if signal.pieces]
+        if met:
+            at = [sent[number] for number in met]
+            collided[at] = ~self._survive([frames[place] for place in at], alone[met], limit[met])
         pairs.decide(faded, Outcome.faded)
         pairs.decide(collided, Outcome.collided)
 
@@ -78,10 +80,31 @@ class Reception:
     def _cost(self, snr: Array) -> NDArray[np.int64]:
         return cost(snr, self._bitrate_mbps)
 
-    def _among_others(self, frame: Frame, signal: Signal) -> NDArray[np.int64]:
-        """(N,) what a frame's payload costs with the interference that it met."""
-        edges_ns = np.array([frame.on_air_ns, *(until_ns for until_ns, _ in signal.pieces)])
-        lengths_ns = np.diff(np.maximum(edges_ns, frame.on_air_ns + PREAMBLE_NS))
-        others_mw = np.stack([total_mw for _, total_mw in signal.pieces]) - signal.power_mw
-        snr = signal.power_mw / (self._threshold.noise_mw + np.maximum(others_mw, 0.0))
-        return np.asarray((self._cost(snr) * lengths_ns[:, None]).sum(axis=0))
+    def _survive(self, frames: Sequence[Frame], alone: NDArray[np.bool_], limit: Array) -> NDArray[np.bool_]:
+        """(M, N), where frames arrive with the interference that they met, of those that arrive `alone`."""
+        hopes = []
+        for number, frame in enumerate(frames):
+            signal = self._signal(frame)
+            assert signal.locked is not None
+            hopes.append(np.flatnonzero(alone[number] & signal.locked))
+        ratios = [self._ratios(self._signal(frame), hopeful) for frame, hopeful in zip(frames, hopes, strict=True)]
+        costs = self._cost(np.concatenate([ratio.ravel() for ratio in ratios]))
+        survives = np.zeros_like(alone)
+        ends = np.cumsum([ratio.size for ratio in ratios])[:-1]
+        for number, some in enumerate(np.split(costs, ends)):
+            spent = _lengths_ns(frames[number]) @ some.reshape(ratios[number].shape)
+            survives[number, hopes[number]] = spent < limit[number, hopes[number]]
+        return survives
+
+    def _ratios(self, signal: Signal, at: NDArray[np.intp]) -> Array:
+        """(P, n) signal to noise and interference in each piece of a frame's time, at these receivers."""
+        power_mw = signal.power_mw[at]
+        others_mw = np.array([total_mw[at] for _, total_mw in signal.pieces]) - power_mw
+        return np.asarray(power_mw / (self._threshold.noise_mw + np.maximum(others_mw, 0.0)))
+
+
+def _lengths_ns(frame: Frame) -> NDArray[np.int64]:
+    """(P,), how much of a frame's payload lies in each piece of its time."""
+    assert frame.signal is not None
+    edges_ns = np.array([frame.on_air_ns, *(until_ns for until_ns, _ in frame.signal.pieces)])
+    return np.asarray(np.diff(np.maximum(edges_ns, frame.on_air_ns + PREAMBLE_NS)))

@@ -1,16 +1,45 @@
-"""From a frame to the powers with which it arrives."""
+"""From a frame to the powers with which it arrives, and all the luck that it has at its receivers.
+
+A frame has one word of 64 random bits a receiver: 16 are of its fading, 16 of its latency, and 32 of the reception.
+The word at its sender, which receives nothing, is of its access to the medium.
+"""
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator.channel.draws import Draws
 from emulator.channel.frames import Frame, Signal
-from emulator.channel.propagation import Nakagami
+from emulator.channel.propagation import QUANTILES, Nakagami
 from vnet.radio import Fading
+from vnet.roads.lanes import Array
 
-FADING, RECEPTION, LATENCY = range(3)
-"""What the three draws of a signal at a receiver are for."""
-JITTER, BACKOFF, NEXT_BACKOFF = range(3)
-"""And those at its sender, which receives nothing: when it gets to the medium, and how long it backs off."""
+Words = NDArray[np.uint64]
+
+JITTER, BACKOFF, NEXT_BACKOFF = 0, 16, 32
+"""The lowest of the 16 bits of a sender's word each: when a frame gets to the medium, how long it backs off."""
+_STEPS = 1 << 16
+_LAST = np.uint64(_STEPS - 1)
+_LATENCY, _RECEPTION = np.uint64(16), np.uint64(32)
+
+assert QUANTILES == _STEPS
+
+
+def latency_draws(luck: Words) -> Array:
+    """Draws in [0, 1)."""
+    return np.asarray((luck >> _LATENCY & _LAST) / _STEPS)
+
+
+def reception_draws(luck: Words) -> Array:
+    """Draws in (0, 1)."""
+    return np.asarray(((luck >> _RECEPTION) + 0.5) / (1 << 32))
+
+
+def sender_draw(frame: Frame, which: int) -> float:
+    """One of a sender's draws, in [0, 1)."""
+    assert frame.signal is not None
+    return (int(frame.signal.luck[frame.sender]) >> which & _STEPS - 1) / _STEPS
 
 
 class Signals:
@@ -23,10 +52,11 @@ class Signals:
 
     def of(self, frame: Frame) -> Signal:
         """The signal of one frame."""
-        luck = self._draws.uniform(frame.sender, frame.seq, 3 * self._count, frame.draw).reshape(-1, 3)
+        luck = self._draws.words(frame.sender, frame.seq, self._count, frame.draw)
         surroundings, sender = frame.surroundings, frame.sender
         assert surroundings.power_mw is not None
         assert surroundings.fading is not None
-        factor = self.nakagami.factor(surroundings.fading[sender], luck[:, FADING])
-        factor[sender] = 1.0
-        return Signal(luck, surroundings.power_mw[sender] * factor)
+        mean_mw = surroundings.power_mw[sender]
+        power_mw = mean_mw * self.nakagami.factor(surroundings.fading[sender], luck & _LAST)
+        power_mw[sender] = mean_mw[sender]
+        return Signal(luck, power_mw)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from emulator.channel.draws import Draws
 from emulator.channel.frames import NS_PER_MS, Frame, Pairs
 from emulator.channel.outcomes import Outcome
-from emulator.channel.signals import LATENCY
+from emulator.channel.signals import latency_draws
 from vnet.scenario import Radio
 
 MIN_LATENCY_NS = 1_000
@@ -100,4 +100,5 @@ class Latency:
         """(K, count), those of the signals where frames have one."""
         if all(frame.signal is None for frame in frames):
             return self._draws.of(frames, count)
-        return np.stack([np.zeros(count) if f.signal is None else f.signal.luck[:, LATENCY] for f in frames])
+        nothing = np.zeros(count, np.uint64)
+        return latency_draws(np.array([nothing if f.signal is None else f.signal.luck for f in frames]))

@@ -24,7 +24,7 @@ class Surroundings:
     in_range: NDArray[np.bool_]
     admitted: NDArray[np.bool_]
     power_mw: Array | None = None
-    fading: NDArray[np.int64] | None = None
+    fading: NDArray[np.uint64] | None = None
 
 
 class Topology:

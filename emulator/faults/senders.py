@@ -41,6 +41,11 @@ class SenderFaults:
         self._acting: dict[int, list[PlannedFault]] = {}
         self._sent: dict[int, deque[tuple[int, int, bytes]]] = {}
 
+    @property
+    def misbehave(self) -> bool:
+        """Whether any of them does."""
+        return bool(self._acting)
+
     def update(self, active: Sequence[PlannedFault]) -> None:
         """From now on these act and no others."""
         self._acting = {}
