@@ -76,7 +76,7 @@ class Engine:
         nakagami = signals.nakagami if signals is not None else None
         self._topology = Topology(position_m, reach_of(radio, seed, links), radio.max_peers, nakagami)
         self._csma = (
-            Csma(radio.mac, radio, signals, count) if radio.mac is not None and signals is not None else None
+            Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
         )
         self._access: Access = self._csma or TransmitQueue(seed, radio)
         self._links = LinkFaults(seed, self._access, count)
@@ -134,6 +134,7 @@ class Engine:
         """Frames that `node` broadcasts at `time_ns`, in order. Those of a node that is down are discarded."""
         if not self._topology.is_up(node):
             return
+        self._access.run(time_ns)
         for payload in payloads:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1

@@ -53,9 +53,9 @@ _Instant = tuple[int, int, int, int, Frame | None]
 class _Station:
     """A sender: the frames that wait, and how its backoff stands.
 
-    `queue` are the frames that are ready, and `coming` is how many more will be; where congestion control holds
-    them back, it is asked again at `ask_ns`. `wants` is true while a frame waits for the medium and for
-    nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium is idle, and stands
+    `queue` are the frames that are ready, and `coming` is how many more will be; `held` is true while congestion
+    control, which is asked again at `ask_ns`, holds them back. `wants` is true while a frame waits for the medium
+    and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium is idle, and stands
     still while it is `busy` there. `plans` counts what was planned: of its accesses only `access` still happens.
     """
 
@@ -63,6 +63,7 @@ class _Station:
     queue: deque[Frame] = field(default_factory=deque)
     coming: int = 0
     ready_ns: int = 0
+    held: bool = False
     ask_ns: int = -1
     on_air: bool = False
     wants: bool = False
@@ -94,7 +95,7 @@ def times_ns(mac: Mac) -> Times:
 class Csma:
     """Access to one medium that all `count` vehicles share; see the module's text."""
 
-    def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int) -> None:
+    def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int, seed: int) -> None:
         self._aifs_ns, self._window = times_ns(mac)
         self._signals = signals
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
@@ -102,7 +103,9 @@ class Csma:
         self._limit = radio.queue_frames
         threshold = Threshold(radio.receiver or Receiver())
         self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold)
-        self._gate = gate_of(radio.congestion, count)
+        self._gate = gate_of(radio.congestion, count, seed)
+        if self._gate is not None:
+            self.medium.listener = self._gate.hear
         self._throttle = Throttle()
         self._instants: list[_Instant] = []
         self._stations: dict[int, _Station] = {}
@@ -183,22 +186,32 @@ class Csma:
         if station.queue and not station.wants and not station.on_air:
             self._want(station, now_ns)
 
-    def _is_held(self, station: _Station, gate: Gate, now_ns: int) -> bool:
-        """Whether congestion control lets a station's frames not go yet; those that are too many never will."""
+    def _is_let_through(self, station: _Station, gate: Gate, now_ns: int) -> bool:
+        """Whether congestion control lets a station's next frame go; those that are too many never will.
+
+        A frame that was held back gets to the medium with its jitter, like any other: else those that collided once
+        would come, after the same pause, at the same instant again.
+        """
         self.medium.count(now_ns)
-        ask_ns = gate.ask_ns(station.node, now_ns, self.medium.windows)
+        ask_ns = gate.ask_ns(station.node, now_ns)
         if ask_ns <= now_ns:
-            return False
+            held, station.held = station.held, False
+            jitter_ns = int(self._jitter_ns * sender_draw(station.queue[0], JITTER))
+            if held and jitter_ns:
+                self._plan(now_ns + jitter_ns, READY, station)
+                return False
+            return True
         if ask_ns != station.ask_ns:
             station.ask_ns = ask_ns
             self._plan(ask_ns, READY, station)
+        station.held = True
         while len(station.queue) > gate.waiting:
             self._leave(station.queue.popleft(), Outcome.held_back, now_ns)
-        return True
+        return False
 
     def _want(self, station: _Station, now_ns: int) -> None:
         """Let the first frame of a station go on air as soon as it may."""
-        if self._gate is not None and self._is_held(station, self._gate, now_ns):
+        if self._gate is not None and not self._is_let_through(station, self._gate, now_ns):
             return
         station.wants = True
         node = station.node

@@ -28,8 +28,7 @@ NOT_ON_AIR = -1
 class Signal:
     """A frame as it arrives at the receivers, (N,) each; at its own sender, with the power that it was sent with.
 
-    `luck` are words of 64 random bits, of which the draws are made that decide about the frame. `power_mw` is 0 where
-    the sender is out of range.
+    `luck` are words of 64 random bits, of which come the draws that decide about it. `power_mw` is 0 out of range.
 
     `locked` is where a receiver has set itself on this frame, or None where nothing kept it from doing so.
     `pieces` are the times until which the sum of all powers on air was so much (N,); none if it was alone.

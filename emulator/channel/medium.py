@@ -5,6 +5,8 @@ Everything here is done for all vehicles at once. It knows nothing of who may se
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,8 @@ from vnet.roads.lanes import Array
 
 WINDOW_NS = 100_000_000
 """Over which time the channel busy ratio is taken (ETSI TS 102 687)."""
+SLICE_NS = WINDOW_NS // 10
+"""At such times somebody may listen to it."""
 LONG_AGO_NS = -(1 << 60)
 
 
@@ -34,8 +38,11 @@ class Medium:
         self.busy_ns = np.full(count, LONG_AGO_NS)
         self.idle_ns = np.full(count, LONG_AGO_NS)
         self._counted_ns = 0
-        self._window_ends_ns = WINDOW_NS
+        self._slice_ends_ns = SLICE_NS
         self._busy_for_ns = np.zeros(count, np.int64)
+        self._window_ns = np.zeros(count, np.int64)
+        self.listener: Callable[[int, NDArray[np.int64]], None] | None = None
+        """Is told of each slice when it is over: its number, and for how long the medium was busy in it (N,)."""
         self.windows: list[Array] = []
         """The channel busy ratios (N,) of the windows that are over."""
 
@@ -105,13 +112,22 @@ class Medium:
 
     def count(self, time_ns: int) -> None:
         """Add up for how long the medium has been busy, until `time_ns`."""
-        while time_ns >= self._window_ends_ns:
-            self._count(self._window_ends_ns)
-            self.windows.append(self._busy_for_ns / WINDOW_NS)
-            self._busy_for_ns[:] = 0
-            self._window_ends_ns += WINDOW_NS
+        while time_ns >= self._slice_ends_ns:
+            self._count(self._slice_ends_ns)
+            self._end_slice()
         if time_ns > self._counted_ns:
             self._count(time_ns)
+
+    def _end_slice(self) -> None:
+        number = self._slice_ends_ns // SLICE_NS - 1
+        self._slice_ends_ns += SLICE_NS
+        if self.listener is not None:
+            self.listener(number, self._busy_for_ns)
+        self._window_ns += self._busy_for_ns
+        self._busy_for_ns = np.zeros_like(self._busy_for_ns)
+        if (number + 1) * SLICE_NS % WINDOW_NS == 0:
+            self.windows.append(self._window_ns / WINDOW_NS)
+            self._window_ns[:] = 0
 
     def _count(self, time_ns: int) -> None:
         if self.sensed is not None:

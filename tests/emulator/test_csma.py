@@ -1,6 +1,7 @@
 """The shared medium: nothing depends on how time is cut, and access goes by the rules of 802.11p."""
 
 from collections import Counter
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -39,11 +40,15 @@ def rows(of: Engine) -> list[dict[str, Any]]:
     return of.trace.to_table().to_pylist()
 
 
-def run(subject: Engine, sends: list[Send], stops: list[int]) -> list[tuple[int, int, bytes]]:
-    """Let all happen, with a look at every one of `stops`; returns what was delivered."""
+def run(subject: Engine, sends: list[Send], stops: Sequence[int] | None = None) -> list[tuple[int, int, bytes]]:
+    """Let all happen, with a look at every one of `stops` and whenever something is sent, or none at all.
+
+    Returns what was delivered.
+    """
     heard = []
-    for time_ns in sorted({time for time, _, _ in sends} | set(stops)):
-        heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(time_ns)]
+    for time_ns in sorted({time for time, _, _ in sends} | set(stops or ())):
+        if stops is not None:
+            heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(time_ns)]
         for _, node, size in [send for send in sends if send[0] == time_ns]:
             subject.transmit(time_ns, node, [bytes([node]) * size])
     heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(10**10)]
@@ -77,7 +82,7 @@ def test_however_time_is_cut_the_same_happens(
 ) -> None:
     position_m = scattered(6, seed)
     one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
-    assert run(one, sends, []) == run(other, sends, stops)
+    assert run(one, sends) == run(other, sends, stops)
     assert one.trace.sha256() == other.trace.sha256()
     assert one.counts == other.counts
 
@@ -106,7 +111,7 @@ def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
             asked.advance(first_ns)
         asked.advance(until_ns)
     asked.drain()
-    heard = run(plain, sends, [])
+    heard = run(plain, sends)
     assert told == sorted({time_ns for time_ns, receiver, _ in heard if receiver in (2, 3)} - set(times_ns))
     assert plain.trace.sha256() == asked.trace.sha256()
 
@@ -120,8 +125,8 @@ def test_at_one_instant_it_does_not_matter_whom_the_drivers_ask_first(
     one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
     first = sorted(sends, key=lambda send: (send[0], send[1]))
     second = sorted(first, key=lambda send: (send[0], order.index(send[1])))
-    run(one, first, [])
-    run(other, second, [])
+    run(one, first)
+    run(other, second)
     assert one.trace.sha256() == other.trace.sha256()
 
 
@@ -134,8 +139,8 @@ def test_others_far_away_change_nothing(
     near = scattered(6, seed)
     far = np.vstack([near, near[:3] + 1e5])
     one, other = engine(near, seed, **PHYSICAL, **radio), engine(far, seed, **PHYSICAL, **radio)
-    run(one, sends, [])
-    run(other, sends + [(time, node, 400) for time, node in elsewhere], [])
+    run(one, sends)
+    run(other, sends + [(time, node, 400) for time, node in elsewhere])
     ours = [row for row in rows(other) if int(row["sender"][1:]) < 6]
     assert ours == rows(one)
 
@@ -270,7 +275,7 @@ def test_every_pair_has_one_outcome_and_the_cause_is_exact(
     """What collided had an overlapping frame; and what arrives in the crowd arrives if its sender is alone."""
     position_m = scattered(6, seed)
     subject = engine(position_m, seed, **PHYSICAL, **radio)
-    run(subject, sends, [])
+    run(subject, sends)
     table = rows(subject)
     keys = [(row["sender"], row["seq"], row["receiver"]) for row in table]
     assert len(set(keys)) == len(keys)
