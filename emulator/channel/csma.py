@@ -55,8 +55,8 @@ class _Station:
 
     `queue` are the frames that are ready, and `coming` is how many more will be; `held` is true while congestion
     control, which is asked again at `ask_ns`, holds them back. `wants` is true while a frame waits for the medium
-    and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium is idle, and stands
-    still while it is `busy` there. `plans` counts what was planned: of its accesses only `access` still happens.
+    and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium is idle, and
+    stands still while it is `busy` there. `plans` counts what was planned: of its accesses only `access` happens.
     """
 
     node: int
