@@ -37,17 +37,13 @@ class Delivery:
 class Deliveries(Sequence[Delivery]):
     """Packets that have reached their receivers, in the order (arrival, sender, seq, receiver, copy).
 
-    They are made one by one only when somebody looks; `pairs` says who heard whom without making any.
+    They are made one by one, and only when somebody looks.
     """
 
     _table: Whole
     _frames: dict[int, Frame]
     _trace: Trace
     _made: list[Delivery] | None = field(default=None, init=False)
-
-    def pairs(self) -> Whole:
-        """(n, 2): sender and receiver of each, in no order."""
-        return np.column_stack([self._trace.column("sender")[self._table[_ROW]], self._table[_RECEIVER]])
 
     def __len__(self) -> int:
         return int(self._table.shape[1])
@@ -74,8 +70,8 @@ class Deliveries(Sequence[Delivery]):
         order = np.argsort(arrival, kind="stable")
         if (np.diff(arrival[order]) > 0).all():
             return order
-        sender, seq, copy = (self._trace.column(name)[row] for name in ("sender", "seq", "copy"))
-        return np.lexsort((row, copy, receiver, seq, sender, arrival))
+        rows = self._trace.rows(row)
+        return np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))
 
     def _delivery(self, arrival_ns: int, receiver: int, row: int, number: int) -> Delivery:
         frame = self._frames[number]

@@ -25,7 +25,7 @@ from emulator.arrivals import NEVER_NS, Arrivals, Deliveries, Delivery
 from emulator.channel.csma import Csma
 from emulator.channel.frames import Frame, Pairs, Stage
 from emulator.channel.medium import WINDOW_NS
-from emulator.channel.outcomes import Outcome
+from emulator.channel.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.channel.queue import Access, TransmitQueue
 from emulator.channel.reach import reach_of
 from emulator.channel.reception import Reception
@@ -181,41 +181,45 @@ class Engine:
         """Write the rows of pairs in range, and put those that arrive where they are awaited."""
         for (number, node), flips in pairs.flips.items():
             frames[number].altered[node] = _flipped(frames[number].payload, flips)
-        place, receiver = which = np.nonzero(pairs.outcome != Outcome.out_of_range)
-        self._counts[Outcome.out_of_range] += len(frames) * (len(self._node_ids) - 1) - len(place)
-        self._enter(frames, place, receiver, pairs.outcome[which], pairs.arrival_ns[which], pairs.cause[which])
+        count = len(self._node_ids)
+        which = pairs.outcome != OUT_OF_RANGE
+        each = np.count_nonzero(which, axis=1)
+        receiver = np.broadcast_to(np.arange(count), which.shape)[which]
+        self._counts[Outcome.out_of_range] += len(frames) * (count - 1) - len(receiver)
+        self._enter(frames, each, receiver, pairs.outcome[which], pairs.arrival_ns[which], pairs.cause[which])
         for number, copied, later_ns, cause in pairs.copies:
-            again = np.flatnonzero(copied & (pairs.outcome[number] == Outcome.pending))
+            again = np.flatnonzero(copied & (pairs.outcome[number] == PENDING))
             if len(again):
                 frame = frames[number]
                 frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
-                zeros = np.zeros(len(again), np.intp)
+                each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
                 arrival_ns = pairs.arrival_ns[number, again] + later_ns
-                self._enter([frame], zeros, again, zeros.astype(np.uint8), arrival_ns, np.int16(cause))
+                self._enter([frame], each, again, pending, arrival_ns, np.int16(cause))
 
     def _enter(
         self,
         frames: Sequence[Frame],
-        place: NDArray[np.intp],
+        each: NDArray[np.intp],
         receiver: NDArray[np.intp],
         outcome: NDArray[np.uint8],
         arrival_ns: NDArray[np.int64],
         cause: NDArray[np.int16] | np.int16,
     ) -> None:
-        """The pairs of frame `place` and `receiver`, (n,) each, as rows of the trace and perhaps in flight."""
-        columns = np.array([_OF_FRAME(frame) for frame in frames], np.int64)[place].T
+        """Pairs as rows of the trace, and perhaps in flight: of `each` frame so many, one after the other."""
+        columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
+        digests = np.array([_digest(frame.payload) for frame in frames], np.uint64)
         first = self._trace.append(
-            len(place),
-            receiver=receiver,
-            payload_digest=_digests(frames, place, receiver),
-            outcome=outcome,
-            cause=cause,
-            arrival_ns=arrival_ns,
-            **dict(zip(_COLUMNS, columns, strict=True)),
+            {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns
         )
-        for kind in Outcome:
-            self._counts[kind] += int(np.count_nonzero(outcome == kind))
-        flying = np.flatnonzero(outcome == Outcome.pending)
+        place = np.repeat(np.arange(len(frames)), each)
+        for number, frame in enumerate(frames):
+            for node, payload in frame.altered.items():
+                for row in np.flatnonzero((place == number) & (receiver == node)).tolist():
+                    self._trace.alter(first + row, _digest(payload))
+        for kind, number in enumerate(np.bincount(outcome).tolist()):
+            if number:
+                self._counts[Outcome(kind)] += number
+        flying = np.flatnonzero(outcome == PENDING)
         self._arrivals.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
 
     # Arriving.
@@ -316,15 +320,6 @@ class Engine:
 
 def _digest(payload: bytes) -> int:
     return int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little")
-
-
-def _digests(frames: Sequence[Frame], place: NDArray[np.intp], receiver: NDArray[np.intp]) -> NDArray[np.uint64]:
-    """(n,) digests of what arrives."""
-    digests = np.array([_digest(frame.payload) for frame in frames], np.uint64)[place]
-    for number, frame in enumerate(frames):
-        for node, payload in frame.altered.items():
-            digests[(place == number) & (receiver == node)] = _digest(payload)
-    return digests
 
 
 def _flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:

@@ -105,7 +105,7 @@ class Csma:
         self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold)
         self._gate = gate_of(radio.congestion, count, seed)
         if self._gate is not None:
-            self.medium.listener = self._gate.hear
+            self.medium.listen(self._gate.hear)
         self._throttle = Throttle()
         self._instants: list[_Instant] = []
         self._stations: dict[int, _Station] = {}
@@ -134,9 +134,19 @@ class Csma:
         elif station.coming + len(station.queue) >= self._limit:
             self._leave(frame, Outcome.queue_full, frame.sent_ns)
         else:
-            station.coming += 1
             station.ready_ns = max(ready_ns, station.ready_ns)
-            self._plan(station.ready_ns, READY, station, frame)
+            if station.ready_ns == frame.sent_ns and self._is_quiet(frame.sent_ns):
+                self._ready(station, frame, frame.sent_ns)
+            else:
+                station.coming += 1
+                self._plan(station.ready_ns, READY, station, frame)
+
+    def _is_quiet(self, time_ns: int) -> bool:
+        """Whether nothing else has to happen before a frame is ready at this instant.
+
+        None goes on air at the instant at which it is ready, so that those of one instant do not meet.
+        """
+        return self._now_ns <= time_ns and (not self._instants or self._instants[0][:2] > (time_ns, READY))
 
     def _leave(self, frame: Frame, fate: Outcome, time_ns: int) -> None:
         frame.fate, frame.end_ns = fate, time_ns
@@ -222,7 +232,7 @@ class Csma:
         self._counting[node] = station
         station.slots = 0
         station.busy = self.medium.is_sensed(node)
-        noticed_ns = int(self.medium.busy_ns[node]) + DETECTION_NS
+        noticed_ns = self.medium.busy_ns(node) + DETECTION_NS
         if station.busy and noticed_ns <= now_ns:
             station.slots = self._draw(station.queue[0], BACKOFF)
             return

@@ -50,6 +50,7 @@ DEAD_PER_NS = 0.05
 """A microsecond at this cost, in nepers a nanosecond, is the end of any frame."""
 
 
+@lru_cache(maxsize=4096)
 def airtime_ns(size_bytes: int, bitrate_mbps: float) -> int:
     """How long a frame of this many bytes in all is on air: 40 µs + 8 µs · ⌈(22 + 8 L) / bits a symbol⌉."""
     bits, numerator, denominator = _MODES[bitrate_mbps]

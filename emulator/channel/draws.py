@@ -26,6 +26,7 @@ class Draws:
         self._bits = np.random.Philox(key=np.array([seed, stage_key], dtype=np.uint64))
         self._generator = np.random.Generator(self._bits)
         self._state = self._bits.state
+        self._state["buffer_pos"], self._state["has_uint32"] = 4, 0  # nothing is left over from other frames
         self._counter = self._state["state"]["counter"]
 
     def uniform(self, sender: int, seq: int, count: int, copy: int = 0) -> NDArray[np.float64]:
@@ -40,11 +41,9 @@ class Draws:
 
     def _go_to(self, sender: int, seq: int, copy: int) -> None:
         # Setting the counter of one generator is four times as fast as making one for each frame.
-        counter, state = self._counter, self._state
+        counter = self._counter
         counter[0], counter[1], counter[2], counter[3] = 0, seq, sender, copy
-        state["buffer_pos"] = 4
-        state["has_uint32"] = 0
-        self._bits.state = state
+        self._bits.state = self._state
 
     def of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
         """(K, count): the draws of each frame."""

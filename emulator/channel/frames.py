@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.channel.outcomes import Outcome
+from emulator.channel.outcomes import PENDING, Outcome
 
 if TYPE_CHECKING:
     from emulator.channel.topology import Surroundings
@@ -107,11 +107,11 @@ class Pairs:
 
     def decide(self, which: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
         """Give `outcome` to those of `which`, (K, N) or what fits that shape, that are still pending."""
-        self.outcome[(self.outcome == Outcome.pending) & which] = outcome
+        self.outcome[(self.outcome == PENDING) & which] = outcome.value
 
     def fault(self, place: int, which: NDArray[np.bool_], cause: int) -> None:
         """Frame `place` comes no further, by fault number `cause`, at those of `which` (N,) still pending."""
-        decided = (self.outcome[place] == Outcome.pending) & which
+        decided = (self.outcome[place] == PENDING) & which
         self.outcome[place, decided] = Outcome.fault
         self.cause[place, decided] = cause
 

@@ -21,12 +21,14 @@ SLICE_NS = WINDOW_NS // 10
 """At such times somebody may listen to it."""
 LONG_AGO_NS = -(1 << 60)
 
+Listener = Callable[[int, NDArray[np.int64]], None]
+
 
 class Medium:
     """Frames on air between `count` vehicles.
 
     `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, or None if nothing is on air;
-    `busy_ns` and `idle_ns` (N,) are when it last became so, and when it last was no longer.
+    `idle_ns` (N,) is when it last was no longer so.
     """
 
     def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
@@ -35,20 +37,31 @@ class Medium:
         self._frames: list[Frame] = []
         self._total_mw: Array = np.zeros(count)
         self.sensed: NDArray[np.bool_] | None = None
-        self.busy_ns = np.full(count, LONG_AGO_NS)
+        self._busy_ns = np.full(count, LONG_AGO_NS)
+        self._busy_since_ns: int | None = None
         self.idle_ns = np.full(count, LONG_AGO_NS)
         self._counted_ns = 0
-        self._slice_ends_ns = SLICE_NS
-        self._busy_for_ns = np.zeros(count, np.int64)
+        self._spans: list[tuple[NDArray[np.bool_], int]] = []
+        self._slice_ns = self._slice_ends_ns = WINDOW_NS
         self._window_ns = np.zeros(count, np.int64)
-        self.listener: Callable[[int, NDArray[np.int64]], None] | None = None
-        """Is told of each slice when it is over: its number, and for how long the medium was busy in it (N,)."""
+        self._listener: Listener | None = None
         self.windows: list[Array] = []
         """The channel busy ratios (N,) of the windows that are over."""
 
     def is_sensed(self, node: int) -> bool:
         """Whether the medium is busy at `node`."""
         return self.sensed is not None and bool(self.sensed[node])
+
+    def busy_ns(self, node: int) -> int:
+        """Since when it has been busy at `node`, if it is."""
+        return int(self._busy_ns[node]) if self._busy_since_ns is None else self._busy_since_ns
+
+    def _know_since(self) -> None:
+        """Write down since when the first frame on air, until now alone, is sensed."""
+        if self._busy_since_ns is not None:
+            assert self.sensed is not None
+            np.copyto(self._busy_ns, self._busy_since_ns, where=self.sensed)
+            self._busy_since_ns = None
 
     def begin(self, frame: Frame, time_ns: int) -> None:
         """A frame begins, `frame.signal` its powers."""
@@ -104,9 +117,10 @@ class Medium:
     def _sense(self, total_mw: Array, time_ns: int) -> None:
         sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
         if before is None:
-            np.copyto(self.busy_ns, time_ns, where=sensed)
+            self._busy_since_ns = time_ns
         else:
-            np.copyto(self.busy_ns, time_ns, where=sensed & ~before)
+            self._know_since()
+            np.copyto(self._busy_ns, time_ns, where=sensed & ~before)
             np.copyto(self.idle_ns, time_ns, where=before & ~sensed)
         self._total_mw, self.sensed = total_mw, sensed
 
@@ -118,21 +132,28 @@ class Medium:
         if time_ns > self._counted_ns:
             self._count(time_ns)
 
-    def _end_slice(self) -> None:
-        number = self._slice_ends_ns // SLICE_NS - 1
-        self._slice_ends_ns += SLICE_NS
-        if self.listener is not None:
-            self.listener(number, self._busy_for_ns)
-        self._window_ns += self._busy_for_ns
-        self._busy_for_ns = np.zeros_like(self._busy_for_ns)
-        if (number + 1) * SLICE_NS % WINDOW_NS == 0:
-            self.windows.append(self._window_ns / WINDOW_NS)
-            self._window_ns[:] = 0
-
     def _count(self, time_ns: int) -> None:
         if self.sensed is not None:
-            self._busy_for_ns += self.sensed * (time_ns - self._counted_ns)
+            self._spans.append((self.sensed, time_ns - self._counted_ns))
         self._counted_ns = time_ns
+
+    def _end_slice(self) -> None:
+        busy_ns = np.zeros_like(self._window_ns)
+        if self._spans:
+            sensed, lengths_ns = zip(*self._spans, strict=True)
+            busy_ns = np.array(lengths_ns) @ np.array(sensed)
+            self._spans.clear()
+        if self._listener is not None:
+            self._listener(self._slice_ends_ns // SLICE_NS - 1, busy_ns)
+        self._window_ns += busy_ns
+        if self._slice_ends_ns % WINDOW_NS == 0:
+            self.windows.append(self._window_ns / WINDOW_NS)
+            self._window_ns[:] = 0
+        self._slice_ends_ns += self._slice_ns
+
+    def listen(self, listener: Listener) -> None:
+        """Tell `listener` of each slice when it is over: its number, and for how long (N,) it was busy."""
+        self._listener, self._slice_ns, self._slice_ends_ns = listener, SLICE_NS, SLICE_NS
 
 
 def _signal(frame: Frame) -> Signal:

@@ -22,3 +22,7 @@ class Outcome(IntEnum):
     faded = 10
     collided = 11
     held_back = 12
+
+
+PENDING, OUT_OF_RANGE = Outcome.pending.value, Outcome.out_of_range.value
+"""The same as plain numbers, with which numpy compares ten times as fast."""

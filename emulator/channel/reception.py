@@ -60,9 +60,8 @@ class Reception:
         limit = -np.log(reception_draws(np.array([signal.luck for signal in signals]))) * COST_STEPS
         on_air_ns = np.array([airtime_ns(frames[place].size_bytes, self._bitrate_mbps) for place in sent])
         heard = power_mw >= self._threshold.alone_mw
-        snr = power_mw[heard] / self._threshold.noise_mw
-        alone = heard.copy()
-        alone[heard] = self._cost(snr) * (on_air_ns - PREAMBLE_NS)[np.nonzero(heard)[0]] < limit[heard]
+        snr = np.where(heard, power_mw / self._threshold.noise_mw, np.inf)
+        alone = heard & (self._cost(snr) * (on_air_ns - PREAMBLE_NS)[:, None] < limit)
         faded, collided = np.zeros_like(pairs.outcome, bool), np.zeros_like(pairs.outcome, bool)
         faded[sent] = ~alone
         met = [number for number, signal in enumerate(signals) if signal.pieces]

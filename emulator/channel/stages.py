@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emulator.channel.draws import Draws
 from emulator.channel.frames import NS_PER_MS, Frame, Pairs
-from emulator.channel.outcomes import Outcome
+from emulator.channel.outcomes import PENDING, Outcome
 from emulator.channel.signals import latency_draws
 from vnet.scenario import Radio
 
@@ -42,7 +42,7 @@ def sender_side(frames: Sequence[Frame], pairs: Pairs) -> None:
     for place, frame in enumerate(frames):
         if frame.fate:
             row = pairs.outcome[place]
-            row[row == Outcome.pending] = frame.fate
+            row[row == PENDING] = frame.fate
 
 
 def peer_cap(frames: Sequence[Frame], pairs: Pairs) -> None:

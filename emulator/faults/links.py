@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from emulator.channel.draws import Draws
 from emulator.channel.frames import NS_PER_MS, Copied, Frame, Pairs
-from emulator.channel.outcomes import Outcome
+from emulator.channel.outcomes import PENDING
 from emulator.channel.queue import Access
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Mask
@@ -67,7 +67,7 @@ class LinkEffects:
 
     def changes(self, frame: Frame, place: int, pairs: Pairs) -> None:
         """Let what is left of frame number `place` arrive later, once more, or with other bytes."""
-        pending = pairs.outcome[place] == Outcome.pending
+        pending = pairs.outcome[place] == PENDING
         count = len(pending)
         for one in self.delaying:
             draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,27 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike, NDArray
 
 from emulator.channel.frames import NO_CAUSE
-from emulator.channel.outcomes import Outcome
+from emulator.channel.outcomes import PENDING, Outcome
 
 NOT_ARRIVING = -1
-FIRST_ROWS = 1 << 22
+FIRST_PAIRS, FIRST_FRAMES = 1 << 22, 1 << 17
 """Room from the start: the system hands out zeroed pages only as they are written, and growing means copying."""
 
+_FRAME = np.dtype(
+    [
+        ("sent_ns", "<i8"),
+        ("seq", "<i8"),
+        ("sender", "<i4"),
+        ("size_bytes", "<i4"),
+        ("payload_digest", "<u8"),
+        ("on_air_ns", "<i8"),
+        ("left_ns", "<i8"),
+        ("copy", "<i2"),
+    ]
+)
+_PAIR = np.dtype(
+    [("frame", "<i4"), ("receiver", "<i4"), ("outcome", "u1"), ("cause", "<i2"), ("arrival_ns", "<i8")]
+)
 ROW = np.dtype(
     [
         ("sent_ns", "<i8"),
@@ -49,46 +64,82 @@ def decided_ns(rows: NDArray[np.void]) -> NDArray[np.int64]:
     return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["left_ns"], rows["arrival_ns"]))
 
 
+class _Table:
+    """Records of one type, as many as are added."""
+
+    def __init__(self, kind: np.dtype[np.void], room: int) -> None:
+        self._records = np.zeros(room, kind)
+        self.count = 0
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """Those that were added."""
+        return self._records[: self.count]
+
+    def add(self, count: int) -> NDArray[np.void]:
+        """So many more, to be written."""
+        first, end = self.count, self.count + count
+        if end > len(self._records):
+            grown = np.zeros(max(2 * len(self._records), end), self._records.dtype)
+            grown[:first] = self._records[:first]
+            self._records = grown
+        self.count = end
+        return self._records[first:end]
+
+
 class Trace:
     """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
-    `knows_air` says that frames have times at which they went on air and left it; else they leave as they are sent.
+    What the rows of a frame have in common is kept once. `knows_air` says that frames have times at which they went
+    on air and left it; else they leave as they are sent.
     """
 
     def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
         self._node_ids = list(node_ids)
         self._knows_air = knows_air
         self._causes = [""]
-        self._rows = np.zeros(FIRST_ROWS, dtype=ROW)
-        self._count = 0
+        self._pairs = _Table(_PAIR, FIRST_PAIRS)
+        self._frames = _Table(_FRAME, FIRST_FRAMES)
+        self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
-        return self._count
+        return self._pairs.count
 
-    def append(self, count: int, **columns: ArrayLike) -> int:
-        """Add `count` rows, one for each frame and receiver; returns the number of the first.
+    def append(
+        self,
+        frames: Mapping[str, ArrayLike],
+        each: NDArray[np.intp],
+        receiver: ArrayLike,
+        outcome: NDArray[np.uint8],
+        cause: ArrayLike,
+        arrival_ns: ArrayLike,
+    ) -> int:
+        """Add the rows of frames: of `each` (K,) of them so many, one after the other; returns the first's number.
 
-        All columns are wanted, each a number or (count,). `payload_digest` is of what arrives; `cause` are numbers
-        of faults, whose names `name_cause` has told; `arrival_ns` counts only where the outcome is pending.
+        `frames` are the columns (K,) that are the same for all rows of a frame; the others are of the rows (n,).
+        `cause` are numbers of faults, whose names `name_cause` has told; `arrival_ns` counts only where the outcome
+        is pending.
         """
-        first, end = self._count, self._count + count
-        if end > len(self._rows):
-            grown = np.zeros(max(2 * len(self._rows), end), dtype=ROW)
-            grown[:first] = self._rows[:first]
-            self._rows = grown
-        rows = self._rows[first:end]
-        for name, values in columns.items():
-            rows[name] = values
+        first, first_frame = self._pairs.count, self._frames.count
+        new = self._frames.add(len(each))
+        for name, values in frames.items():
+            new[name] = values
         if not self._knows_air:
-            rows["left_ns"] = rows["sent_ns"]
+            new["left_ns"] = new["sent_ns"]
+        rows = self._pairs.add(len(outcome))
+        rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
+        rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
         rows["cause"] -= NO_CAUSE
-        rows["arrival_ns"][rows["outcome"] != Outcome.pending] = NOT_ARRIVING
-        self._count = end
+        rows["arrival_ns"] = np.where(outcome == PENDING, arrival_ns, NOT_ARRIVING)
         return first
+
+    def alter(self, row: int, payload_digest: int) -> None:
+        """What arrives by this row has other bytes than its frame."""
+        self._altered[row] = payload_digest
 
     def column(self, name: str) -> NDArray[Any]:
         """A column of the trace so far, as numbers."""
-        return np.asarray(self._rows[name][: self._count])
+        return np.asarray(self.rows(slice(None))[name])
 
     def name_cause(self, number: int, name: str) -> None:
         """Say what fault `number` is called."""
@@ -98,11 +149,20 @@ class Trace:
 
     def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
         """Give rows their outcome."""
-        self._rows["outcome"][rows] = outcome
+        self._pairs.records["outcome"][rows] = outcome.value
 
     def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
-        """These rows as records of type `ROW`, which they are: to be read only."""
-        return self._rows[which]
+        """These rows as records of type `ROW`."""
+        pairs = self._pairs.records[which]
+        frames = self._frames.records[pairs["frame"]]
+        rows = np.zeros(len(pairs), ROW)
+        for name in ROW.fields or ():
+            rows[name] = pairs[name] if name in (_PAIR.fields or ()) else frames[name]
+        if self._altered:
+            number = np.arange(self._pairs.count)[which]
+            for place in np.flatnonzero(np.isin(number, list(self._altered))).tolist():
+                rows["payload_digest"][place] = self._altered[int(number[place])]
+        return rows
 
     def to_table(self) -> pa.Table:
         """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
@@ -110,7 +170,7 @@ class Trace:
         Where senders share the air there are two columns more: `on_air_ns`, when a frame's transmission began (null
         if it never did), and `left_ns`, when it ended, or the frame was given up.
         """
-        rows = self._rows[: self._count]
+        rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
         rows = rows[order]
         outcome_names = [outcome.name for outcome in Outcome]
