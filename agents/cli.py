@@ -27,14 +27,18 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 @app.command()
 def agent(
     connect: Annotated[
-        str, typer.Option(help="The emulator's (or its router's) endpoint, tcp/HOST:PORT or tls/HOST:PORT.")
+        str,
+        typer.Option(metavar="ENDPOINT", help="Of the emulator, or of its router: tcp/HOST:PORT or tls/HOST:PORT."),
     ],
-    run: Annotated[str, typer.Option(help="The name of the run: run.name of the scenario.")],
-    node: Annotated[list[str], typer.Option(help="A node of this process; give it once a node.")],
+    run: Annotated[str, typer.Option(metavar="NAME", help="The name of the run: run.name of its scenario.")],
+    node: Annotated[list[str], typer.Option(metavar="ID", help="A vehicle of this process; once for each.")],
     credentials: Annotated[
-        Path | None, typer.Option(help="Credentials file of this process's user, as vnet access writes it.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Of this process: access/credentials/ID.json, with the first ID."),
     ] = None,
-    join_timeout_s: Annotated[float, typer.Option(help="How long to wait for the emulator's welcome.")] = 60.0,
+    join_timeout_s: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for the emulator's welcome.")
+    ] = 60.0,
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     faulthandler.register(signal.SIGUSR1)

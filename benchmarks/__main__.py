@@ -27,7 +27,18 @@ def vnet(command: str, scenario: str, *options: str, watch: Callable[[int], None
     """Run a vnet command; returns its verdict and events, and the whole wall-clock time as `total_s`."""
     with tempfile.TemporaryDirectory(prefix="vnet-bench-") as folder:
         out = Path(folder) / "run"
-        arguments = [sys.executable, "-P", "-m", "emulator.cli", command, scenario, "--out", str(out), *options]
+        arguments = [
+            sys.executable,
+            "-P",
+            "-m",
+            "emulator.cli",
+            command,
+            scenario,
+            "--out",
+            str(out),
+            "--no-report",
+            *options,
+        ]
         started = time.monotonic()
         process = subprocess.Popen(arguments, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         watcher = threading.Thread(target=watch or (lambda pid: None), args=(process.pid,))
@@ -175,6 +186,13 @@ def bench_rbpf(particles: int = 500, vehicles: int = 10, steps: int = 400) -> Fi
     return {"step_us": statistics.median(times_s) * 1e6}
 
 
+def bench_dashboard() -> Figures:
+    """What the picture of a run with 50 vehicles costs: taking a snapshot, and a redraw at 100 × 30."""
+    from benchmarks import dashboard
+
+    return dashboard.measure()
+
+
 def bench_estimators() -> Figures:
     """The RBPF step against the same with a covariance a particle, and against Stone Soup and filterpy."""
     from benchmarks import estimators  # needs the extra `bench`
@@ -189,8 +207,16 @@ def bench_quadratic_programs() -> Figures:
     return quadratic_programs.compare()
 
 
+def bench_observer() -> Figures:
+    """The observer of 50 vehicles at 10 Hz in real time: its share of a core, and what it writes."""
+    from benchmarks import observer
+
+    return observer.measure()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
+    "dashboard": bench_dashboard,
     "estimators": bench_estimators,
     "quadratic_programs": bench_quadratic_programs,
     "simulate": bench_simulate,
@@ -198,6 +224,7 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "demo": bench_demo,
     "realtime": bench_realtime,
     "awaiting": bench_awaiting,
+    "observer": bench_observer,
 }
 
 

@@ -1,4 +1,4 @@
-"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, analyze, experiment.
+"""`vnet`: run, simulate, emulator, access, check, record, view, render, play, report, compare and others.
 
 Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
 """
@@ -6,11 +6,13 @@ Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 1
 from __future__ import annotations
 
 import asyncio
+import io
+import json
 import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +22,7 @@ import typer
 from rich.console import Console
 
 from emulator.experiments.cli import app as experiment_app
+from emulator.export_cli import export, radio
 from emulator.fault_cli import app as fault_app
 from emulator.fault_cli import status
 from emulator.observe.checks import check_run, recorded_verdict
@@ -27,16 +30,17 @@ from emulator.observe.run_folder import RunFolder
 from emulator.observe.sinks import Sinks, choose_sinks
 from emulator.observe.summary import print_checks, print_summary
 from emulator.playback_cli import play, render
+from emulator.report_cli import ReportOption, compare, report, report_at_end
 from emulator.run.attachment import LiveOptions
 from emulator.run.conclude import conclude, run_again
 from emulator.run.emulation import Emulation
 from emulator.run.join import split_into_processes
 from emulator.run.live import run_live
 from emulator.run.messages import Messages
-from emulator.run.progress import ProgressLine
+from emulator.run.progress import Progress, show_progress
 from emulator.run.router import SeparateRouter
 from emulator.run.simulate import simulate as run_simulation
-from emulator.terminal import one_line_errors
+from emulator.terminal import LogFormat, one_line_errors, run_app
 from emulator.viewing_cli import RerunBindOption, RerunPortOption, RerunVehicleOption, view
 from emulator.world.world import World, build_world
 from vnet.errors import LinkError, ScenarioError, VnetError
@@ -45,18 +49,32 @@ from vnet.link.hosting import fix_hash_seed
 from vnet.link.session import quiet_zenoh
 from vnet.scenario import Scenario, load_scenario
 
+
+class Panel(StrEnum):
+    """Under what commands are listed."""
+
+    RUNS = "Run a scenario"
+    LIVE = "While a run is on"
+    AFTER = "Afterwards"
+    STUDIES = "Studies"
+    APART = "Apart from the emulator"
+
+
 app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     no_args_is_help=True,
     help="An asyncio message-passing emulator for connected vehicles over Zenoh.",
 )
-app.add_typer(experiment_app, name="experiment")
-app.add_typer(fault_app, name="fault")
-app.command()(status)
-app.command()(view)
-app.command()(render)
-app.command()(play)
+app.add_typer(experiment_app, name="experiment", rich_help_panel=Panel.STUDIES)
+app.add_typer(fault_app, name="fault", rich_help_panel=Panel.LIVE)
+app.command(rich_help_panel=Panel.AFTER)(view)
+app.command(rich_help_panel=Panel.AFTER)(render)
+app.command(rich_help_panel=Panel.AFTER)(play)
+app.command(rich_help_panel=Panel.AFTER)(radio)
+app.command(rich_help_panel=Panel.AFTER)(export)
+app.command(rich_help_panel=Panel.AFTER)(report)
+app.command(rich_help_panel=Panel.AFTER)(compare)
 
 
 class Pacing(StrEnum):
@@ -77,13 +95,25 @@ DEFAULT_ADDRESS = "127.0.0.1:7447"
 DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 
 ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
-ProgramOption = Annotated[str | None, typer.Option(help="What every vehicle runs, as package.module:function.")]
-PacingOption = Annotated[Pacing | None, typer.Option(help="Virtual time, or the wall clock.")]
-SeedOption = Annotated[int | None, typer.Option(help="Same seed, same run.")]
-DurationOption = Annotated[float | None, typer.Option(help="Emulated seconds.")]
-OutOption = Annotated[Path | None, typer.Option(help="Folder for the run's files; the default is runs/NAME-SEED.")]
+ProgramOption = Annotated[
+    str | None, typer.Option(metavar="MODULE:FUNCTION", help="What every vehicle runs, as agents.beacon:main.")
+]
+PacingOption = Annotated[
+    Pacing | None,
+    typer.Option(help="Virtual time, the same on every machine; or the wall clock. Default: the scenario's."),
+]
+SeedOption = Annotated[
+    int | None, typer.Option(metavar="N", help="Of all that is drawn at random: same seed, same run.")
+]
+DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
+OutOption = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="For the run's files. Default: runs/NAME-SEED.")
+]
 SetOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.KEY=VALUE", help="Override a scenario key.")
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. As often as need be."
+    ),
 ]
 TlsNameOption = Annotated[
     list[str] | None,
@@ -100,11 +130,26 @@ RerunOption = Annotated[
     ),
 ]
 DeterminismOption = Annotated[
-    bool, typer.Option("--check-determinism", help="Run it twice, and show the first row that differs.")
+    bool,
+    typer.Option("--check-determinism", metavar="", help="Run it twice, and show the first row that differs."),
 ]
+LogFormatOption = Annotated[
+    LogFormat, typer.Option(help="json: an object a line on stderr, and verdict.json in one line on stdout.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only errors, and the verdict in one line.")]
 
 
-@app.command()
+@dataclass(frozen=True)
+class Asked:
+    """What was asked for beside the run itself."""
+
+    log_format: LogFormat
+    quiet: bool
+    check_determinism: bool = False
+    report: bool = True
+
+
+@app.command(rich_help_panel=Panel.RUNS)
 def run(
     scenario: ScenarioArgument,
     program: ProgramOption = None,
@@ -118,12 +163,15 @@ def run(
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    report: ReportOption = True,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    with one_line_errors():
+    with one_line_errors(log_format):
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
@@ -138,10 +186,11 @@ def run(
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
-            _run_live(loaded, world, RunFolder.create(out, loaded), options, check_determinism)
+            asked = Asked(log_format, quiet, check_determinism, report)
+            _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.RUNS)
 def simulate(
     scenario: ScenarioArgument,
     program: ProgramOption = None,
@@ -152,22 +201,26 @@ def simulate(
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
     fix_hash_seed("emulator.cli")
-    with one_line_errors():
+    with one_line_errors(log_format):
         loaded = _load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
         sys.path.append(str(Path.cwd()))
         emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
-        with ExitStack() as stack:
-            if sinks is not None:
-                _record_here(emulation, sinks, stack)
-            stack.enter_context(ProgressLine(emulation))
-            wall_s, interrupted = run_simulation(emulation)
-        _finish(emulation, wall_s, interrupted, "simulate", check_determinism)
+        with show_progress(emulation, log_format, quiet) as progress:
+            with ExitStack() as stack:
+                if sinks is not None:
+                    _record_here(emulation, sinks, stack)
+                wall_s, interrupted = run_simulation(emulation)
+            asked = Asked(log_format, quiet, check_determinism, report)
+            _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
 
 
 def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
@@ -182,17 +235,24 @@ def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
     stack.callback(lambda: recorder.take("end", messages.end()))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.RUNS)
 def emulator(
     scenario: ScenarioArgument,
     listen: Annotated[
         str | None,
-        typer.Option(help="Be the router, and listen at this endpoint (tcp/HOST:PORT or tls/HOST:PORT)."),
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Be the router, at tcp/HOST:PORT or tls/HOST:PORT. Default: {DEFAULT_LISTEN}.",
+        ),
     ] = None,
-    connect: Annotated[str | None, typer.Option(help="Be a client of the zenohd at this endpoint.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Be a client of the zenohd that is there.")
+    ] = None,
     access: Annotated[
         Path | None,
-        typer.Option(help="Folder written by vnet access; made if it does not exist. Default: OUT/access."),
+        typer.Option(
+            metavar="FOLDER", help="Users, as vnet access wrote them; made if not there. Default: OUT/access."
+        ),
     ] = None,
     program: ProgramOption = None,
     pacing: PacingOption = None,
@@ -204,9 +264,12 @@ def emulator(
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
+    report: ReportOption = True,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
-    with one_line_errors():
+    with one_line_errors(log_format):
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = _load(scenario, overrides, program, pacing, seed, duration)
@@ -218,25 +281,33 @@ def emulator(
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
-        print(f"credentials of the agents: {access}/credentials/NODE.json", file=sys.stderr)
         options = LiveOptions(users, listen, connect, launch=False, record=sinks)
-        _run_live(loaded, world, folder, options)
+        where = f"credentials of the agents: {access}/credentials/NODE.json"
+        _run_live(loaded, world, folder, options, Asked(log_format, quiet, report=report), where)
 
 
-@app.command("access")
+app.command(rich_help_panel=Panel.LIVE)(status)
+
+
+@app.command("access", rich_help_panel=Panel.APART)
 def write_access(
     scenario: ScenarioArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the files.")] = Path("access"),
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="For the files.")] = Path("access"),
     listen: Annotated[
-        str, typer.Option(help="Where the zenohd is to listen; at tls/HOST:PORT everybody gets a certificate.")
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Where the zenohd is to listen; at tls/HOST:PORT everybody gets a certificate.",
+        ),
     ] = DEFAULT_LISTEN,
     tls_name: TlsNameOption = None,
     router_folder: Annotated[
-        Path | None, typer.Option(help="Where the zenohd sees the folder, if elsewhere (a container).")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Where the zenohd sees --out, if elsewhere (in a container)."),
     ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """Write a separate zenohd's configuration (zenohd -c OUT/zenohd.json5) and everybody's credentials."""
+    """Write the configuration of a separate router (zenohd) and everybody's credentials."""
     with one_line_errors():
         loaded = _load(scenario, overrides)
         users = _create_access(loaded, build_world(loaded), listen, tls_name or ())
@@ -245,7 +316,7 @@ def write_access(
         print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.AFTER)
 def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]) -> None:
     """Judge a run again, from its files alone."""
     with one_line_errors():
@@ -254,13 +325,15 @@ def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's fo
         raise typer.Exit(judgement.exit_status)
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.STUDIES)
 def analyze(
     scenario: ScenarioArgument,
-    run: Annotated[Path | None, typer.Option(help="A run's folder: what its filters did is set beside.")] = None,
+    run: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Folder of a run: set beside what its filters did.")
+    ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """What the network's graph says without a run: components, degrees, how well each rule of weights mixes."""
+    """What the graph says without a run: components, degrees, how well each rule of weights mixes."""
     from emulator.experiments.analyze import analysis_table
     from emulator.experiments.analyze import analyze as analyze_scenario
 
@@ -268,21 +341,29 @@ def analyze(
         Console().print(analysis_table(analyze_scenario(_load(scenario, overrides), run)))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.STUDIES)
 def campaign(
     scenario: ScenarioArgument,
-    runs: Annotated[int, typer.Option(min=1, help="How many runs.")] = 200,
-    faults: Annotated[str, typer.Option(help="random, or the kinds to draw from: kill,partition.")] = "random",
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="How many runs.")] = 200,
+    faults: Annotated[
+        str, typer.Option(metavar="KINDS", help="random, or the kinds to draw from: kill,partition.")
+    ] = "random",
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the campaign's files.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the campaign's files.")] = None,
     overrides: SetOption = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Runs at once; as many as there are cores.")] = None,
-    shrink_steps: Annotated[int, typer.Option(min=0, max=50, help="Runs to shrink a failure with.")] = 50,
-    time_limit: Annotated[float, typer.Option(min=1.0, help="Wall-clock seconds a run may take.")] = 300.0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
+    ] = None,
+    shrink_steps: Annotated[
+        int, typer.Option(min=0, max=50, metavar="N", help="Runs to shrink a failure with.")
+    ] = 50,
+    time_limit: Annotated[
+        float, typer.Option(min=1.0, metavar="SECONDS", help="Wall clock that a run may take.")
+    ] = 300.0,
 ) -> None:
-    """Run a scenario many times under random faults; shrink what fails; a matrix of faults and checks."""
+    """Run a scenario many times under random faults, and shrink what fails to the least that still does."""
     fix_hash_seed("emulator.cli")
     from emulator.testing.campaign import Plan, run_campaign
 
@@ -296,12 +377,14 @@ def campaign(
         raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))
 
 
-@app.command()
+@app.command(rich_help_panel=Panel.APART)
 def record(
-    connect: Annotated[str, typer.Option(help="The emulator's (or its router's) endpoint.")],
-    run: Annotated[str, typer.Option(help="The name of the run.")],
-    out: Annotated[Path, typer.Option(help="The recording to write.")] = Path("recording.rrd"),
-    credentials: Annotated[Path | None, typer.Option(help="The observer's credentials file.")] = None,
+    connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Of the emulator, or of its router.")],
+    run: Annotated[str, typer.Option(metavar="NAME", help="The name of the run: run.name of its scenario.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The recording to write.")] = Path("recording.rrd"),
+    credentials: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The observer's: access/credentials/observer.json.")
+    ] = None,
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
@@ -366,19 +449,21 @@ def _run_live(
     world: World,
     folder: RunFolder,
     options: LiveOptions,
-    check_determinism: bool = False,
+    asked: Asked,
+    first_of_all: str | None = None,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
     quiet_zenoh()
     emulation = Emulation(scenario, world, folder)
-    if options.record is not None:
-        sinks = options.record.inside(folder.path)
-        options = replace(options, record=sinks)
-        if sinks.serve is not None:
-            print(sinks.serve.told(), file=sys.stderr)
-    with ProgressLine(emulation) as progress:
-        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state))
-    _finish(emulation, wall_s, interrupted, "run", check_determinism)
+    sinks = None if options.record is None else options.record.inside(folder.path)
+    options = replace(options, record=sinks)
+    with show_progress(emulation, asked.log_format, asked.quiet) as progress:
+        if first_of_all is not None:
+            progress.state(first_of_all)
+        if sinks is not None and sinks.serve is not None:
+            progress.state(sinks.serve.told())
+        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state, on_missing=progress.awaits))
+        _finish(emulation, progress, wall_s, interrupted, "run", asked)
 
 
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:
@@ -394,17 +479,35 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
         raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
 
 
-def _finish(emulation: Emulation, wall_s: float, interrupted: bool, command: str, check_determinism: bool) -> None:
+def _finish(
+    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: Asked
+) -> None:
+    """Judge a run and print its summary; exits with the verdict's status."""
+    progress.judging()
     judgement, verdict = conclude(emulation, wall_s, command)
-    if check_determinism and not interrupted:
-        verdict = run_again(emulation, judgement, verdict, command)
-    print_summary(judgement, verdict, emulation.folder.path, Console())
-    raise typer.Exit(130 if interrupted else judgement.exit_status)
+    progress.close()
+    if asked.check_determinism and not interrupted:
+        again = ["--quiet"] if asked.quiet or asked.log_format is LogFormat.JSON else []
+        verdict = run_again(emulation, judgement, verdict, command, again)
+    status = 130 if interrupted else judgement.exit_status
+    folder = emulation.folder.path
+    progress.ended(verdict, str(folder), status)
+    if asked.log_format is LogFormat.JSON:
+        print(json.dumps(verdict))
+    elif asked.quiet:
+        print(f"verdict: {judgement.verdict}  {folder}")
+    else:
+        print_summary(judgement, verdict, folder, Console(), asked.report)
+    if asked.report:
+        report_at_end(folder)
+    raise typer.Exit(status)
 
 
 def main() -> None:
     """The console script."""
-    app()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a sign that a terminal does not know is no reason to fail
+    sys.exit(run_app(app, sys.argv[1:]))
 
 
 if __name__ == "__main__":

@@ -2,37 +2,53 @@
 
 from __future__ import annotations
 
+import json
+import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from msgspec import convert
 from rich.console import Console
 from rich.table import Table
 
 from emulator.run.control import ask
+from emulator.run.course import Snapshot
+from emulator.run.dashboard import Dashboard
+from emulator.run.painter import Painter
+from emulator.run.progress import terminal
 from emulator.terminal import one_line_errors
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError
 from vnet.faults import KINDS, parse_fault
 
 app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
 
-RunOption = Annotated[Path, typer.Option("--run", help="The folder of the run.")]
+RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
 LATEST = Path("runs/latest")
+WATCH_EVERY_S = 1.0
+ALL_ROWS = 50
 
 
 @app.command()
 def inject(
-    kind: Annotated[str, typer.Argument(help=f"One of {', '.join(KINDS)}.")],
-    lasting: Annotated[float, typer.Option("--for", help="Emulated seconds.")] = 5.0,
-    at: Annotated[float | None, typer.Option(help="When, in emulated seconds; the default is now.")] = None,
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(KINDS)}.")],
+    lasting: Annotated[float, typer.Option("--for", metavar="SECONDS", help="How long, in emulated time.")] = 5.0,
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="When, in emulated time. Default: now.")
+    ] = None,
     parameters: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="As in a scenario: probability=0.5, nodes.random=3"),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. As often as need be.",
+        ),
     ] = None,
     run: RunOption = LATEST,
 ) -> None:
-    """Start a fault: vnet fault inject loss --for 5 --set probability=0.5 --set nodes.fraction=0.2"""
+    """Start a fault: vnet fault inject loss --for 5 --set probability=0.5"""
     with one_line_errors():
         fault: dict[str, Any] = {"kind": kind, "duration_s": lasting}
         if at is not None:
@@ -45,7 +61,8 @@ def inject(
 
 @app.command()
 def heal(
-    name: Annotated[str, typer.Argument(help="The fault's name, as loss-0, or all.")], run: RunOption = LATEST
+    name: Annotated[str, typer.Argument(metavar="NAME", help="The fault's name, such as loss-0; or all.")],
+    run: RunOption = LATEST,
 ) -> None:
     """End a fault now."""
     with one_line_errors():
@@ -57,20 +74,48 @@ def heal(
 def list_faults(run: RunOption = LATEST) -> None:
     """All faults of the run: those that were, are and will be."""
     with one_line_errors():
-        _show(ask(run, "status")["faults"])
+        if faults := ask(run, "status")["faults"]:
+            _show(faults)
+        else:
+            print("no faults are planned")
 
 
-def status(run: RunOption = LATEST) -> None:
-    """How a running emulator gets on."""
+def status(
+    run: RunOption = LATEST,
+    as_json: Annotated[
+        bool, typer.Option("--json", metavar="", help="As one JSON object; docs/terminal.md says what is in it.")
+    ] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", metavar="", help="Go on showing it until the run is over.")
+    ] = False,
+) -> None:
+    """How a running emulator gets on: time, vehicles, errors, frames, faults, events."""
     with one_line_errors():
+        if as_json and watch:
+            raise VnetError("--json and --watch exclude each other")
         found = ask(run, "status")
-        table = Table(title=f"run {found['run']}", show_header=False)
-        table.add_row("time", f"{found['emulated_s']:.1f} of {found['duration_s']:g} s, {found['pacing']}")
-        table.add_row("vehicles", f"{found['vehicles']}, down: {', '.join(found['down']) or 'none'}")
-        table.add_row("frames", ", ".join(f"{name} {count:,}" for name, count in found["frames"].items()))
-        acting = [fault["fault"] for fault in found["faults"] if fault["state"] == "acting"]
-        table.add_row("faults acting", ", ".join(acting) or "none")
-        Console().print(table)
+        if as_json:
+            print(json.dumps(found))
+        elif watch:
+            _watch(run, convert(found, Snapshot))
+        else:
+            Console().print(Dashboard(convert(found, Snapshot), steady=False), height=ALL_ROWS, end="")
+
+
+def _watch(run: Path, shot: Snapshot) -> None:
+    """Show how a run gets on until it is over."""
+    console = terminal(sys.stdout)
+    if console is None:
+        raise VnetError("--watch: needs a terminal; elsewhere use --json, now and then")
+    taken_s = time.monotonic()
+    with Painter(console, lambda: Dashboard(shot, time.monotonic() - taken_s)):
+        while True:
+            time.sleep(WATCH_EVERY_S)
+            try:
+                shot, taken_s = convert(ask(run, "status"), Snapshot), time.monotonic()
+            except VnetError:
+                break
+    print(f"{run}: the run is over")
 
 
 def _set(fault: dict[str, Any], parameter: str) -> None:

@@ -33,7 +33,9 @@ def render(
     ] = None,
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
-    """Make a run's recording anew, from its files alone."""
+    """Make a run's recording anew, and where it lies in the run's folder the report, from its files alone."""
+    from emulator.observe.report.write import write_report  # matplotlib is slow to import
+
     with one_line_errors():
         played = messages(run)
         recording = out or run / RECORDING
@@ -43,6 +45,8 @@ def render(
             recording.name, lambda part: _write_recording(played, Sinks(part, vehicle=rerun_vehicle))
         )
         print(recording)
+        if out is None:
+            print(write_report(run))
 
 
 def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:

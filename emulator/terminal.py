@@ -2,20 +2,65 @@
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
+from itertools import pairwise
 
 import typer
 
-from vnet.errors import VnetError
+from vnet.errors import LONGEST_MESSAGE, VnetError, printable
+
+WRONG_USAGE = 2
+
+
+class LogFormat(StrEnum):
+    """What is written on stderr."""
+
+    TEXT = "text"
+    JSON = "json"
 
 
 @contextmanager
-def one_line_errors() -> Iterator[None]:
+def one_line_errors(log_format: LogFormat = LogFormat.TEXT) -> Iterator[None]:
     """Say what went wrong in one line, and end with status 2."""
     try:
         yield
     except VnetError as error:
-        print(f"vnet: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
+        _say(str(error), log_format)
+        raise typer.Exit(WRONG_USAGE) from None
+
+
+def _say(message: str, log_format: LogFormat) -> None:
+    if log_format is LogFormat.JSON:
+        print(json.dumps({"kind": "error", "message": message, "exit_status": WRONG_USAGE}), file=sys.stderr)
+    else:
+        print(f"vnet: {message}", file=sys.stderr)
+
+
+def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
+    """Run a command line to its end; returns its exit status. A line that makes no sense gets one line of error."""
+    try:
+        return app(list(arguments), prog_name="vnet", standalone_mode=False) or 0
+    except typer.TyperException as error:
+        if type(error).__name__ != "NoArgsIsHelpError":  # then help has been printed
+            _say(_in_one_line(error), _asked_for(arguments))
+        return WRONG_USAGE
+
+
+def _in_one_line(error: typer.TyperException) -> str:
+    """What is wrong with a command line, what may have been meant, and where to read more."""
+    meant = getattr(error, "possibilities", None)
+    text = f"{error.message}; did you mean {' or '.join(meant)}?" if meant else error.format_message()
+    text = " ".join(text.replace("Value error, ", "").replace(". Did you", "; did you").split()).removesuffix(".")
+    context = getattr(error, "ctx", None)
+    command = "vnet" if context is None else context.command_path
+    return printable(f"{text[:1].lower()}{text[1:]} ({command} --help says more)", LONGEST_MESSAGE)
+
+
+def _asked_for(arguments: Sequence[str]) -> LogFormat:
+    """The log format that a command line asks for, even if it makes no sense otherwise."""
+    asked = "--log-format=json" in arguments or ("--log-format", "json") in pairwise(arguments)
+    return LogFormat.JSON if asked else LogFormat.TEXT

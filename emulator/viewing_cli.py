@@ -10,7 +10,15 @@ from typing import Annotated
 
 import typer
 
-from emulator.observe.sinks import RECORDING, has_display, place_to_serve, serve_file, viewer_command
+from emulator.observe.sinks import (
+    RECORDING,
+    has_display,
+    is_closed,
+    mend,
+    place_to_serve,
+    serve_file,
+    viewer_command,
+)
 from emulator.run.control import read_way_in
 from emulator.terminal import one_line_errors
 from vnet.errors import VnetError
@@ -41,7 +49,10 @@ def view(
             return
         recording = run / RECORDING
         if not recording.exists():
-            raise VnetError(f"{run}: has no {RECORDING}: it is made by vnet run --rerun save")
+            raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
+        if not is_closed(recording):
+            recording = mend(recording)
+            print(f"the recording was not closed: what it has is in {recording}", flush=True)
         if has_display() and not serve and rerun_bind is None and rerun_port is None:
             with contextlib.suppress(KeyboardInterrupt):
                 subprocess.run(viewer_command("--new", str(recording)))

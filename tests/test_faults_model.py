@@ -138,7 +138,7 @@ def test_what_is_wrong_is_one_line_here_and_in_a_scenario(
     [
         ({"duration_s": 1}, "a kind is needed"),
         ({"kind": "quake", "duration_s": 1}, "kind = 'quake': must be one of ConstPosOffset, DataReplay, "),
-        ({"kind": "Kill", "duration_s": 1}, "kind = 'Kill': must be one of "),
+        ({"kind": "Kill", "duration_s": 1}, "kind = 'Kill' (did you mean kill?): must be one of "),
         ([], "dictionary"),
         (None, "dictionary"),
         ("kill", "dictionary"),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel
 
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, did_you_mean
 from vnet.scenario import Scenario, dump_scenario, input_digests, load_scenario
 
 ROOT = Path(__file__).parents[1]
@@ -318,3 +318,18 @@ def test_some_vehicles_may_run_another_program(tmp_path: Path) -> None:
     assert (program.of("v2").entry, program.of("v2").options) == ("a:b", {})
     with pytest.raises(ScenarioError, match="'v1' is in two exceptions"):
         load_scenario(write(tmp_path, text + '[[program.exceptions]]\nnodes = ["v1"]\nentry = "c:d"\n'))
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("partion", " (did you mean partition?)"),
+        ("DOS", " (did you mean DoS?)"),
+        ("quake", ""),
+        ("", ""),
+        ("partition" * 100_000, ""),
+        (7, ""),
+    ],
+)
+def test_what_may_have_been_meant(word: object, meant: str) -> None:
+    assert did_you_mean(word, ["kill", "partition", "DoS", "range"]) == meant

@@ -4,6 +4,11 @@ Each message is one line that names the thing, the value and what is allowed. Mi
 assertions, not members of this family.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 LONGEST_MESSAGE = 2000
 """Characters of a whole message."""
 LONGEST_SHOWN = 100
@@ -34,6 +39,15 @@ def shown(value: object) -> str:
         return printable(repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits; a value nested too deeply
         return f"({type(value).__name__})"
+
+
+def did_you_mean(word: object, known: Iterable[str]) -> str:
+    """What a misspelt word may have been meant to be, as ` (did you mean …?)`; empty if it is like none."""
+    if not isinstance(word, str) or len(word) > LONGEST_SHOWN:  # comparing takes time in the square of its length
+        return ""
+    by_small_letters = {name.lower(): name for name in known}
+    close = get_close_matches(word.lower(), by_small_letters, n=1, cutoff=0.7)
+    return f" (did you mean {by_small_letters[close[0]]}?)" if close else ""
 
 
 class ScenarioError(VnetError):

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import ScenarioError, did_you_mean, printable, shown
 from vnet.faults import Fault
 from vnet.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from vnet.sections import Section, first_problem
@@ -37,6 +37,8 @@ FAR_S = 1e11
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
+MOST_NAMED = 8
+"""Files that a message names."""
 
 
 class Run(Section):
@@ -317,7 +319,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     try:
         data = read_toml(path)
     except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
     recorded_digests = data.pop("inputs", {})
@@ -337,6 +339,17 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         if recorded_digests.get(name, digest) != digest:
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
     return scenario
+
+
+def _instead(path: Path) -> str:
+    """What may have been meant by a path that is no file."""
+    try:
+        inside = sorted(each.name for each in path.glob("*.toml"))
+        if inside:
+            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+        return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
+    except (OSError, ValueError):
+        return ""
 
 
 def dump_scenario(scenario: Scenario) -> str:

@@ -7,7 +7,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from vnet.errors import printable, shown
+from vnet.errors import did_you_mean, printable, shown
 
 
 class Section(BaseModel):
@@ -21,16 +21,21 @@ class Section(BaseModel):
 
 def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]) -> str:
     """The first of pydantic's complaints about a value `of` this kind, as `key = value: what is allowed`."""
-    problem = error.errors()[0]
+    problems = error.errors()
+    # A key that is misspelt is unknown, and the one that was meant may be missing.
+    problem = next((each for each in problems if each["type"] == "extra_forbidden"), problems[0])
     place = problem["loc"]
     key = printable(".".join(str(part) for part in place) or "it")
+    before = f"{key}: " if place else ""
     if problem["type"] == "extra_forbidden":
-        return f"{key}: unknown key; allowed here: {', '.join(_allowed_keys(of, place[:-1]))}"
+        allowed = _allowed_keys(of, place[:-1])
+        return f"{key}: unknown key{did_you_mean(place[-1], allowed)}; allowed here: {', '.join(allowed)}"
     if problem["type"] == "union_tag_not_found":
-        return f"{key}: a kind is needed"
+        return f"{before}a kind is needed"
     if problem["type"] == "union_tag_invalid":
         kinds = sorted(problem["ctx"]["expected_tags"].replace("'", "").split(", "))
-        return f"{key}: kind = {shown(problem['ctx']['tag'])}: must be one of {', '.join(kinds)}"
+        tag = problem["ctx"]["tag"]
+        return f"{before}kind = {shown(tag)}{did_you_mean(tag, kinds)}: must be one of {', '.join(kinds)}"
     message = problem["msg"].removeprefix("Value error, ")
     message = message[0].lower() + message[1:]
     if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value

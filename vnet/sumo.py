@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat
@@ -10,6 +11,7 @@ from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, shown
 
 LARGEST_BYTES = 1 << 20
+LATEST_S = 1e9
 _UNITS_S = (1.0, 60.0, 3600.0, 86400.0)
 
 
@@ -30,9 +32,12 @@ def read_begin_s(path: Path) -> float:
     """The time in seconds at which a configuration begins. Raises ScenarioError."""
     text = _values(path).get("begin", "0")
     try:  # seconds, or days:hours:minutes:seconds
-        return sum(float(part) * unit for part, unit in zip(reversed(text.split(":")), _UNITS_S, strict=False))
+        begin_s = sum(float(part) * unit for part, unit in zip(reversed(text.split(":")), _UNITS_S, strict=False))
     except ValueError:
-        raise ScenarioError(f"{path}: begin = {shown(text)}: seconds, or hours:minutes:seconds") from None
+        begin_s = math.nan
+    if not 0 <= begin_s <= LATEST_S:
+        raise ScenarioError(f"{path}: begin = {shown(text)}: seconds, or hours:minutes:seconds, from 0 on")
+    return begin_s
 
 
 def _values(path: Path) -> dict[str, str]:

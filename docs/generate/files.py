@@ -28,6 +28,7 @@ FOLDER = {
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
+    "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the way in for `vnet fault` and `vnet status`; there while a live run is on",
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",

@@ -26,7 +26,7 @@ from emulator.channel.topology import Topology
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
-from vnet.errors import VnetError
+from vnet.errors import ScenarioError, VnetError
 from vnet.roads.lanes import Array
 from vnet.scenario import Scenario
 
@@ -45,6 +45,8 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     and both for each component by itself, where x̄ is the component's mean. `run`, a run's folder, adds `measured`.
     Raises VnetError where the network or the run cannot be used.
     """
+    if scenario.network.moves:
+        raise ScenarioError("analyze: says what one graph is like, and where vehicles move the network has many")
     world = build_world(scenario)
     hears = hears_matrix(scenario, world)
     weak = components(world.at(0).position_m, scenario.radio.range_m, hears)

@@ -21,14 +21,20 @@ app = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, and v
 FOLDER = Path("runs/experiments")
 
 NetworksOption = Annotated[
-    Path | None, typer.Option(help="Folder with network_n1.csv, _n2, _n3; generated ones otherwise.")
+    Path | None,
+    typer.Option(metavar="FOLDER", help="With network_n1.csv, _n2, _n3; generated ones otherwise."),
 ]
-OutOption = Annotated[Path | None, typer.Option(help="Folder for the results; an interrupted run goes on there.")]
-LiveOption = Annotated[bool, typer.Option("--live", help="Run over Zenoh, a process a vehicle, and not simulated.")]
+OutOption = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="For the results; an interrupted run goes on there.")
+]
+LiveOption = Annotated[
+    bool, typer.Option("--live", metavar="", help="Run over Zenoh, a process a vehicle, and not simulated.")
+]
 OnlyOption = Annotated[
-    list[str] | None, typer.Option("--only", help="label=value: only such cells, for example --only network=n2.")
+    list[str] | None,
+    typer.Option("--only", metavar="LABEL=VALUE", help="Only such cells, for example --only network=n2."),
 ]
-SeedsOption = Annotated[int, typer.Option(min=1, help="Seeds 1 … N.")]
+SeedsOption = Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N.")]
 
 
 @app.command()
@@ -107,7 +113,7 @@ def tempering(
 def divergence(
     networks: NetworksOption = None,
     seeds: SeedsOption = 100,
-    duration: Annotated[float, typer.Option(min=1, help="Emulated seconds.")] = 30.0,
+    duration: Annotated[float, typer.Option(min=1, metavar="SECONDS", help="Emulated length of each run.")] = 30.0,
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
@@ -126,7 +132,8 @@ def draw_figures(
     networks: NetworksOption = None,
     seeds: SeedsOption = 3,
     out: OutOption = None,
-    cells_from: Annotated[Path, typer.Option(help="Where Table II keeps its cells.")] = FOLDER / "table2",
+    cells_from: Annotated[Path, typer.Option(metavar="FOLDER", help="Where Table II keeps its cells.")] = FOLDER
+    / "table2",
 ) -> None:
     """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
     from emulator.experiments import figures

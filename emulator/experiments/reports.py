@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
 from emulator.experiments.paper import ALPHAS
 from emulator.experiments.tables import markdown_table, mean_and_error, paired_difference, paired_ratio
+from emulator.observe.metrics import anees_band
 
 Result = Mapping[str, Any]
 LIMIT_RATIO = 1.35
@@ -118,12 +118,6 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
         row += [f"{ratio:.2f} ± {error:.2f}", f"{paper:.2f}"]
     header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
     return markdown_table(header, [*rows, row])
-
-
-def anees_band(runs: int) -> tuple[float, float]:
-    """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
-    low, high = chi2.ppf([0.025, 0.975], 2 * runs) / (2 * runs)
-    return float(low), float(high)
 
 
 def default_profile(results: Sequence[Result]) -> str:

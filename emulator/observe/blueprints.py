@@ -26,7 +26,7 @@ def overview() -> rrb.Vertical:
                 origin="legend",
                 name="Legend",
                 titlebar=False,
-                visual_bounds=rrb.VisualBounds2D(x_range=(-1.6, 24.0), y_range=(-0.6, 2.0)),
+                visual_bounds=rrb.VisualBounds2D(x_range=(-1.2, 26.6), y_range=(-0.6, 2.0)),
             ),
             column_shares=[4, 5],
         ),
@@ -38,7 +38,10 @@ def overview() -> rrb.Vertical:
             ),
             rrb.Vertical(
                 _against_time("figures/common", "Common error (m)"),
-                _against_time("figures/consensus", "Consensus (m)"),
+                rrb.Tabs(
+                    _against_time("figures/consensus", "Consensus (m)"),
+                    _against_time("figures/position", "RMSE of position (m)"),
+                ),
                 _against_time("radio/frames", "Frames a period by outcome, stacked"),
                 row_shares=[4, 2, 3],
             ),
@@ -50,7 +53,7 @@ def overview() -> rrb.Vertical:
             _events(),
             column_shares=[2, 3, 4],
         ),
-        row_shares=[1.25, 7, 2.8],
+        row_shares=[1.4, 7, 2.8],
         name="Overview",
     )
 
@@ -93,7 +96,7 @@ def one_vehicle(vehicle: str) -> rrb.Vertical:
             rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears and weighs"),
             column_shares=[2, 1],
         ),
-        row_shares=[5, 4],
+        row_shares=[4, 4],
         name=f"Vehicle {vehicle}",
     )
 

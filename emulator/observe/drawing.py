@@ -5,6 +5,7 @@ Rerun's 2-D views have y downwards, hence the minus signs: east is right, north 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,23 +25,29 @@ Floats = NDArray[np.float32]
 TIMELINE = "emulated time"
 
 # Okabe & Ito 2008: colours that the colour-blind can tell apart, and that show on dark and light.
-BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
+BLUE, SKY, GREEN, ORANGE, RED, PURPLE, YELLOW, GREY, DARK = (
     (0, 114, 178),
     (86, 180, 233),
     (0, 158, 115),
     (230, 159, 0),
     (213, 94, 0),
     (204, 121, 167),
+    (240, 228, 66),
     (150, 150, 150),
     (100, 100, 100),
 )
+DARK_RED, DARK_BLUE = (138, 58, 0), (0, 65, 102)
+"""Shades of red and blue, where there are more things than colours."""
 OUTCOME_COLOURS: dict[Outcome, Colour] = {
     Outcome.delivered: GREEN,
+    Outcome.faded: YELLOW,
+    Outcome.collided: DARK_RED,
     Outcome.lost: RED,
     Outcome.peer_cap: ORANGE,
     Outcome.fault: PURPLE,
     Outcome.receiver_down: GREY,
     Outcome.queue_full: BLUE,
+    Outcome.held_back: DARK_BLUE,
     Outcome.oversize: DARK,
     Outcome.transport: SKY,
 }
@@ -84,9 +91,14 @@ class Period:
         return int(self.message["period"])
 
     @property
-    def time_s(self) -> float:
+    def time_ns(self) -> int:
         """When it began."""
-        return float(self.message["time_ns"]) / 1e9
+        return int(self.message["time_ns"])
+
+    @property
+    def time_s(self) -> float:
+        """The same in seconds."""
+        return self.time_ns / 1e9
 
     def points(self, name: str) -> Floats:
         """One of the (n, 2) arrays, in metres."""
@@ -112,8 +124,9 @@ class Period:
 
     @cached_property
     def down(self) -> list[str]:
-        """The vehicles that are not."""
-        return [node for node, up in zip(self.node_ids, self.up, strict=True) if not up]
+        """The vehicles that are not, though they are in the network."""
+        there = np.isfinite(self.points("position_m")[:, 0])
+        return [node for node, down in zip(self.node_ids, there & ~self.up, strict=True) if down]
 
     @cached_property
     def truth_m(self) -> Floats:
@@ -130,9 +143,8 @@ class Period:
         pairs = self.pairs
         if outcomes:
             pairs = pairs[np.isin(pairs[:, 2], outcomes)]
-        count = np.zeros((len(self.node_ids), len(self.node_ids)), dtype=np.int32)
-        np.add.at(count, (pairs[:, 1], pairs[:, 0]), pairs[:, 3])
-        return count
+        n = len(self.node_ids)
+        return np.bincount(pairs[:, 1] * n + pairs[:, 0], pairs[:, 3], n * n).astype(np.int32).reshape(n, n)
 
     def clouds(self) -> dict[str, Floats]:
         """Hypotheses of the common error by node, (k, 2)."""
@@ -149,13 +161,19 @@ def link_states(period: Period) -> tuple[NDArray[np.intp], NDArray[np.intp], NDA
     A link is `delivered` if a frame got through; else its state is what befell most of them.
     """
     pairs = period.pairs
-    rank = np.where(pairs[:, 2] == Outcome.delivered, np.iinfo(np.int32).max, pairs[:, 3])
-    order = np.lexsort((-rank, pairs[:, 1], pairs[:, 0]))
-    pairs = pairs[order]
-    first = np.ones(len(pairs), dtype=bool)
-    first[1:] = (pairs[1:, :2] != pairs[:-1, :2]).any(axis=1)
-    chosen = pairs[first]
-    return chosen[:, 0].astype(np.intp), chosen[:, 1].astype(np.intp), chosen[:, 2]
+    if not len(pairs):
+        return np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, np.int32)
+    link = pairs[:, 0].astype(np.intp) * len(period.node_ids) + pairs[:, 1]
+    order = np.argsort(link, kind="stable")  # as a rule they come so
+    pairs, link = pairs[order], link[order]
+    rank = np.where(pairs[:, 2] == Outcome.delivered, _FIRST, pairs[:, 3])
+    starts = np.flatnonzero(np.diff(link, prepend=-1))
+    best = np.maximum.reduceat(rank * len(Outcome) + pairs[:, 2], starts)
+    return link[starts] // len(period.node_ids), link[starts] % len(period.node_ids), best % len(Outcome)
+
+
+_FIRST = np.int64(1) << 40
+"""More than there are frames."""
 
 
 def ellipses(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Floats:
@@ -179,18 +197,44 @@ for _outcome, _colour in OUTCOME_COLOURS.items():
     _COLOUR_OF[_outcome] = _colour[:3]
 
 
+class _Rows:
+    """What is to be drawn of one entity, instant by instant."""
+
+    def __init__(self) -> None:
+        self.times_ns: list[int] = []
+        self.arrays: list[NDArray[Any]] = []
+        self.colours: list[NDArray[np.uint8]] = []
+
+    def add(self, time_ns: int, array: NDArray[Any], colours: NDArray[np.uint8] | None = None) -> None:
+        self.times_ns.append(time_ns)
+        self.arrays.append(array)
+        if colours is not None:
+            self.colours.append(colours)
+
+    @property
+    def lengths(self) -> list[int]:
+        """How many there are at each instant."""
+        return [len(array) for array in self.arrays]
+
+
 class Canvas:
-    """A recording to draw on. `at` sets the time; nothing may be awaited between it and what is drawn."""
+    """A recording to draw on. `at` sets the time; nothing may be awaited between it and what is drawn.
+
+    Points, lines and plots are kept until `send`: one message of many instants costs little more than one of one.
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._recording = recording
-        self._time_s = 0.0
-        self._lines: dict[str, tuple[list[float], list[ArrayLike]]] = {}
+        self._time_ns = 0
+        self._points: dict[str, _Rows] = defaultdict(_Rows)
+        self._strips: dict[str, _Rows] = defaultdict(_Rows)
+        self._plots: dict[str, tuple[list[int], list[float]]] = {}
+        self._bars: dict[str, Floats] = {}
 
-    def at(self, time_s: float) -> None:
+    def at(self, time_ns: int) -> None:
         """What is drawn from now on belongs to this emulated time."""
-        self._time_s = time_s
-        self._recording.set_time(TIMELINE, duration=time_s)
+        self._time_ns = time_ns
+        self._recording.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"))
 
     def log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
         """Anything that Rerun knows."""
@@ -218,12 +262,13 @@ class Canvas:
         )
         self.log(entity, style, static=True)
 
-    def points(
-        self, entity: str, position_m: ArrayLike, colours: NDArray[np.uint8] | None = None, static: bool = False
-    ) -> None:
+    def points(self, entity: str, position_m: ArrayLike, static: bool = False) -> None:
         """Points (k, 2) where they are now; those at NaN are not seen."""
         position = flipped(np.asarray(position_m, dtype=np.float32).reshape(-1, 2))
-        self.log(entity, rr.Points2D.from_fields(positions=position, colors=colours), static=static)
+        if static:
+            self.log(entity, rr.Points2D.from_fields(positions=position), static=True)
+        else:
+            self._points[entity].add(self._time_ns, position)
 
     def labels(
         self, entity: str, position_m: ArrayLike, colours: Colour | ArrayLike, labels: Sequence[str]
@@ -245,8 +290,11 @@ class Canvas:
         self, entity: str, strips_m: Any, colours: NDArray[np.uint8] | None = None, static: bool = False
     ) -> None:
         """Lines (k, corners, 2) as they are now."""
-        strips = _strip_array(flipped(strips_m))
-        self.log(entity, rr.LineStrips2D.from_fields(strips=strips, colors=colours), static=static)
+        strips = flipped(strips_m)
+        if static:
+            self.log(entity, rr.LineStrips2D.from_fields(strips=_strip_array([strips])), static=True)
+        else:
+            self._strips[entity].add(self._time_ns, strips, colours)
 
     def rings(self, entity: str, radii_m: Sequence[float], cross: bool = True) -> None:
         """Circles around the origin, each with its radius in words: the scale of a view."""
@@ -267,42 +315,64 @@ class Canvas:
         lines = rr.SeriesLines(names=names, colors=colours, widths=widths)
         self.log(entity, lines, static=True)
 
+    def states(self, entity: str, colours: Mapping[str, Colour]) -> None:
+        """Announce states of a timeline, and their colours; others have colours of Rerun's choice."""
+        style = rr.StateConfiguration(values=list(colours), colors=list(colours.values()))
+        self.log(entity, style, static=True)
+
     def plot(self, entity: str, *values: float) -> None:
-        """One more value of each line of an entity, NaN for none; shown with the next `send_lines`."""
-        times, rows = self._lines.setdefault(entity, ([], []))
-        times.append(self._time_s)
-        rows.append(values)
+        """One more value of each line of an entity against time, NaN for none."""
+        self.plot_at(entity, [self._time_ns], values)
 
-    def plot_at(self, entity: str, times_s: Sequence[float], values: Sequence[float]) -> None:
-        """More values of an entity of one line."""
-        times, rows = self._lines.setdefault(entity, ([], []))
-        times.extend(times_s)
-        rows.extend([value] for value in values)
+    def plot_at(self, entity: str, times_ns: Sequence[int], values: Sequence[float]) -> None:
+        """More values of an entity: at each time as many as it has lines."""
+        times, numbers = self._plots.setdefault(entity, ([], []))
+        times.extend(times_ns)
+        numbers.extend(values)
 
-    def send_lines(self) -> None:
-        """Send all that was plotted."""
-        for entity, (times, rows) in self._lines.items():
-            if times:
-                values = np.asarray(rows, dtype=float)
-                scalars = rr.Scalars.columns(scalars=values.ravel())
-                if values.shape[1] > 1:
-                    scalars = scalars.partition(np.full(len(values), values.shape[1]))
-                index = [rr.TimeColumn(TIMELINE, duration=np.asarray(times))]
-                self._recording.send_columns(entity, indexes=index, columns=scalars)
-        self._lines.clear()
+    def bars(self, entity: str, values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> None:
+        """A bar chart with bars of `width` around `middles`, which are only told when they change."""
+        where, heights = np.asarray(middles, dtype=np.float32), np.asarray(values, dtype=np.float32)
+        told = self._bars.get(entity)
+        if told is None or not np.array_equal(told, where):
+            self._bars[entity] = where
+            widths = np.full(len(where), width, dtype=np.float32)
+            self.log(entity, rr.BarChart(heights, color=colour, abscissa=where, widths=widths))
+        else:
+            self.log(entity, rr.BarChart.from_fields(values=heights))
+
+    def send(self) -> None:
+        """Send what has been kept."""
+        for entity, rows in self._points.items():
+            columns = rr.Points2D.columns(positions=np.concatenate(rows.arrays))
+            self._recording.send_columns(entity, _index(rows.times_ns), columns.partition(rows.lengths))
+        for entity, rows in self._strips.items():
+            colours = np.concatenate(rows.colours) if rows.colours else None
+            columns = rr.LineStrips2D.columns(strips=_strip_array(rows.arrays), colors=colours)
+            self._recording.send_columns(entity, _index(rows.times_ns), columns.partition(rows.lengths))
+        for entity, (times_ns, numbers) in self._plots.items():
+            columns = rr.Scalars.columns(scalars=np.array(numbers))
+            lines = np.full(len(times_ns), len(numbers) // len(times_ns))
+            self._recording.send_columns(entity, _index(times_ns), columns.partition(lines))
+        for kept in (self._points, self._strips, self._plots):
+            kept.clear()
+
+
+def _index(times_ns: Sequence[int]) -> list[rr.TimeColumn]:
+    return [rr.TimeColumn(TIMELINE, duration=np.array(times_ns, dtype="timedelta64[ns]"))]
 
 
 _STRIPS = rr.components.LineStrip2DBatch([]).as_arrow_array().type
 
 
-def _strip_array(strips: Floats) -> pa.Array:
-    """Strips of equally many corners as Rerun keeps them; its own conversion goes strip by strip."""
-    if not strips.size:
+def _strip_array(arrays: Sequence[Floats]) -> pa.Array:
+    """Strips (k, corners, 2) of all arrays as Rerun keeps them; its own conversion goes strip by strip."""
+    corners = np.concatenate([np.full(len(array), array.shape[1], dtype=np.int32) for array in arrays])
+    if not len(corners):
         return pa.array([], type=_STRIPS)
-    count, corners, _ = strips.shape
-    points = rr.encodings.Vec2DBatch(strips.reshape(-1, 2)).as_arrow_array()
-    starts = pa.array(np.arange(0, (count + 1) * corners, corners, dtype=np.int32))
-    return pa.ListArray.from_arrays(starts, points, type=_STRIPS)
+    points = rr.encodings.Vec2DBatch(np.concatenate([array.reshape(-1, 2) for array in arrays])).as_arrow_array()
+    starts = np.concatenate([[0], np.cumsum(corners)]).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(starts), points, type=_STRIPS)
 
 
 def nice_length(at_most: float) -> float:
@@ -319,14 +389,3 @@ def in_length(length_m: float) -> str:
 def flipped(position: ArrayLike) -> Floats:
     """East, north as Rerun's x right, y down."""
     return np.asarray(position, dtype=np.float32) * np.array([1, -1], dtype=np.float32)
-
-
-def bars(values: ArrayLike, middles: ArrayLike, width: float, colour: Colour) -> rr.BarChart:
-    """A bar chart with bars of `width` around `middles`."""
-    heights = np.asarray(values, dtype=np.float32)
-    return rr.BarChart(
-        heights,
-        color=colour,
-        abscissa=np.asarray(middles, dtype=np.float32),
-        widths=np.full(len(heights), width, dtype=np.float32),
-    )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from emulator.world.world import Instant
 from vnet.link.node import Report
@@ -268,6 +269,12 @@ def _anees(error: Array, covariance: Array) -> float | None:
         return None
     error, matrix = error[regular], matrix[regular]
     return float(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(matrix), error)) / 2)
+
+
+def anees_band(samples: int) -> tuple[float, float]:
+    """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
+    low, high = chi2.ppf([0.025, 0.975], 2 * samples) / (2 * samples)
+    return float(low), float(high)
 
 
 def _is_not_finite(report: Report) -> bool:

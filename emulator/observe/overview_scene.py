@@ -12,10 +12,12 @@ import rerun as rr
 from emulator.observe.drawing import (
     BLUE,
     COMMON_RINGS_M,
+    DARK,
     GREEN,
     GREY,
     OUTCOME_COLOURS,
     POSITION_RINGS_M,
+    PURPLE,
     RED,
     SKY,
     Canvas,
@@ -34,15 +36,17 @@ from emulator.observe.observation import unpack
 from emulator.observe.paper_values import paper_rmse
 
 LANE_HALF_LENGTH_M = 250.0
-ELLIPSES_EVERY_S = 0.5
+ELLIPSES_EVERY_S = 1.0
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-LIMIT_VEHICLES = 200
+LIMIT_VEHICLES = 100
 """The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60
 NAMED_DOWN = 6
+ACTING, NOBODY = "acting", "none"
+"""States of faults, and of those who are down."""
 LEGEND_STEP = 3.1
 """From one name of the legend to the next; its rows are 1 apart."""
 
@@ -58,6 +62,7 @@ class OverviewScene:
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
+        self._known_faults: set[str] = set()
         self._down: list[str] | None = None
         self._clouds: dict[str, Floats] = {}  # each vehicle's latest
         self._trusted = False  # whether any weights have been reported
@@ -83,13 +88,14 @@ class OverviewScene:
         if self._paper is not None:
             common.append((self._paper[0], GREY, 1.5))
         canvas.series("figures/common", common)
+        canvas.states("faults/down", {NOBODY: DARK})
         consensus = [("consensus error", BLUE, 2.0), ("error of the network's mean", GREEN, 1.5)]
         canvas.series("figures/consensus", consensus)
         canvas.series("figures/position", [("estimate", SKY, 2.0), ("raw fix", GREY, 1.0)])
 
     def _set_styles(self) -> None:
         canvas = self._canvas
-        canvas.strip_style("map/links", None, 1.0, -10.0)
+        canvas.strip_style("map/links", None, 1.8, -10.0)
         canvas.point_style("map/true", None, 5.0, self._node_ids)
         canvas.point_style("map/fix", GREY, 2.0)
         canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
@@ -97,7 +103,7 @@ class OverviewScene:
         canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
         canvas.point_style("common/particles", GREY, 1.0)
         canvas.point_style("common/estimates", SKY, 4.0, self._node_ids)
-        canvas.strip_style("common/ellipses", (*SKY, 110), 1.0)
+        canvas.strip_style("common/ellipses", (*SKY, 130), 1.2)
 
     def period(self, period: Period) -> None:
         """Draw a period."""
@@ -107,7 +113,7 @@ class OverviewScene:
         self._trust(period)
         self._faults_and_downs(period)
         self.events(period.message["events"])
-        self._canvas.at(period.time_s)
+        self._canvas.at(period.time_ns)
 
     def _map(self, period: Period) -> None:
         canvas, position = self._canvas, period.points("position_m")
@@ -127,8 +133,9 @@ class OverviewScene:
         common = period.points("common_error_estimate_m") - truth
         canvas.points("common/estimates", common)
         self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
-        for node in period.down:
-            self._clouds.pop(node, None)
+        for node, up in zip(self._node_ids, period.up, strict=True):
+            if not up:
+                self._clouds.pop(node, None)
         if period.time_s >= self._next_ellipses_s:
             self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
             outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
@@ -163,7 +170,10 @@ class OverviewScene:
     def _faults_and_downs(self, period: Period) -> None:
         acting = set(period.message["faults"])
         for label in sorted(acting ^ self._faults):
-            state = "acting" if label in acting else ""  # an empty state ends the one before
+            if label not in self._known_faults:
+                self._known_faults.add(label)
+                self._canvas.states(f"faults/{label}", {ACTING: PURPLE})
+            state = ACTING if label in acting else ""  # an empty state ends the one before
             self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
         self._faults = acting
         down = period.down
@@ -171,14 +181,13 @@ class OverviewScene:
             colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
             self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
             shown = ", ".join(down[:NAMED_DOWN]) + (" …" if len(down) > NAMED_DOWN else "")
-            if down or self._down:
-                self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else ""))
+            self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else NOBODY))
             self._down = down
 
     def events(self, events: Iterable[Mapping[str, Any]]) -> None:
         """Write down what happened, each event at its own time."""
         for event in events:
-            self._canvas.at(event["time_ns"] / 1e9)
+            self._canvas.at(event["time_ns"])
             level = "WARN" if event["kind"] in WARNINGS else "INFO"
             self._canvas.log("events", rr.TextLog(in_words(event), level=level))
 
@@ -212,7 +221,8 @@ def draw_legend(canvas: Canvas) -> None:
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     links = [(outcome_title(outcome), colour) for outcome, colour in OUTCOME_COLOURS.items()]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
-        place = [[LEGEND_STEP * number, row] for number in range(len(items))]
+        place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
+        canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
         colours = [list(colour) for _, colour in items]
         canvas.point_style(f"legend/{entity}", colours, 5.0, [label for label, _ in items], show_labels=True)
         canvas.points(f"legend/{entity}", place, static=True)

@@ -20,7 +20,6 @@ from emulator.observe.drawing import (
     Canvas,
     Floats,
     Period,
-    bars,
     outcome_title,
 )
 from emulator.observe.observation import LATENCY_BIN_NS
@@ -29,7 +28,7 @@ WINDOW_S = 5.0
 """Shares, histograms and loads are those of so many last seconds."""
 EVERY_S = 1.0
 DISTANCE_BINS = 20
-STROKES = 4
+STROKES = 8
 """The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
 LEAST_LATENCY_BINS = 8
 LARGEST_MATRIX = 400
@@ -37,22 +36,22 @@ LARGEST_MATRIX = 400
 
 
 class Window:
-    """Sums of arrays over the last periods."""
+    """Sums of arrays of whole numbers over the last periods."""
 
     def __init__(self, periods: int) -> None:
-        self._kept: deque[NDArray[Any]] = deque(maxlen=max(1, periods))
+        self._kept: deque[NDArray[Any]] = deque()
+        self._periods = max(1, periods)
+        self.total: NDArray[Any] = np.zeros(1)
 
     def add(self, array: NDArray[Any]) -> None:
         """Take one period's."""
         self._kept.append(array)
+        self.total = self.total + array
+        if len(self._kept) > self._periods:
+            self.total -= self._kept.popleft()
 
     def __len__(self) -> int:
         return len(self._kept)
-
-    @property
-    def total(self) -> NDArray[Any]:
-        """The sum."""
-        return np.asarray(np.sum(self._kept, axis=0))
 
 
 class RadioScene:
@@ -61,7 +60,8 @@ class RadioScene:
     def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
         self._canvas = canvas
         self._count = len(scene["node_ids"])
-        self._period_s = scene["period_ns"] / 1e9
+        self._period_ns: int = scene["period_ns"]
+        self._period_s = self._period_ns / 1e9
         self._range_m: float | None = scene["range_m"]
         periods = round(WINDOW_S / self._period_s)
         self._tried, self._delivered = Window(periods), Window(periods)
@@ -80,15 +80,15 @@ class RadioScene:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
-        self._sent.add(period.numbers("sent_bytes"))
-        self._received.add(period.numbers("received_bytes"))
+        self._sent.add(period.numbers("sent_bytes").astype(float))
+        self._received.add(period.numbers("received_bytes").astype(float))
         if period.time_s >= self._next_s:
             self._next_s = period.time_s + EVERY_S
             self._charts(period)
 
     def _stack(self, period: Period) -> None:
         """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back."""
-        times = period.time_s + self._period_s * np.arange(2 * STROKES) / (2 * STROKES)
+        times_ns = (period.time_ns + self._period_ns * np.arange(2 * STROKES) // (2 * STROKES)).tolist()
         lower = 0.0
         for outcome, colour in OUTCOME_COLOURS.items():
             count = period.message["outcomes"].get(outcome.name, 0)
@@ -101,7 +101,7 @@ class RadioScene:
                 self._canvas.log(entity, style, static=True)
             if entity in self._announced:
                 layer = [lower, lower + count] * STROKES if count else [np.nan]
-                self._canvas.plot_at(entity, times[: len(layer)].tolist(), layer)
+                self._canvas.plot_at(entity, times_ns[: len(layer)], layer)
             lower += count
 
     def _load(self, period: Period) -> None:
@@ -113,10 +113,10 @@ class RadioScene:
         latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
         self._latency_bins = max(self._latency_bins, int(np.flatnonzero(latency).max(initial=0)) + 2)
         latency = latency[: self._latency_bins]
-        canvas.log("radio/latency", bars(latency, (np.arange(len(latency)) + 0.5) * width_ms, width_ms, SKY))
+        canvas.bars("radio/latency", latency, (np.arange(len(latency)) + 0.5) * width_ms, width_ms, SKY)
         for side, name, window, colour in ((-1, "sent", self._sent, SKY), (1, "received", self._received, GREEN)):
             rate = window.total / span_s / 1e3
-            canvas.log(f"radio/bytes/{name}", bars(rate, np.arange(self._count) + 0.2 * side, 0.4, colour))
+            canvas.bars(f"radio/bytes/{name}", rate, np.arange(self._count) + 0.2 * side, 0.4, colour)
         if self._count <= LARGEST_MATRIX:
             self._links(period)
 
@@ -129,10 +129,10 @@ class RadioScene:
         position = period.points("position_m").astype(float)
         distance_m = np.hypot(*(position[:, None] - position[None]).transpose(2, 0, 1))
         tried = np.where(np.isfinite(distance_m), tried, 0)  # who has left is nowhere
+        distance_m = np.nan_to_num(distance_m)
         farthest_m = self._range_m or float(distance_m[tried > 0].max(initial=1.0))
         shares, middles_m, width_m = delivery_by_distance(distance_m, tried, delivered, farthest_m)
-        chart = bars(100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
-        self._canvas.log("radio/distance", chart)
+        self._canvas.bars("radio/distance", 100 * np.nan_to_num(shares), middles_m, 0.95 * width_m, GREEN)
 
 
 def delivery_by_distance(

@@ -1,8 +1,8 @@
 """A Rerun recording of a run, from what the emulator tells observers.
 
-Few batched entities: one for all vehicles, one for all links, one for all particles. Clouds and matrices come once
-a second, lines against time twice. `blueprints` says how it is laid out; lengths are in metres, times in emulated
-seconds, east is right and north is up.
+Few batched entities: one for all vehicles, one for all links, one for all particles. What is drawn is sent once a
+second. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
+north is up.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from emulator.observe.blueprints import blueprint
 from emulator.observe.drawing import Canvas, Period
 from emulator.observe.overview_scene import OverviewScene
 from emulator.observe.radio_scene import RadioScene
-from emulator.observe.sinks import Sinks, open_recording
+from emulator.observe.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.observe.vehicle_scene import VehicleScene
 from vnet.errors import VnetError
 
-LINES_EVERY_S = 0.5
+DRAWN_EVERY_S = 1.0
+"""Periods are drawn some at a time: ten take hardly longer than three that come apart."""
 NAMED = 8
 
 
@@ -41,7 +42,8 @@ class Recorder:
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._node_ids: list[str] = []
-        self._next_lines_s = 0.0
+        self._next_s = 0.0
+        self._waiting: list[Period] = []
         self._last: int | None = None
         self.missed = 0
 
@@ -51,7 +53,7 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._canvas.send_lines()
+        self._draw()
         self._stack.close()
 
     def take(self, stream: str, message: Mapping[str, Any]) -> None:
@@ -59,8 +61,12 @@ class Recorder:
         if stream == "scene" and not self._parts:
             self._begin(message)
         elif stream == "period" and self._parts:
-            self._period(Period(message, self._node_ids))
+            self._waiting.append(Period(message, self._node_ids))
+            if self._waiting[-1].time_s >= self._next_s:
+                self._next_s = self._waiting[-1].time_s + DRAWN_EVERY_S
+                self._draw()
         elif stream == "end" and self._overview is not None:
+            self._draw()
             self._overview.events(message.get("events", []))
 
     def _begin(self, scene: Mapping[str, Any]) -> None:
@@ -76,17 +82,19 @@ class Recorder:
             VehicleScene(self._canvas, scene, vehicle),
         ]
         self._recording.send_blueprint(blueprint(vehicle))
+        self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
 
-    def _period(self, period: Period) -> None:
-        self._canvas.at(period.time_s)
-        if self._last is not None and period.number > self._last + 1:
-            self._tell_gap(period.number - self._last - 1)
-        self._last = period.number
-        for part in self._parts:
-            part.period(period)
-        if period.time_s >= self._next_lines_s:
-            self._next_lines_s = period.time_s + LINES_EVERY_S
-            self._canvas.send_lines()
+    def _draw(self) -> None:
+        """Draw the periods that wait."""
+        for period in self._waiting:
+            self._canvas.at(period.time_ns)
+            if self._last is not None and period.number > self._last + 1:
+                self._tell_gap(period.number - self._last - 1)
+            self._last = period.number
+            for part in self._parts:
+                part.period(period)
+        self._waiting.clear()
+        self._canvas.send()
 
     def _tell_gap(self, count: int) -> None:
         self.missed += count

@@ -10,6 +10,7 @@ import contextlib
 import importlib.util
 import ipaddress
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -241,11 +242,8 @@ def _looked_at(place: ServeAt, spawn: bool) -> Iterator[None]:
     pages = viewer_command(
         *("--serve-web", "--web-viewer-port", str(place.web_port), place.url), bind=place.address
     )
-    with subprocess.Popen([*TIED, *pages], stdin=subprocess.DEVNULL) as web:
-        try:
-            yield
-        finally:
-            web.terminate()
+    with _running(pages):
+        yield
 
 
 TIED = [sys.executable, "-P", "-m", "emulator.observe.tied"]
@@ -253,16 +251,17 @@ TIED = [sys.executable, "-P", "-m", "emulator.observe.tied"]
 
 
 def viewer_command(*arguments: str, bind: str = LOOPBACK) -> list[str]:
-    """Rerun's own program with these arguments; what it listens at by itself is bound to `bind`.
+    """Rerun's own program with these arguments; what it listens at by itself is bound to `bind`."""
+    return [_program(), "--bind", bind, *arguments]
 
-    Its Python front end is passed by: ended by a signal, that would leave the program behind.
-    """
+
+def _program() -> str:
+    """Rerun's own program. Its Python front end is passed by: ended by a signal, that would leave it behind."""
     spec = importlib.util.find_spec("rerun_cli")
     assert spec is not None and spec.submodule_search_locations, "rerun-sdk brings rerun_cli along"
     folder = Path(spec.submodule_search_locations[0])
     bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
-    program = bundled if bundled.exists() else folder / "rerun"
-    return [str(program), "--bind", bind, *arguments]
+    return str(bundled if bundled.exists() else folder / "rerun")
 
 
 def serve_file(path: Path, place: ServeAt) -> None:
@@ -271,25 +270,56 @@ def serve_file(path: Path, place: ServeAt) -> None:
     origin = ("--cors-allow-origin", place.origin)
     command = viewer_command("--serve-web", *ports, *origin, str(path), bind=place.address)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with (
-        contextlib.suppress(KeyboardInterrupt),
-        subprocess.Popen([*TIED, *command], stdin=subprocess.DEVNULL, start_new_session=True) as served,
-    ):
+    with contextlib.suppress(KeyboardInterrupt), _running(command) as served:
+        served.wait()
+
+
+@contextmanager
+def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """A command for as long as the block lasts; of Rerun's only warnings are seen. Ctrl-C does not reach it."""
+    process = subprocess.Popen(
+        [*TIED, *command],
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "RUST_LOG": "warn"},
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
         try:
-            served.wait()
-        finally:
-            served.terminate()
+            process.wait(CLOSE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a recording was closed cleanly; one that was not can be read, but not be searched."""
+    """Whether a recording was closed cleanly; the viewer opens no other."""
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
         file.seek(max(0, file.tell() - 16))
         return _END_OF_A_CLOSED_FILE in file.read()
 
 
+def mended_path(path: Path) -> Path:
+    """Where the whole recording goes that is made of one that was not closed."""
+    return path.with_name(f"{path.stem}-mended{path.suffix}")
+
+
 def mending_command(path: Path) -> str:
-    """What makes a whole recording of one that was not closed."""
-    mended = path.with_name(f"{path.stem}-mended{path.suffix}")
-    return f"rerun rrd optimize --continue-on-error {path} -o {mended}"
+    """What makes a whole recording of one that was not closed, as one types it."""
+    return f"rerun {shlex.join(_mending(path))}"
+
+
+def mend(path: Path) -> Path:
+    """Make a whole recording of one that was not closed, and return where it is. Raises VnetError."""
+    done = subprocess.run([_program(), *_mending(path)], capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip() or "nothing was said").splitlines()[-1]
+        raise VnetError(f"{path}: was not closed, and cannot be mended: {last}")
+    return mended_path(path)
+
+
+def _mending(path: Path) -> list[str]:
+    return ["rrd", "optimize", "--continue-on-error", str(path), "-o", str(mended_path(path))]

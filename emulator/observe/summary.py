@@ -13,10 +13,11 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.observe.checks import Judgement, Verdict
+from emulator.observe.report.names import REPORT
 from emulator.observe.sinks import RECORDING, is_closed, mending_command
 
-_STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
-_FIGURES = {
+STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
+FIGURES = {
     "common_error_rmse_m": "common error, RMSE",
     "deviation_m": "deviation between vehicles",
     "position_rmse_m": "position, RMSE of the estimates",
@@ -25,14 +26,17 @@ _FIGURES = {
 }
 
 
-def print_summary(judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console) -> None:
-    """The whole summary of a run that has just ended."""
+def print_summary(
+    judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console, report: bool = False
+) -> None:
+    """The whole summary of a run that has just ended; with `report`, its report is about to be written."""
     print_checks(judgement, console, verdict["reproduce"])
     console.print(_figures(verdict))
     console.print(_frames(verdict["frames_by_outcome"]))
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
+    following[f"vnet report {folder} --open"] = f"read {folder / REPORT}" if report else "have a report of it"
     if (recording := folder / RECORDING).exists():
         following[f"vnet view {folder}"] = "look at it"
         if not is_closed(recording):
@@ -53,28 +57,26 @@ def as_typed(command: str) -> str:
 
 def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None:
     """The verdict and its checks; of those that failed the offending rows, and how to have them again."""
-    table = Table(
-        title=Text(f"verdict: {judgement.verdict}", style=_STYLE[judgement.verdict]), title_justify="left"
-    )
+    table = Table(title=Text(f"verdict: {judgement.verdict}", style=STYLE[judgement.verdict]), title_justify="left")
     table.add_column("check")
     table.add_column("verdict")
     table.add_column("what was seen", overflow="fold")
     for check in judgement.checks:
-        table.add_row(check.name, Text(check.verdict.value, style=_STYLE[check.verdict]), Text(check.text))
+        table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
     console.print(table)
-    for reason, names in _left_out(judgement).items():
+    for reason, names in left_out(judgement).items():
         console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
         if rows := check.figures.get("rows"):
             console.print(Text(f"{check.name}: the first offending rows", style="bold red"))
-            console.print(_offending(rows))
+            console.print(offending(rows))
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
 
 
-def _left_out(judgement: Judgement) -> dict[str, list[str]]:
+def left_out(judgement: Judgement) -> dict[str, list[str]]:
     """What could not be exercised, by reason."""
     names: dict[str, list[str]] = {}
     for left in judgement.not_exercised:
@@ -82,18 +84,19 @@ def _left_out(judgement: Judgement) -> dict[str, list[str]]:
     return names
 
 
-def _offending(rows: Sequence[Mapping[str, Any]]) -> Table:
+def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     """The rows that a failed check holds against the run."""
     table = Table(box=None, padding=(0, 1, 0, 0))
     columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
-        table.add_row(*(Text(_cell(row.get(column))) for column in columns))
+        table.add_row(*(Text(cell(row.get(column))) for column in columns))
     return table
 
 
-def _cell(value: Any) -> str:
+def cell(value: Any) -> str:
+    """A value as a table shows it."""
     if isinstance(value, float):
         return f"{value:.6g}"
     return "" if value is None else str(value)
@@ -117,7 +120,7 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
     table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
-    for name, title in _FIGURES.items():
+    for name, title in FIGURES.items():
         if (value := verdict["figures"].get(name)) is not None:
             table.add_row(title, f"{value:.3f} m")
     return table

@@ -25,7 +25,7 @@ from emulator.observe.drawing import (
 )
 from emulator.observe.radio_scene import EVERY_S, WINDOW_S, Window
 
-SLOW_EVERY_S = 0.5
+SLOW_EVERY_S = 1.0
 """How often ellipses and neighbours are drawn."""
 LABELLED = 40
 """As many neighbours have their names written beside them."""

@@ -8,6 +8,8 @@ the file is closed cleanly.
 from __future__ import annotations
 
 import contextlib
+import gc
+import os
 import signal
 import sys
 import threading
@@ -26,6 +28,8 @@ from vnet.link.access import Credentials
 from vnet.link.session import open_client
 
 LEASE_MS = 60_000
+NICE = 10
+"""So that on a full machine the emulator and the agents come first."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
 
@@ -76,6 +80,7 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
     def on_alive(sample: zenoh.Sample) -> None:
         inbox.put("found" if sample.kind == zenoh.SampleKind.PUT else "lost")
 
+    os.nice(NICE)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with (
         contextlib.suppress(KeyboardInterrupt),
@@ -107,6 +112,7 @@ def _record_all(inbox: Inbox, recorder: Recorder) -> None:
             recorder.take(stream, message)
             if stream == "scene":
                 patience_s = _patience_s(message)
+                gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         if recorder.missed > said:
             _say(f"{recorder.missed - said} periods were left out: the recording could not keep up")
             said = recorder.missed

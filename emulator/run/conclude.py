@@ -6,6 +6,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
@@ -79,13 +80,15 @@ def _judged(judgement: Judgement) -> dict[str, Any]:
     }
 
 
-def run_again(emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str) -> dict[str, Any]:
+def run_again(
+    emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str, options: Sequence[str] = ()
+) -> dict[str, Any]:
     """Have a concluded run once more, in processes of its own, and add to its verdict how the two compare.
 
     Returns the new contents of verdict.json.
     """
     path = emulation.folder.path
-    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN)]
+    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN), "--no-report", *options]
     # A process of its own: nothing that a program has left in this one may help it to agree with itself.
     done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
     finding: Finding = check_replay(path)

@@ -10,13 +10,15 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from emulator.faults.plan import PlannedFault
+import zenoh
+
 from emulator.observe.sinks import ServeAt, Sinks
+from emulator.run.course import Course, fault_state
 from emulator.run.emulation import Emulation
 from vnet.errors import LinkError, ScenarioError, VnetError
 from vnet.faults import parse_fault
@@ -31,16 +33,18 @@ LEASE_MS = 10_000
 ANSWER_TIMEOUT_S = 10.0
 
 
-def answer(emulation: Emulation, verb: str, payload: bytes, now_ns: int, own_router: bool) -> dict[str, Any]:
+def answer(
+    emulation: Emulation, course: Course, verb: str, payload: bytes, now_ns: int, own_router: bool
+) -> dict[str, Any]:
     """Do what a query asks for. Raises VnetError, in one line, if it cannot be done."""
     match verb:
         case "status":
-            return _status(emulation, now_ns)
+            return asdict(course.snapshot(now_ns))
         case "inject":
             fault = parse_fault(_json(payload))
             if fault.kind == "router_restart" and not own_router:
                 raise ScenarioError("router_restart: needs a router of its own: vnet run --router separate")
-            return _described(emulation.inject(fault, now_ns), emulation, now_ns)
+            return asdict(fault_state(emulation.inject(fault, now_ns), emulation, now_ns))
         case "heal":
             label = _json(payload)
             if not isinstance(label, str):
@@ -66,31 +70,6 @@ def _json(payload: bytes) -> Any:
         raise ScenarioError(f"not valid JSON: {error}") from None
 
 
-def _status(emulation: Emulation, now_ns: int) -> dict[str, Any]:
-    scenario = emulation.scenario
-    return {
-        "run": scenario.run.name,
-        "pacing": scenario.run.pacing,
-        "emulated_s": now_ns / 1e9,
-        "duration_s": scenario.run.duration_s,
-        "vehicles": len(emulation.world.node_ids),
-        "down": [node for node, up in emulation.up.items() if not up],
-        "frames": {outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
-        "faults": [_described(planned, emulation, now_ns) for planned in emulation.faults.faults],
-    }
-
-
-def _described(planned: PlannedFault, emulation: Emulation, now_ns: int) -> dict[str, Any]:
-    state = "acting" if planned.acts_at(now_ns) else ("ended" if planned.end_ns <= now_ns else "to come")
-    return {
-        "fault": planned.label,
-        "state": state,
-        "start_s": planned.start_ns / 1e9,
-        "end_s": planned.end_ns / 1e9,
-        "nodes": [node for node, number in emulation.number.items() if planned.nodes[number]],
-    }
-
-
 @contextmanager
 def way_in(folder: Path, endpoint: str, access: Access, sinks: Sinks | None = None) -> Iterator[None]:
     """Keep `control.json` in the run's folder for as long as the block lasts; `sinks`: where it can be watched."""
@@ -107,6 +86,17 @@ def way_in(folder: Path, endpoint: str, access: Access, sinks: Sinks | None = No
         for left in (path, folder / OPERATOR_FILE):
             with contextlib.suppress(OSError):
                 left.unlink()
+
+
+@contextmanager
+def _connected(folder: Path, endpoint: str, login: Credentials) -> Iterator[zenoh.Session]:
+    """A session with the run; one that was killed has left its way in behind."""
+    with ExitStack() as stack:
+        try:
+            session = stack.enter_context(open_client(endpoint, login, LEASE_MS))
+        except LinkError as error:
+            raise LinkError(f"{folder}: the run does not answer (was it killed?): {error}") from None
+        yield session
 
 
 def read_way_in(folder: Path) -> tuple[str, str, ServeAt | None] | None:
@@ -132,7 +122,7 @@ def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
         raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)")
     endpoint, run, _ = way
     login = Credentials.load(folder / OPERATOR_FILE)
-    with open_client(endpoint, login, LEASE_MS) as session:
+    with _connected(folder, endpoint, login) as session:
         replies = session.get(
             keys.control(run, verb), payload=json.dumps(payload).encode(), timeout=ANSWER_TIMEOUT_S
         )

@@ -23,6 +23,7 @@ import zenoh
 from emulator.observe.sinks import Sinks
 from emulator.run.attachment import Attachment, LiveOptions
 from emulator.run.control import answer, way_in
+from emulator.run.course import Course
 from emulator.run.emulation import Emulation, PeriodView, ProcessActions
 from emulator.run.join import Membership, split_into_processes
 from emulator.run.launch import Exit, Launcher
@@ -97,11 +98,12 @@ async def run_live(
     options: LiveOptions,
     on_state: Callable[[str], None] = lambda text: None,
     gate: Gate = _open,
+    on_missing: Callable[[Sequence[str]], None] = lambda nodes: None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end over Zenoh; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C and SIGTERM end the run early, with the event `interrupted`. Raises VnetError if it cannot start.
-    `gate` holds a run in lockstep.
+    `gate` holds a run in lockstep. `on_missing` is told which nodes have not joined, whenever that changes.
     """
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
@@ -112,7 +114,7 @@ async def run_live(
             run = LiveRun(emulation, options, launcher, gate)
             stack.callback(run.close)
             stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access, options.record))
-            return await run.run(on_state)
+            return await run.run(on_state, on_missing)
 
 
 def _lease_ms(scenario: Scenario) -> int:
@@ -144,6 +146,7 @@ class LiveRun:
         self._changed = asyncio.Event()
         self._dead: dict[str, dict[str, Any]] = {}
         self._returning: set[str] = set()  # nodes whose processes faults have ended, or who have left
+        self._connected: set[str] = set()  # nodes whose processes are connected
         self._going: set[asyncio.Task[None]] = set()  # what sees them off (real time)
         self._expected: set[str] = set()  # leads of processes that were started anew (real time)
         self._paused: set[str] = set()
@@ -154,6 +157,7 @@ class LiveRun:
         self._messages = Messages(emulation)
         self._watched = True  # from the first period on, by a recorder of the run's own
         self._memory = MemoryWatch(emulation.duration_ns)
+        self._seen = Course(emulation)
         lease_ms = _lease_ms(emulation.scenario)
         self._link = Attachment(
             options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake, self._intake
@@ -184,8 +188,12 @@ class LiveRun:
         while self._incoming and not self._over:
             node, item = self._incoming.popleft()
             if isinstance(item, bool):
-                if not item:
+                if item:
+                    self._connected.add(node)
+                else:
+                    self._connected.discard(node)
                     self._token_lost(node)
+                    self._changed.set()
                 continue
             if isinstance(item, zenoh.Query):
                 self._answer(node, item)
@@ -201,7 +209,7 @@ class LiveRun:
         own_router = self._options.router is not None
         with query:
             try:
-                told = answer(self._emulation, verb, payload, self._time_ns(), own_router)
+                told = answer(self._emulation, self._seen, verb, payload, self._time_ns(), own_router)
                 query.reply(query.key_expr, json.dumps(told))
             except VnetError as error:
                 query.reply_err(str(error))
@@ -302,7 +310,9 @@ class LiveRun:
 
     # The course of a run.
 
-    async def run(self, on_state: Callable[[str], None]) -> tuple[float, bool]:
+    async def run(
+        self, on_state: Callable[[str], None], on_missing: Callable[[Sequence[str]], None]
+    ) -> tuple[float, bool]:
         """Join, run, end. Returns the wall-clock seconds between time 0 and the end, and whether interrupted."""
         watching = self._watch_children()
         folder = self._emulation.folder
@@ -310,7 +320,7 @@ class LiveRun:
         patience_s = 0.5
         interrupted = False
         try:
-            await self._join(on_state)
+            await self._join(on_state, on_missing)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started, 3))
             self._emulation.watch(self._publish_period)
             self._emulation.watch(self._look_at_memory)
@@ -335,7 +345,7 @@ class LiveRun:
             self._over = True
         return wall_s, interrupted
 
-    async def _join(self, on_state: Callable[[str], None]) -> None:
+    async def _join(self, on_state: Callable[[str], None], on_missing: Callable[[Sequence[str]], None]) -> None:
         """Start what is to be started and wait until every node is ready."""
         run = self._emulation.scenario.run
         node_ids = self._emulation.world.node_ids
@@ -351,13 +361,22 @@ class LiveRun:
                 self._launch(nodes)
         else:
             on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
+        missing: list[str] = []
         while self._members.missing or not self._recorder_listens():
+            if missing != self._members.missing:
+                missing = self._members.missing
+                self._tell_missing(missing, on_missing)
             if self._join_failure is not None:
                 raise self._join_failure
             if time.monotonic() > deadline:
                 raise LinkError(self._who_is_missing(run.join_timeout_s))
             await self._change(0.05 if self._options.record else deadline - time.monotonic())
         self._members.closed = True
+        self._tell_missing([], on_missing)
+
+    def _tell_missing(self, nodes: Sequence[str], on_missing: Callable[[Sequence[str]], None]) -> None:
+        self._seen.awaits(nodes)
+        on_missing(nodes)
 
     def _launch(self, nodes: Sequence[str]) -> None:
         nice = REALTIME_AGENT_NICE if self._realtime else 0
@@ -366,7 +385,8 @@ class LiveRun:
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
         arguments += ["--out", str(sinks.save), *sinks.arguments]
-        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), {})
+        environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), environment)
 
     def _recorder_listens(self) -> bool:
         return self._options.record is None or self._link.is_watched("period")
@@ -580,12 +600,15 @@ class LiveRun:
         """Tell everybody that it is over, hear last words, and see every process off."""
         for node in self._members.joined:
             self._link.send(node, wire.End(None, "the run is over"))
+        deadline = time.monotonic() + FAREWELL_S
         if isinstance(self._pacing, RealTime):
-            deadline = time.monotonic() + FAREWELL_S
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
                 pass
             self._pacing.finish()
             await asyncio.gather(*self._going)
+        if not self._options.launch:  # who closes at once may take the last words along
+            while self._connected and await self._change(deadline - time.monotonic()):
+                pass
         self._link.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)

@@ -13,6 +13,14 @@ SAMPLES = 40
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
 
 
+def resident_kb(pid: int | str = "self") -> int | None:
+    """Resident memory of a process, in KiB; None if it has just ended, or if this system has no /proc."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE_KB
+    except (OSError, IndexError, ValueError):
+        return None
+
+
 class MemoryWatch:
     """Samples the resident memory of processes; `write` puts it into the run's events."""
 
@@ -27,11 +35,8 @@ class MemoryWatch:
             return
         self._next_ns = time_ns + self._every_ns
         for name, pid in pids.items():
-            try:
-                pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-            except (OSError, IndexError, ValueError):
-                continue  # it has just ended, or this system has no /proc
-            self._series.setdefault((name, pid), []).append((time_ns / 1e9, pages * _PAGE_KB))
+            if (size_kb := resident_kb(pid)) is not None:
+                self._series.setdefault((name, pid), []).append((time_ns / 1e9, size_kb))
 
     def write(self, folder: RunFolder, time_ns: int) -> None:
         """One event `memory` a process: `time_s` and `rss_kb` of its samples."""

@@ -7,8 +7,11 @@ simulation give the same trace, and a test holds them to it.
 from __future__ import annotations
 
 import asyncio
+import signal
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 from msgspec.structs import replace
 
@@ -28,7 +31,8 @@ class _RunOverError(Exception):
 def simulate(emulation: Emulation, gate: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
-    Ctrl-C ends the run early, with the event `interrupted`. Raises ProgramError if the program cannot be loaded.
+    Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
+    it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `gate` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     """
     simulation = _Simulation(emulation, gate)
@@ -36,12 +40,32 @@ def simulate(emulation: Emulation, gate: Callable[[Lockstep], None] | None = Non
     started = time.monotonic()
     interrupted = False
     try:
-        simulation.run()
+        with _ending_between_instants(simulation):
+            simulation.run()
     except KeyboardInterrupt:
         interrupted = True
         emulation.folder.event(simulation.loop.now_ns, "interrupted")
         emulation.finish(simulation.loop.now_ns)
     return time.monotonic() - started, interrupted
+
+
+@contextmanager
+def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
+    """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
+
+    def ask(number: int, frame: object) -> None:
+        simulation.interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # others see to it
+        yield
+        return
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class _Simulation:
@@ -54,10 +78,11 @@ class _Simulation:
         self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
         self._gate = gate or (lambda lockstep: None)
         self._seq = 0
-        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
+        self.interrupted = False
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
         welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
-        self._programs = load_programs(welcomes)
+        self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
+        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._host = Host(welcomes, lambda: self.loop.now_ns)
 
     def run(self) -> None:
@@ -74,11 +99,16 @@ class _Simulation:
                     self._host.end_spinning(self.loop, spin)
         except _RunOverError:
             self._host.close(self.loop)
+        except KeyboardInterrupt:
+            self._host.close(self.loop)
+            raise
         finally:
             asyncio.set_event_loop(None)
             self.loop.close()
 
     def _exchange(self, next_timer_ns: int | None) -> int:
+        if self.interrupted:
+            raise KeyboardInterrupt
         self._lockstep.receive(self._lead, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
         grants = self._lockstep.step()
         while self._lockstep.held:

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 
 from emulator.run.join import split_into_processes
 from emulator.world.world import build_world
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, did_you_mean
 from vnet.faults import KINDS, Fault, parse_fault
 from vnet.scenario import Scenario
 
@@ -69,7 +69,8 @@ def known_kinds(kinds: Sequence[str] | None) -> tuple[str, ...]:
     """These kinds, or all that can be simulated. Raises ScenarioError for others."""
     for kind in kinds or ():
         if kind not in SIMULATED_KINDS:
-            raise ScenarioError(f"fault {kind!r}: must be one of {', '.join(SIMULATED_KINDS)}")
+            meant = did_you_mean(kind, SIMULATED_KINDS)
+            raise ScenarioError(f"fault {kind!r}{meant}: must be one of {', '.join(SIMULATED_KINDS)}")
     return tuple(kinds) if kinds else SIMULATED_KINDS
 
 

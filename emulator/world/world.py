@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from emulator.world.links import load_links
 from emulator.world.networks import Network, generate_network, load_network
-from emulator.world.trips.course import Course
 from emulator.world.trips.drive import drive
+from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
 from vnet.link.node import Fix
 from vnet.roads.lanes import Array, LaneMap
@@ -49,7 +49,7 @@ class Instant:
 
 
 class World:
-    """All that is true during a run: the `course` of each vehicle, and what its receiver makes of it.
+    """All that is true during a run: the `motion` of each vehicle, and what its receiver makes of it.
 
     `lane_map` is what vehicles may know; `lane_of` (N,) is the lane of each that stands on one, and their secret.
     `links` (N, N) is who (row) hears whom (column), or None where the radio's range decides. `moves` says whether
@@ -57,20 +57,20 @@ class World:
     Raises ScenarioError if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 
-    def __init__(self, scenario: Scenario, course: Course, lane_map: LaneMap, lane_of: NDArray[np.intp]) -> None:
+    def __init__(self, scenario: Scenario, motion: Motion, lane_map: LaneMap, lane_of: NDArray[np.intp]) -> None:
         seed = scenario.run.seed
-        count = len(course.node_ids)
-        self.node_ids = course.node_ids
+        count = len(motion.node_ids)
+        self.node_ids = motion.node_ids
         self.moves = scenario.network.moves
         self.links = load_links(scenario.radio, count)
         self.period_ns = scenario.period_ns
         self.periods = periods_of(scenario)
         self.lane_map = lane_map
         self.lane_of = lane_of
-        self.course_m, self._heading_rad = course.position_m, course.heading_rad
-        there = np.isfinite(course.position_m[: self.periods - 1, :, 0])
+        self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
+        there = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((there[1:] != there[:-1]).any(axis=1)) + 1  # periods
-        _check_exceptions(scenario, course.node_ids)
+        _check_exceptions(scenario, motion.node_ids)
         _check_processes(scenario, bool(there.all()))
         self._gnss = scenario.world.gnss
         self._common_m = self._draw_common(scenario)
@@ -170,14 +170,14 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
     lateral_m = _draw_lateral(scenario, count)
     position_m = network.position_m + lateral_m[:, :, None] * normal
     heading_rad = np.broadcast_to(network.heading_rad, lateral_m.shape)
-    return World(scenario, Course(network.node_ids, position_m, heading_rad), lane_map, np.argsort(order))
+    return World(scenario, Motion(network.node_ids, position_m, heading_rad), lane_map, np.argsort(order))
 
 
 def _drive_trips(scenario: Scenario) -> World:
     """A world in which vehicles drive their trips; where there are lanes, nobody says."""
-    course = drive(scenario.network, periods_of(scenario), scenario.period_ns)
+    motion = drive(scenario.network, periods_of(scenario), scenario.period_ns)
     nowhere = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
-    return World(scenario, course, nowhere, np.zeros(0, dtype=np.intp))
+    return World(scenario, motion, nowhere, np.zeros(0, dtype=np.intp))
 
 
 def _check_exceptions(scenario: Scenario, node_ids: tuple[str, ...]) -> None:

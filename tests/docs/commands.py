@@ -19,7 +19,7 @@ import emulator.cli
 from tests.docs.markdown import ROOT
 
 APPS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "run", "check", "analyze", "access")
+HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
 APART = ("campaign",)
 """Commands of vnet that are run in a process of their own, as they start some themselves."""
@@ -32,6 +32,9 @@ ONLY_PARSED = {
     "vnet fault": "needs a run that is on",
     "vnet status": "needs a run that is on",
     "vnet experiment": "takes minutes to hours",
+    "vnet view": "needs a screen, or somebody who looks",
+    "vnet play": "needs a screen, or somebody who looks",
+    "vnet render": "needs a run that the page has not made",
 }
 """Why these are parsed, and not run."""
 NOT_RUN = {
@@ -42,7 +45,9 @@ NOT_RUN = {
     "pip": "needs the network",
     "rerun": "needs a screen",
     "scp": "needs another host",
+    "ssh": "needs another host",
     "source": "the shell's own",
+    "tshark": "a program of its own",
     "zenohd": "a program of its own",
 }
 """Why these other programs are not run."""

@@ -1,5 +1,6 @@
 """Vehicles that drive, enter and leave: where they are when they send, who hears them, and that checks notice."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,18 @@ from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 
 from emulator.observe.checks import Evidence, NotExercised, Verdict, judge
+from emulator.observe.observation import unpack
+from emulator.observe.playback import messages
+from emulator.observe.recorder import Recorder
 from emulator.observe.run_folder import Event
+from emulator.observe.sinks import Sinks
+from emulator.run.course import Course
+from emulator.run.simulate import simulate
 from emulator.world.world import build_world, components
-from tests.emulator.apart import run_apart, run_together
+from tests.emulator.apart import emulation_of, run_apart, run_together
 from tests.emulator.motion import along, scenario_of_trips, still, write_trips
 from tests.emulator.test_checks import result, run_scenario, verdict
+from tests.emulator.test_dashboard import row as row_of
 from vnet.errors import ScenarioError
 from vnet.scenario import Scenario, load_scenario
 
@@ -352,3 +360,34 @@ def test_a_wrong_network_is_refused(tmp_path: Path, network: str, named: str) ->
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
     assert named in str(caught.value) and "\n" not in str(caught.value)
+
+
+# Those who watch.
+
+
+def test_who_watches_is_told_who_is_not_there_and_none_of_them_is_down(tmp_path: Path) -> None:
+    scenario = traffic(tmp_path)
+    emulation = emulation_of(scenario)
+    course = Course(emulation)
+    shots = {}
+    emulation.watch(lambda view: shots.update({view.instant.period: course.snapshot()}))
+    simulate(emulation)
+    assert {shot.down for shot in shots.values()} == {()}
+    assert shots[0].absent == ("v3",) and shots[12].absent == ("v5", "v3") and shots[35].absent == ("v4",)
+    text = row_of(shots[12], "vehicles")
+    assert "3 up" in text and "2 not there" in text and "down" not in text
+
+
+def test_a_recording_is_drawn_without_lanes_and_of_vehicles_that_are_not_there(tmp_path: Path) -> None:
+    run_scenario(tmp_path / "run", traffic(tmp_path))
+    told = list(messages(tmp_path / "run"))
+    streams = [stream for stream, _ in told]
+    assert streams == ["scene", *["period"] * 40, "end"]
+    scene = told[0][1]
+    assert scene["moves"] and unpack(scene["area_m"], 2).tolist() == [[0, 0], [100, 50]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        with Recorder(Sinks(save=tmp_path / "a.rrd"), "driving") as recorder:
+            for stream, message in told:
+                recorder.take(stream, message)
+    assert (tmp_path / "a.rrd").stat().st_size > 0

@@ -67,7 +67,7 @@ def test_what_is_rendered_is_what_was_recorded_live(watched: Watched, tmp_path: 
     events = (folder / "events.jsonl").read_text().splitlines()
     assert '"ended"' in events[-1], "written when nobody watched any more"
     (folder / "events.jsonl").write_text("\n".join(events[:-1]) + "\n")
-    assert vnet("render", folder) == (0, f"{folder / 'recording.rrd'}\n")
+    assert vnet("render", folder) == (0, f"{folder / 'recording.rrd'}\n{folder / 'report.html'}\n")
     verify = [sys.executable, "-P", "-m", "rerun", "rrd", "verify", str(folder / "recording.rrd")]
     assert subprocess.run(verify, capture_output=True).returncode == 0
     live, again = contents(watched.folder / "live.rrd"), contents(folder / "recording.rrd")

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from emulator.cli import app
 from emulator.experiments import cells as cells_module
 from emulator.experiments import divergence, paper, tempering
-from emulator.experiments.reports import anees_band
+from emulator.observe.metrics import anees_band
 
 TINY: dict[str, Any] = {"n3": {"kind": "generated", "vehicles": 4}}
 

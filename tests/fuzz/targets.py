@@ -5,11 +5,13 @@ it accepts. The tests in this folder and `make fuzz` take it from there.
 """
 
 import functools
+import io
 import json
 import os
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +20,19 @@ import numpy as np
 from agents import cooperative_frame
 from emulator.observe.run_folder import RunFolder
 from emulator.run.control import answer
+from emulator.run.course import Course
 from emulator.run.emulation import Emulation
 from emulator.world.links import load_links
 from emulator.world.networks import load_network
+from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
 from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, VnetError, WireError
 from vnet.faults import KINDS, parse_fault
 from vnet.link import wire
 from vnet.link.access import Access, Credentials
 from vnet.link.node import Report
-from vnet.scenario import Radio, Scenario, dump_scenario, load_scenario
+from vnet.scenario import Network, Radio, Scenario, dump_scenario, load_scenario
+from vnet.sumo import input_files, read_begin_s
 
 OVERRIDE = b"\n--set "
 """Stands between a scenario file and each override in one input of the scenario target."""
@@ -142,6 +147,26 @@ def _read_network(data: bytes) -> None:
 def _read_links(data: bytes) -> None:
     links = load_links(Radio(links=_file("links.csv", data)), 2)
     assert links is not None and links.shape == (2, 2) and not links.diagonal().any()
+
+
+def _read_trips(name: str, data: bytes) -> None:
+    """Trips, as a world of them reads them: the reader that goes with the file's name, and what it makes of it."""
+    network = Network(kind="trips", path=_file(name, data), origin_deg=(42.0, -83.0))
+    motion = drive(network, 21, 10**8)
+    there = np.isfinite(motion.position_m).all(axis=2)
+    assert motion.position_m.shape == (21, len(motion.node_ids), 2) and there[:20].any(axis=0).all()
+
+
+def _read_sumo(data: bytes) -> None:
+    path = _file("town.sumocfg", data)
+    input_files(path)
+    assert np.isfinite(read_begin_s(path))
+
+
+def _npz(**arrays: Any) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
 
 
 def _read_credentials(data: bytes) -> None:
@@ -298,6 +323,30 @@ _CSV_WORDS = (
     b"1_0",
     b"0,1\n",
 )
+_TRIPS = (
+    b"id,time_s,x_m,y_m\na,0,0,0\na,1,10,0\na,2,20,0\nb,0.5,5,5\nb,2.5,5,5\n",
+    b"id,time_s,lat_deg,lon_deg,speed_mps\na,0,42.0,-83.0,1\na,2,42.0001,-83.0,1\n",
+)
+_FCD = b"""<fcd-export>
+<timestep time="0.00"><vehicle id="a" x="0" y="0" angle="90" speed="10"/></timestep>
+<timestep time="2.00"><vehicle id="a" x="20" y="0" angle="90" speed="10"/></timestep>
+</fcd-export>
+"""
+_SUMO = b"""<configuration><input><net-file value="a.net.xml"/></input><time><begin value="1:00:00"/></time>
+</configuration>
+"""
+_XML_WORDS = (
+    b"<!DOCTYPE",
+    b"<!ENTITY",
+    b"&",
+    b"<![CDATA[",
+    b"]]>",
+    b"-->",
+    b"<?xml",
+    b'encoding="UTF-16"',
+    b"nan",
+    b"/>",
+)
 _JSON_WORDS = (
     b'"user"',
     b'"password"',
@@ -313,18 +362,21 @@ _JSON_WORDS = (
 
 
 @functools.cache
-def _small_emulation() -> Emulation:
+def _small_run() -> tuple[Emulation, Course]:
     scenario = Scenario.model_validate({"network": {"vehicles": 3}})
     folder = RunFolder.create(Path(tempfile.mkdtemp(prefix="vnet-fuzz-")) / "run", scenario)
-    return Emulation(scenario, build_world(scenario), folder)
+    emulation = Emulation(scenario, build_world(scenario), folder)
+    return emulation, Course(emulation)
 
 
 def _read_query(data: bytes) -> None:
     """A query of an operator: its verb, a line, and its payload."""
     verb, _, payload = data.partition(b"\n")
-    emulation = _small_emulation()
+    emulation, course = _small_run()
     try:
-        json.dumps(answer(emulation, verb.decode(errors="replace"), payload, 1_000_000_000, own_router=False))
+        json.dumps(
+            answer(emulation, course, verb.decode(errors="replace"), payload, 1_000_000_000, own_router=False)
+        )
     finally:
         emulation.faults.faults.clear()
 
@@ -343,6 +395,17 @@ TARGETS = (  # the slowest first
         (_SCENARIO, _FAULTS, _FILES, b"" + OVERRIDE + b"radio.loss=0.3"),
         _TOML_WORDS,
     ),
+    Target(
+        "trips CSV", partial(_read_trips, "t.csv"), ScenarioError, _TRIPS, (*_CSV_WORDS, b"lat_deg", b",time_s")
+    ),
+    Target("trips FCD", partial(_read_trips, "t.xml"), ScenarioError, (_FCD,), _XML_WORDS),
+    Target(
+        "trips NPZ",
+        partial(_read_trips, "t.npz"),
+        ScenarioError,
+        (_npz(x_m=np.array([[0.0, 1, 2, 3]]), y_m=np.zeros((1, 4)), rate_hz=2.0),),
+    ),
+    Target("sumocfg", _read_sumo, ScenarioError, (_SUMO,), _XML_WORDS),
     Target("network CSV", _read_network, ScenarioError, (_NETWORK,), _CSV_WORDS),
     Target("fault", _read_fault, ScenarioError, _FAULT_SEEDS, _FAULT_WORDS),
     Target("control query", _read_query, VnetError, _QUERIES, _FAULT_WORDS),

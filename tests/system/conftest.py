@@ -64,8 +64,9 @@ def vnet(tmp_path: Path) -> Vnet:
 
     def run(command: str, scenario: str, *options: str) -> Finished:
         folder = tmp_path / f"run{next(numbers)}"
+        plain = ["--no-report"] if command in ("run", "simulate") and "--report" not in options else []
         done = subprocess.run(
-            [*VNET, command, scenario, "--out", str(folder), *options],
+            [*VNET, command, scenario, "--out", str(folder), *plain, *options],
             cwd=ROOT,
             capture_output=True,
             text=True,

@@ -45,7 +45,7 @@ def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Pat
         assert ask(folder, "heal", "loss-1") == {"healed": ["loss-1"]}, "healing twice is harmless"
         listed = command("fault", "list", "--run", str(folder))
         assert [name in listed.stdout for name in ("kill-0", "loss-1")] == [True, True]
-        assert "down: none" in command("status", "--run", str(folder)).stdout
+        assert " 3 up\n" in command("status", "--run", str(folder)).stdout
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)
     assert not (folder / CONTROL_FILE).exists()

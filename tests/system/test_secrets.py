@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from emulator.observe.run_folder import RunFolder
+from emulator.observe.sinks import Sinks
 from emulator.run.conclude import conclude
 from emulator.run.emulation import Emulation
 from emulator.run.live import LiveOptions, run_live
@@ -51,7 +52,9 @@ def test_a_run_shows_no_secret(
             seen[pid] = (process / "cmdline").read_bytes() + (process / "environ").read_bytes()
 
     emulation.watch(look)
-    wall_s, _ = asyncio.run(run_live(emulation, LiveOptions(access, listen, record=folder / "recording.rrd")))
+    wall_s, _ = asyncio.run(
+        run_live(emulation, LiveOptions(access, listen, record=Sinks(folder / "recording.rrd")))
+    )
     _, verdict = conclude(emulation, wall_s, "run")
     assert verdict["verdict"] == "valid"
     assert len(seen) == 3

@@ -90,7 +90,7 @@ WRONG_STEPS = {
 }
 WRONG_SCENARIOS = {
     "BEACON, speed=3": "*ScenarioError: speed: unknown; write section.key, or one of vehicles, *",
-    "BEACON, **{'radio.lost': 1}": "*ScenarioError: radio.lost: unknown key; allowed here:*",
+    "BEACON, **{'radio.lost': 1}": "*ScenarioError: radio.lost: unknown key (did you mean loss?); allowed here:*",
     "BEACON, **{'run.pacing': 'realtime'}": "*a test steps a run in lockstep*",
     "{'network': {'vehicles': 0}}": "*ScenarioError: network.vehicles = 0:*",
     "'nowhere.toml'": "*ScenarioError: nowhere.toml: cannot be read*",

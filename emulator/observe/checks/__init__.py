@@ -62,6 +62,7 @@ __all__ = [
     "Verdict",
     "check_run",
     "judge",
+    "read_evidence",
     "recorded_verdict",
 ]
 
@@ -164,6 +165,18 @@ def check_run(folder: Path) -> Judgement:
 
     A trace that is not the one whose hash the verdict holds makes the run invalid.
     """
+    evidence = read_evidence(folder)
+    recorded = recorded_verdict(folder)["trace_sha256"]
+    judgement = judge(evidence)
+    judgement.put(check_replay(folder))
+    if judgement.trace_sha256 != recorded:
+        text = f"the trace is not the one that verdict.json speaks of ({recorded[:12]}…)"
+        judgement.put(CheckResult("trace_sha256", Verdict.INVALID, text))
+    return judgement
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """What a run has left in its folder. Raises VnetError if the folder is not a finished run's."""
     events = read_events(folder)
     try:
         trace = read_trace(folder / "trace.parquet")
@@ -172,11 +185,4 @@ def check_run(folder: Path) -> Judgement:
         busy = pq.read_table(folder / "busy.parquet") if (folder / "busy.parquet").exists() else None
     except (OSError, pa.ArrowInvalid, ValueError) as error:
         raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
-    recorded = recorded_verdict(folder)["trace_sha256"]
-    scenario = load_scenario(folder / "scenario.toml")
-    judgement = judge(Evidence(scenario, trace, states, metrics, events, busy=busy))
-    judgement.put(check_replay(folder))
-    if judgement.trace_sha256 != recorded:
-        text = f"the trace is not the one that verdict.json speaks of ({recorded[:12]}…)"
-        judgement.put(CheckResult("trace_sha256", Verdict.INVALID, text))
-    return judgement
+    return Evidence(load_scenario(folder / "scenario.toml"), trace, states, metrics, events, busy=busy)

@@ -71,7 +71,7 @@ def _held_down(evidence: Evidence, planned: PlannedFault) -> bool:
                 free_ns = max(free_ns, end_ns)
         if free_ns < planned.end_ns:
             return False
-    return True
+    return bool(planned.nodes.any())
 
 
 def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:

@@ -111,6 +111,11 @@ class Places:
         """(N,), how many each receiver has in range."""
         return np.asarray(self._degrees[1][min(index, len(self._position_m) - 1)])
 
+    def mean_senders_in_range(self) -> Array:
+        """(N,), how many each receiver has in range, in the mean over the time in which it is there."""
+        there = self.present().sum(axis=0)
+        return np.asarray(self._degrees[1].sum(axis=0) / np.maximum(there, 1))
+
     @property
     def most_in_range(self) -> int:
         """How many senders any receiver ever had in range."""

@@ -24,17 +24,25 @@ ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outc
 def check_replay(folder: Path) -> Finding:
     """Compare a run with the second one in its folder. Raises VnetError if a table cannot be read."""
     again = folder / AGAIN
-    if not (again / "verdict.json").exists():
-        return ONCE
-    try:
-        tables = [(name, _read(folder, name), _read(again, name)) for name in TABLES]
-    except (OSError, pa.ArrowInvalid) as error:
-        raise VnetError(f"{again}: not the folder of a finished run: {error}") from None
+    return compare_folders(folder, again) if (again / "verdict.json").exists() else ONCE
+
+
+def compare_folders(first: Path, second: Path) -> Finding:
+    """Compare two finished runs. Raises VnetError if a table cannot be read, or has other columns in one."""
+    tables = []
+    for name in TABLES:
+        ours, theirs = _read(first, name), _read(second, name)
+        if set(ours.column_names) != set(theirs.column_names):
+            raise VnetError(f"{second / name}.parquet: has other columns than the one of {first}")
+        tables.append((name, ours, theirs))
     return compare(tables)
 
 
 def _read(folder: Path, name: str) -> pa.Table:
-    return pq.read_table(folder / f"{name}.parquet")
+    try:
+        return pq.read_table(folder / f"{name}.parquet")
+    except (OSError, pa.ArrowInvalid) as error:
+        raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
 
 
 def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:

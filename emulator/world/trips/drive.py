@@ -1,13 +1,13 @@
-"""From `[network]` to courses: which reader reads the file, and what of it the run takes."""
+"""From `[network]` to motion: which reader reads the file, and what of it the run takes."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from emulator.world.trips.clean import Rules
-from emulator.world.trips.course import Course, Frame, courses
 from emulator.world.trips.fcd import drive_sumo, read_fcd
 from emulator.world.trips.matrices import read_npz
+from emulator.world.trips.motion import Frame, Motion, motion_of
 from emulator.world.trips.samples import Samples
 from emulator.world.trips.tables import read_csv, read_parquet
 from vnet.errors import ScenarioError
@@ -18,8 +18,8 @@ READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml":
 """By the ending of the file's name."""
 
 
-def drive(network: Network, periods: int, period_ns: int) -> Course:
-    """The courses of a network of trips over so many periods. Raises ScenarioError, naming file and place."""
+def drive(network: Network, periods: int, period_ns: int) -> Motion:
+    """How the vehicles of a network drive over so many periods. Raises ScenarioError, naming file and place."""
     path = network.path
     assert path is not None
     rules = Rules(network.fastest_mps, network.longest_gap_s)
@@ -37,7 +37,7 @@ def drive(network: Network, periods: int, period_ns: int) -> Course:
     if start_s is None:
         start_s = min(float(trip.time_s[0]) for trip in trips)
     try:
-        return courses(trips, Frame(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
+        return motion_of(trips, Frame(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
 

@@ -6,6 +6,7 @@ given; without ids vehicles are v1, v2, …, with zeros in front so that they so
 
 from __future__ import annotations
 
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from emulator.world.trips.samples import DEGREES, METRES, MOST_SAMPLES, OPTIONAL
 from vnet.errors import ScenarioError, printable
 from vnet.roads.lanes import Array
 
-_LARGEST_BYTES = (len(METRES) + len(OPTIONAL)) * 8 * MOST_SAMPLES + (1 << 20)
+_LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
+"""Of one array."""
 
 
 def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
@@ -50,15 +52,19 @@ def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
+    arrays = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > _LARGEST_BYTES:
-            raise ScenarioError(f"{path}: {size:,} bytes of arrays; at most {_LARGEST_BYTES:,} are taken")
-        with np.load(path, allow_pickle=False) as file:
-            wanted = {*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"}
-            arrays = {name: file[name] for name in file.files if name in wanted}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            for name in (*METRES, *DEGREES, *OPTIONAL, "rate_hz", "id"):
+                if f"{name}.npy" in archive.namelist():
+                    _check_size(archive, f"{name}.npy")
+                    with archive.open(f"{name}.npy") as member:
+                        arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (
+        Exception
+    ) as error:  # zipfile, zlib and numpy have a dozen ways to say that something is wrong with a file
         raise ScenarioError(f"{path}: not an NPZ file: {printable(str(error), 300)}") from None
     for name, array in arrays.items():
         if name != "id":
@@ -66,6 +72,19 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
                 raise ScenarioError(f"{path}: {name} holds {array.dtype}: numbers are needed")
             arrays[name] = array.astype(float)
     return arrays
+
+
+def _check_size(archive: zipfile.ZipFile, name: str) -> None:
+    """Raises ValueError where an array is larger than what is taken, or than it is."""
+    size = archive.getinfo(name).file_size
+    if size > _LARGEST_BYTES:
+        raise ValueError(f"{name}: {size:,} bytes; at most {_LARGEST_BYTES:,} are taken")
+    with archive.open(name) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(member)
+    if math.prod(shape) * kind.itemsize > size:
+        raise ValueError(f"{name}: {shape} of {kind} in {size:,} bytes")
 
 
 def _shape(path: Path, where: tuple[str, str], first: Array, second: Array) -> tuple[int, int]:

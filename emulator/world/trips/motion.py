@@ -1,4 +1,4 @@
-"""The true courses of all vehicles: where each is at the start of every period of a run, and when it is there."""
+"""The true motion of all vehicles: where each is at the start of every period of a run, and when it is there."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MOST_STATES = 50_000_000
 
 
 @dataclass(frozen=True)
-class Course:
+class Motion:
     """`position_m` (K, N, 2) and `heading_rad` (K, N) at the start of each period; NaN where one is not there.
 
     A vehicle that is there has no heading, NaN, only if it never moves and nobody says how it stands.
@@ -49,7 +49,7 @@ class Frame:
     most: int | None = None
 
 
-def courses(trips: list[Trip], frame: Frame, rules: Rules) -> Course:
+def motion_of(trips: list[Trip], frame: Frame, rules: Rules) -> Motion:
     """Resample trips to a run's periods; vehicles in the order in which they enter, and then of the file.
 
     Raises ScenarioError if nobody is there during the run, or so many that the truth does not fit into memory.
@@ -70,7 +70,7 @@ def courses(trips: list[Trip], frame: Frame, rules: Rules) -> Course:
             "set max_vehicles, or a disc, or a shorter run"
         )
     states = np.stack([driven for _, _, driven in there], axis=1)
-    return Course(tuple(name for _, name, _ in there), states[..., :2], states[..., 2])
+    return Motion(tuple(name for _, name, _ in there), states[..., :2], states[..., 2])
 
 
 def _drive(trip: Trip, frame: Frame, rules: Rules) -> Array | None:

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from emulator.world.trips.clean import Rules, clean
-from emulator.world.trips.course import Course, Frame, courses
+from emulator.world.trips.motion import Frame, Motion, motion_of
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 
@@ -22,16 +22,16 @@ def trip(time_s: object, x_m: object, y_m: object = 0.0, name: str = "a", **know
     return Trip(name, time, position_m.astype(float), **known)
 
 
-def drive(*trips: Trip, seconds: float = 10.0, start_s: float = 0.0, **frame: object) -> Course:
+def drive(*trips: Trip, seconds: float = 10.0, start_s: float = 0.0, **frame: object) -> Motion:
     periods = round(seconds * 10) + 1
-    return courses(list(trips), Frame(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
+    return motion_of(list(trips), Frame(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
 
 
-def x_of(course: Course, vehicle: int = 0) -> np.ndarray:
+def x_of(course: Motion, vehicle: int = 0) -> np.ndarray:
     return course.position_m[:, vehicle, 0]
 
 
-def there(course: Course, vehicle: int = 0) -> tuple[float, float]:
+def there(course: Motion, vehicle: int = 0) -> tuple[float, float]:
     """From when until when, in seconds, a vehicle is there."""
     periods = np.flatnonzero(np.isfinite(x_of(course, vehicle)))
     assert len(periods) == periods[-1] - periods[0] + 1, "without a break"
@@ -179,7 +179,7 @@ def test_a_disc_is_entered_and_left_and_short_excursions_do_not_count() -> None:
 
 
 def test_what_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulator.world.trips.course.MOST_STATES", 150)
+    monkeypatch.setattr("emulator.world.trips.motion.MOST_STATES", 150)
     with pytest.raises(ScenarioError, match="2 vehicles for 101 periods: at most 150 states; set max_vehicles"):
         drive(trip([0, 10], [0, 10]), trip([0, 10], [0, 10], name="b"))
 

@@ -1,0 +1,53 @@
+"""What it costs to show a run in a terminal: all that its thread does, and what it takes of the run's own."""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from emulator.observe.run_folder import RunFolder
+from emulator.run.course import Course, Snapshot
+from emulator.run.dashboard import Dashboard
+from emulator.run.emulation import Emulation
+from emulator.run.painter import EVERY_S, Painter
+from emulator.run.simulate import simulate
+from emulator.world.world import build_world
+from vnet.scenario import load_scenario
+
+SCENARIO = Path(__file__).parents[1] / "scenarios" / "faults.toml"
+OVERRIDES = ["network.vehicles=50", "program.entry=agents.beacon:main"]
+
+
+def measure(width: int = 100, height: int = 30) -> dict[str, float]:
+    """Medians in ms, and the share of a core, of a picture in which something changes at every redraw."""
+    with tempfile.TemporaryDirectory() as folder:
+        scenario = load_scenario(SCENARIO, OVERRIDES)
+        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(Path(folder) / "run", scenario))
+        course = Course(emulation)
+        shots: list[Snapshot] = []
+        snapshot_ms: list[float] = []
+        emulation.watch(lambda view: snapshot_ms.append(_ms(lambda: shots.append(course.snapshot()))))
+        simulate(emulation)
+    with Path("/dev/null").open("w") as nobody:
+        console = Console(file=nobody, force_terminal=True, width=width, height=height, color_system="truecolor")
+        painter = Painter(console, lambda: Dashboard(shots[0]))
+        redraw_ms = []
+        while len(shots) > 1:
+            shots.pop(0)
+            redraw_ms.append(_ms(painter.draw))
+    together_ms = statistics.median(snapshot_ms) + statistics.median(redraw_ms)
+    return {
+        "snapshot_ms": statistics.median(snapshot_ms),
+        "redraw_ms": statistics.median(redraw_ms),
+        "redraw_p99_ms": statistics.quantiles(redraw_ms, n=100)[-1],
+        "share_of_a_core": together_ms / 1000 / EVERY_S,
+    }
+
+
+def _ms(what: Callable[[], None]) -> float:
+    started = time.perf_counter()
+    what()
+    return 1000 * (time.perf_counter() - started)

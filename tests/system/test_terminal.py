@@ -1,0 +1,281 @@
+"""What users see at a terminal, through the commands they type: a picture, one line for each mistake, JSON."""
+
+import errno
+import fcntl
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import termios
+from collections.abc import Callable
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from emulator.cli import app
+from emulator.run.control import ask, way_in
+from emulator.run.course import Snapshot
+from emulator.terminal import run_app
+from tests.emulator.screen import Screen
+from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
+from tests.system.test_failures import long_run
+from vnet.errors import LinkError
+from vnet.link import session
+from vnet.link.access import Access
+
+DOCS = (ROOT / "docs" / "terminal.md").read_text()
+SHORT = ["scenarios/beacon.toml", "--duration", "3", "--set", "network.vehicles=4"]
+WIDTH, HEIGHT = 90, 24
+CONTROL = re.compile(r"\x1b\[(\??)[\d;]*([A-Za-z])")
+
+
+def at_a_terminal(
+    *arguments: str, awaited: str = "", then: Callable[[], None] = lambda: None, **environment: str
+) -> tuple[int, str]:
+    """A vnet command on a pseudo-terminal: its status, and what it wrote; once it writes `awaited`, do `then`."""
+    master, slave = os.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", HEIGHT, WIDTH, 0, 0))
+    kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
+    environment = {**kept, "TERM": "xterm-256color", "PYTHONHASHSEED": "0", **environment}
+    with subprocess.Popen([*VNET, *arguments], cwd=ROOT, stdout=slave, stderr=slave, env=environment) as process:
+        os.close(slave)
+        written = b""
+        done = False
+        while part := _read(master):
+            written += part
+            if awaited and not done and awaited in written.decode(errors="ignore"):
+                done = True
+                then()
+        os.close(master)
+    return process.returncode, written.decode().replace("\r\n", "\n")
+
+
+def _read(master: int) -> bytes:
+    try:
+        return os.read(master, 65_536)
+    except OSError as error:  # nobody has the other end open any more
+        assert error.errno == errno.EIO
+        return b""
+
+
+def on_screen(written: str) -> str:
+    screen = Screen(WIDTH, HEIGHT)
+    screen.feed(written)
+    return screen.text
+
+
+def test_a_picture_is_shown_and_the_summary_follows_on_a_clean_screen(tmp_path: Path) -> None:
+    status, written = at_a_terminal("simulate", *SHORT, "--out", str(tmp_path / "run"))
+    assert status == 0
+    assert "lockstep · seed 1 · 4 vehicles" in CONTROL.sub("", written)
+    shown = on_screen(written)
+    assert shown.splitlines()[0] == "verdict: valid"
+    assert "lockstep · seed" not in shown
+    assert f"files        {tmp_path}" in shown
+
+
+def test_what_programs_print_is_all_there(tmp_path: Path) -> None:
+    (tmp_path / "chatty.py").write_text(
+        "async def main(node):\n"
+        "    async for fix in node.gnss:\n"
+        "        print(node.id, 'hears nothing at', fix.time_ns)\n"
+    )
+    program = ["--program", "chatty:main", "--set", "run.name='chatty'"]
+    status, written = at_a_terminal(
+        "simulate", *SHORT, *program, "--out", str(tmp_path / "run"), PYTHONPATH=f"{tmp_path}:{ROOT}"
+    )
+    assert status == 3, "nobody sent anything"
+    said = [line for line in on_screen(written).splitlines() if "hears nothing" in line]
+    expected = [f"v{n:02} hears nothing at {t * 100_000_000}" for t in range(30) for n in range(1, 5)]
+    assert sorted(said) == sorted(expected)
+
+
+def test_no_colour_means_no_colour(tmp_path: Path) -> None:
+    _, written = at_a_terminal("simulate", *SHORT, "--out", str(tmp_path / "run"), NO_COLOR="1")
+    styles = {match.group() for match in CONTROL.finditer(written) if match[2] == "m"}
+    in_picture = written.partition("verdict: ")[0]
+    assert "lockstep · seed 1" in in_picture
+    assert not [match for match in CONTROL.finditer(in_picture) if match[2] == "m"]
+    assert not [style for style in styles if re.search(r"[\[;][34]\d", style)], "and none in the summary"
+
+
+def test_a_dumb_terminal_gets_lines(tmp_path: Path) -> None:
+    status, written = at_a_terminal("simulate", *SHORT, "--out", str(tmp_path / "run"), TERM="dumb")
+    assert status == 0
+    assert "\x1b" not in written
+    assert "× real time" in written
+
+
+def test_json_for_machines(vnet: Vnet) -> None:
+    done = vnet("run", *SHORT, "--log-format", "json")
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert {line["kind"] for line in lines} == {"state", "event", "progress", "ended"}
+    assert [line["phase"] for line in lines if line["kind"] == "state"][-2:] == ["running", "judging"]
+    assert any("listening at" in line.get("text", "") for line in lines)
+    assert any(line.get("phase") == "joining" and len(line["missing"]) == 4 for line in lines)
+    ended = lines[-1]
+    assert (ended["verdict"], ended["exit_status"], ended["folder"]) == ("valid", 0, str(done.folder))
+    assert done.stdout.count("\n") == 1
+    assert json.loads(done.stdout) == done.verdict
+
+
+def fields_in_the_docs(heading: str) -> set[str]:
+    """The names in the first column of the table under a heading of docs/terminal.md."""
+    _, _, after = DOCS.partition(heading)
+    rows = re.findall(r"^\| (`.*?) \|", after.partition("\n\n##")[0].partition("\n\nOn stdout")[0], re.MULTILINE)
+    return {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+
+
+def test_the_docs_name_every_field(tmp_path: Path) -> None:
+    told = subprocess.run(
+        [*VNET, "simulate", *SHORT, "--out", str(tmp_path / "run"), "--log-format", "json"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    lines = [json.loads(line) for line in told.stderr.splitlines()]
+    (progress, *_) = [line for line in lines if line["kind"] == "progress"]
+    assert fields_in_the_docs("A `progress` object:") == progress.keys() - {"kind", "wall_s"}
+    in_status = {field.name for field in fields(Snapshot)}
+    beside = in_status - progress.keys()
+    assert fields_in_the_docs("## A run that is on") == beside
+    assert progress.keys() - in_status == {"kind", "vehicles", "faults_acting"}
+    kinds = {line["kind"] for line in lines} | {"error"}
+    assert kinds <= fields_in_the_docs("## JSON for machines")
+
+
+def test_json_of_a_run_that_is_had_twice_is_that_of_one(vnet: Vnet) -> None:
+    done = vnet("simulate", *SHORT, "--log-format", "json", "--check-determinism")
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert [line["kind"] for line in lines].count("ended") == 1
+    assert "replay" in {check["name"] for check in json.loads(done.stdout)["checks"]}
+
+
+def test_quiet(vnet: Vnet) -> None:
+    done = vnet("simulate", *SHORT, "--quiet")
+    assert (done.status, done.stderr) == (0, "")
+    assert done.stdout == f"verdict: valid  {done.folder}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["runn", "x"], "no such command 'runn'; did you mean 'run'? (vnet --help says more)"),
+        (["run"], "missing argument 'SCENARIO' (vnet run --help says more)"),
+        (
+            ["run", "x", "--sed", "3"],
+            "no such option: --sed; did you mean --seed or --set? (vnet run --help says more)",
+        ),
+        (["run", "x", "--xyz"], "no such option: --xyz (vnet run --help says more)"),
+        (["run", "x", "--seed", "y"], "invalid value for '--seed': Input should be a valid integer"),
+        (
+            ["run", "x", "--pacing", "fast"],
+            "invalid value for '--pacing': 'fast' is not one of 'lockstep', 'realtime' (vnet run --help says more)",
+        ),
+        (["run", "x", "--out"], "option '--out' requires an argument"),
+        (["run", "x", "y"], "got unexpected extra argument(s) (y) (vnet run --help says more)"),
+        (
+            ["analyze", "scenarios/quikstart.toml"],
+            "scenarios/quikstart.toml: cannot be read: No such file or directory (did you mean quickstart.toml?)",
+        ),
+        (["analyze", "scenarios"], "scenarios: cannot be read: Is a directory; in it there are beacon.toml, dense"),
+        (["fault", "inject", "partion"], "fault: kind = 'partion' (did you mean partition?): must be one of Const"),
+        (["fault", "inject", "dos"], "fault: kind = 'dos' (did you mean DoS?): must be one of Const"),
+        (
+            ["fault", "inject", "loss", "--set", "probabilty=1"],
+            "fault: loss.probabilty: unknown key (did you mean probability?); allowed here: at_s, duration_s, ",
+        ),
+        (
+            ["analyze", "scenarios/beacon.toml", "--set", "radio.los=1"],
+            "scenarios/beacon.toml: radio.los: unknown key (did you mean loss?); allowed here: access_jitter_ms",
+        ),
+        (["status", "--json", "--watch"], "--json and --watch exclude each other"),
+        (["status", "--run", "nowhere"], "nowhere: no run is going on there (control.json is missing)"),
+    ],
+)
+def test_a_mistake_gets_one_line(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    assert run_app(app, arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith(f"vnet: {said}")
+    assert told.err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [["simulate", "nowhere.toml", "--log-format", "json"], ["run", "--log-format=json", "--sed", "1"]]
+)
+def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pytest.CaptureFixture) -> None:
+    if arguments[0] == "simulate":  # which starts anew, for its hash seed
+        arguments = ["run", *arguments[1:]]
+    assert run_app(app, arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    error = json.loads(told.err)
+    assert (error["kind"], error["exit_status"]) == ("error", 2)
+    assert "nowhere.toml: cannot be read" in error["message"] or "no such option: --sed" in error["message"]
+
+
+@pytest.mark.parametrize(
+    "command", ["", "run", "simulate", "emulator", "status", "fault inject", "campaign", "check"]
+)
+def test_help_fits_eighty_columns(
+    command: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run_app(app, [*command.split(), "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not [line for line in lines if "…" in line], "nothing is cut off"
+
+
+def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture) -> None:
+    assert run_app(app, []) == 2
+    told = capsys.readouterr()
+    assert "Run a scenario" in told.out
+    assert told.err == ""
+
+
+def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with long_run(folder) as process:
+        told = subprocess.run([*VNET, "status", "--run", str(folder)], cwd=ROOT, capture_output=True, text=True)
+        assert told.returncode == 0, told.stderr
+        rows = [line.split() for line in told.stdout.splitlines()]
+        assert rows[0][:6] == ["beacon", "lockstep", "·", "seed", "1", "·"]
+        (vehicles,) = [row for row in rows if row and row[0] == "vehicles"]
+        assert vehicles == ["vehicles", "●●●", "3", "up"]
+        assert "\x1b" not in told.stdout
+        asked = subprocess.run([*VNET, "status", "--run", str(folder), "--json"], capture_output=True, text=True)
+        status = json.loads(asked.stdout)
+        assert (status["run"], status["phase"], status["node_ids"]) == ("beacon", "running", ["v01", "v02", "v03"])
+        assert 0 < status["emulated_s"] < status["duration_s"] == 3600
+        assert status["real_time_factor"] > 0
+        assert status["fix_rmse_m"] > 0
+        assert ask(folder, "status")["emulated_s"] >= status["emulated_s"]
+        ends = partial(process.send_signal, signal.SIGINT)
+        watch = ("status", "--run", str(folder), "--watch")
+        exit_status, written = at_a_terminal(*watch, awaited="vehicles", then=ends)
+        assert exit_status == 0
+        assert on_screen(written) == f"{folder}: the run is over"
+        process.communicate(timeout=TIMEOUT_S)
+
+
+def test_a_run_that_was_killed_is_said_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It leaves its way in behind."""
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_MS", 100)
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        endpoint = f"tcp/127.0.0.1:{nobody.getsockname()[1]}"
+        with (
+            way_in(tmp_path, endpoint, Access.create("town", [["v01"]])),
+            pytest.raises(LinkError, match=r"the run does not answer \(was it killed\?\): cannot connect to tcp/"),
+        ):
+            ask(tmp_path, "status")
