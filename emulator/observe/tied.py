@@ -20,6 +20,8 @@ def main(command: list[str]) -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # it has ended meanwhile
             return
+    for number in (signal.SIGTERM, signal.SIGINT):  # whatever it was that started this may ignore them
+        signal.signal(number, signal.SIG_DFL)
     os.execv(command[0], command)
 
 

@@ -49,8 +49,7 @@ class VehicleScene:
         reach_m: float | None = scene["range_m"]
         if reach_m is not None:
             canvas.rings("vehicle/hears", (reach_m / 3, reach_m * 2 / 3, reach_m), cross=False)
-        errors = (("position, estimate", SKY, 2.0), ("position, raw fix", GREY, 1.0), ("common error", RED, 2.0))
-        canvas.series("vehicle/errors", errors)
+        canvas.series("vehicle/errors", (("position", SKY, 2.0), ("common error", RED, 2.0)))
         canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
 
     def period(self, period: Period) -> None:
@@ -91,7 +90,7 @@ class VehicleScene:
             self._weights[:] = np.nan
         if cloud is not None:
             canvas.points("vehicle/common/particles", cloud - period.truth_m)
-        canvas.plot("vehicle/errors", *(float(np.hypot(*error[0])) for error in (estimate, fix, common)))
+        canvas.plot("vehicle/errors", *(float(np.hypot(*error[0])) for error in (estimate, common)))
         if period.time_s >= self._next_slow_s:
             self._next_slow_s = period.time_s + SLOW_EVERY_S
             covariance = period.covariances("covariance_m2")[one]

@@ -299,10 +299,10 @@ def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dic
 
 def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, Entity]) -> None:
     period = next(period for period in periods(told) if period.time_s == LATE_S)
-    position, fix, estimate = (period.points(f"{name}_m")[2] for name in ("position", "fix", "estimate"))
+    position, estimate = (period.points(f"{name}_m")[2] for name in ("position", "estimate"))
     common = period.points("common_error_estimate_m")[2] - period.truth_m
     drawn = entities["/vehicle/errors"].array("Scalars:scalars", LATE_S)
-    wanted = [np.hypot(*(estimate - position)), np.hypot(*(fix - position)), np.hypot(*common)]
+    wanted = [np.hypot(*(estimate - position)), np.hypot(*common)]
     np.testing.assert_allclose(drawn, wanted, rtol=1e-5)
     assert all(clouds <= {"Points2D:positions"} for clouds in [set(entities["/vehicle/common/particles"].at)])
     table = list(entities["/vehicle/table"].at["TextDocument:text"].values())[-1][0]

@@ -160,7 +160,7 @@ def test_all_sinks_get_everything_and_none_listens_beyond_the_loopback_interface
             wait_for(lambda: f"127.0.0.1:{place.web_port}" in everything_of_ours())
             mine = everything_of_ours()
         finally:
-            viewer.terminate()
+            viewer.kill()
             viewer.wait()
     assert {f"127.0.0.1:{place.port}", f"127.0.0.1:{place.web_port}"} <= mine
     assert {address for address in mine if not address.startswith("127.0.0.1:")} == set()
