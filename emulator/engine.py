@@ -18,7 +18,6 @@ from dataclasses import replace
 from operator import attrgetter
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.arrivals import NEVER_NS, Arrivals, Deliveries, Delivery
@@ -289,21 +288,6 @@ class Engine:
         self._csma.run(time_ns)
         self._csma.medium.count(time_ns)
         return self._csma.medium.windows[: time_ns // WINDOW_NS]
-
-    def busy_table(self, time_ns: int) -> pa.Table | None:
-        """The same as a table, a row for each window and vehicle; None where senders share no medium."""
-        if self._csma is None:
-            return None
-        ratios = np.array(self.busy_ratios(time_ns)).reshape(-1, len(self._node_ids))
-        windows, count = ratios.shape
-        node = pa.array(np.tile(np.arange(count, dtype=np.int32), windows))
-        return pa.table(
-            {
-                "time_ns": pa.array(np.repeat(np.arange(windows, dtype=np.int64) * WINDOW_NS, count)),
-                "node": pa.DictionaryArray.from_arrays(node, pa.array(self._node_ids, pa.string())),
-                "busy_ratio": pa.array(ratios.ravel()),
-            }
-        )
 
     def lose(self, delivery: Delivery) -> None:
         """A delivery that never reached its process (real time only); once for each."""

@@ -72,7 +72,10 @@ def radio() -> rrb.Vertical:
             _bars("radio/latency", f"Deliveries by time on the way (ms), {last}"),
         ),
         rrb.Horizontal(
-            _against_time("radio/load", "Load of a vehicle (kB/s)"),
+            rrb.Tabs(
+                _against_time("radio/load", "Load of a vehicle (kB/s)"),
+                _against_time("radio/busy", "Busy ratio of the medium (%)"),
+            ),
             _bars("radio/bytes", f"Load by vehicle number (kB/s), {last}", legend=True),
         ),
         row_shares=[5, 4, 4],

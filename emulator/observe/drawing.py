@@ -25,22 +25,21 @@ Floats = NDArray[np.float32]
 TIMELINE = "emulated time"
 
 # Okabe & Ito 2008: colours that the colour-blind can tell apart, and that show on dark and light.
-BLUE, SKY, GREEN, ORANGE, RED, PURPLE, YELLOW, GREY, DARK = (
+BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
     (0, 114, 178),
     (86, 180, 233),
     (0, 158, 115),
     (230, 159, 0),
     (213, 94, 0),
     (204, 121, 167),
-    (240, 228, 66),
     (150, 150, 150),
     (100, 100, 100),
 )
-DARK_RED, DARK_BLUE = (138, 58, 0), (0, 65, 102)
-"""Shades of red and blue, where there are more things than colours."""
+DARK_YELLOW, DARK_RED, DARK_BLUE = (140, 130, 50), (150, 66, 8), (40, 90, 140)
+"""Shades of yellow, red and blue, where there are more things than colours."""
 OUTCOME_COLOURS: dict[Outcome, Colour] = {
     Outcome.delivered: GREEN,
-    Outcome.faded: YELLOW,
+    Outcome.faded: DARK_YELLOW,
     Outcome.collided: DARK_RED,
     Outcome.lost: RED,
     Outcome.peer_cap: ORANGE,

@@ -138,12 +138,13 @@ def period_message(
     up: ArrayLike,
     faults: Sequence[str],
     events: Iterable[Event],
+    busy_ratio: Array,
 ) -> dict[str, Any]:
     """One period, [instant.time_ns, end_ns).
 
     Truth, fixes, what was reported, `figures`, `faults` acting in it (labels), `events` since the last message,
-    `up` (uint8, n) at its end, and what became of frames, from `rows` of the trace: all that were sent or decided
-    in the period, and any others.
+    `up` (uint8, n) at its end, how busy the medium was (n), NaN where senders share none, and what became of
+    frames, from `rows` of the trace: all that were sent or decided in the period, and any others.
     """
     return {
         "period": instant.period,
@@ -162,6 +163,7 @@ def period_message(
         "up": np.asarray(up, dtype=np.uint8).tobytes(),
         "faults": list(faults),
         "events": list(map(event_message, events)),
+        "busy_ratio": pack(busy_ratio),
         **_frames(rows, instant.time_ns, end_ns, len(node_ids)),
     }
 

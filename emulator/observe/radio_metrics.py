@@ -60,10 +60,11 @@ VEHICLES = pa.schema(
         "latency_mean_ms": pa.float64(),
         "inter_reception_mean_ms": pa.float64(),
         "age_mean_ms": pa.float64(),
+        "busy_ratio_mean": pa.float64(),
     }
 )
 """A row for each vehicle: as a sender, then as a receiver; latency, inter-reception time and age are means over the
-links by which it hears."""
+links by which it hears. How busy it found the medium is null where senders share none."""
 DISTANCES = pa.schema(
     {
         "from_m": pa.float64(),
@@ -107,7 +108,8 @@ def radio_metrics(evidence: Evidence, bin_m: float = BIN_M) -> RadioMetrics:
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(evidence.node_ids, codes, count, figures)
     vehicles = _vehicles_table(evidence, codes, count, figures)
-    return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), _totals(pairs, figures))
+    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(evidence.busy_ratio)}
+    return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
 
 def _pairs(evidence: Evidence, count: int) -> _Pairs:
@@ -247,6 +249,8 @@ def _vehicles_table(evidence: Evidence, codes: NDArray[np.intp], count: int, fig
         "heard_vehicles": np.bincount(receiver[figures["delivered"] > 0], minlength=count),
         **{name: mean(name) for name in ("latency_mean_ms", "inter_reception_mean_ms", "age_mean_ms")},
     }
+    busy = evidence.busy_ratio
+    columns["busy_ratio_mean"] = busy.mean(axis=0) if len(busy) else np.full(count, np.nan)
     named = {"node": pa.array(evidence.node_ids, pa.string())}
     return pa.table(named | {name: _column(values) for name, values in columns.items()}).cast(VEHICLES)
 
@@ -283,7 +287,7 @@ def _totals(pairs: _Pairs, figures: dict[str, Array]) -> dict[str, float | None]
 
 
 def _mean(values: Array) -> float | None:
-    return float(values.mean()) if len(values) else None
+    return float(values.mean()) if values.size else None
 
 
 def _column(values: Numbers) -> pa.Array:

@@ -76,6 +76,7 @@ class RadioScene:
         """Draw a period."""
         self._stack(period)
         self._load(period)
+        self._busy(period)
         if self._count <= LARGEST_MATRIX:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
@@ -107,6 +108,15 @@ class RadioScene:
     def _load(self, period: Period) -> None:
         rates = [period.numbers(name) / self._period_s / 1e3 for name in ("sent_bytes", "received_bytes")]
         self._canvas.plot("radio/load", *(float(value) for rate in rates for value in (rate.mean(), rate.max())))
+
+    def _busy(self, period: Period) -> None:
+        ratio = 100 * period.numbers("busy_ratio")[period.up]
+        if not len(ratio) or np.isnan(ratio).any():  # senders share no medium, or no window is over
+            return
+        if "radio/busy" not in self._announced:
+            self._announced.add("radio/busy")
+            self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
+        self._canvas.plot("radio/busy", float(ratio.mean()), float(ratio.max()))
 
     def _charts(self, period: Period) -> None:
         canvas, span_s = self._canvas, len(self._latency) * self._period_s

@@ -275,8 +275,22 @@ def test_a_busy_table_that_cannot_be_read_is_said_in_one_line(tmp_path: Path) ->
     folder = tmp_path / "run"
     run(folder, mac={})
     assert check_run(folder).verdict is Verdict.VALID
-    (folder / "busy.parquet").write_bytes(b"nothing")
-    with pytest.raises(VnetError, match="not the folder of a finished run"):
+    path = folder / "busy.parquet"
+    table = pq.read_table(path)
+    spoilt = (
+        (table.drop_columns(["node"]), "has the columns"),
+        (table.slice(1), "not those of 12 vehicles"),
+        (table.set_column(1, "node", pa.array(["x"] * len(table))), "not those of 12 vehicles"),
+    )
+    for wrong, text in spoilt:
+        pq.write_table(wrong, path)
+        with pytest.raises(VnetError, match=text):
+            check_run(folder)
+    path.write_bytes(b"nothing")
+    with pytest.raises(VnetError, match=r"busy\.parquet: cannot be read"):
+        check_run(folder)
+    path.unlink()
+    with pytest.raises(VnetError, match=r"there is no busy\.parquet in it"):
         check_run(folder)
 
 

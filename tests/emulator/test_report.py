@@ -109,6 +109,16 @@ def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path)
     assert re.search(r"Not shown, and why .*Common error.*: no program reported what it needs", page.text)
 
 
+def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
+    run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
+    page = page_of(run)
+    assert "busy ratio (%)" in page.text and "expected: " not in page.text
+    (run / "busy.parquet").unlink()
+    assert "busy" not in page_of(run).ids
+    reason = r"Not shown, and why .*Busy ratio of the medium.*: .*no busy\.parquet in it"
+    assert re.search(reason, page_of(run).text)
+
+
 def test_what_others_wrote_is_text(beacon: Path) -> None:
     verdict = json.loads((beacon / "verdict.json").read_text())
     check = {"name": EVIL, "verdict": "invalid", "text": EVIL, "figures": {"rows": [{"sender": EVIL}], EVIL: EVIL}}

@@ -16,6 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from emulator.observe.busy import read_busy
 from emulator.observe.checks.bits import check_bits
 from emulator.observe.checks.channel import (
     check_conservation,
@@ -182,7 +183,8 @@ def read_evidence(folder: Path) -> Evidence:
         trace = read_trace(folder / "trace.parquet")
         states = pq.read_table(folder / "states.parquet")
         metrics = pq.read_table(folder / "metrics.parquet")
-        busy = pq.read_table(folder / "busy.parquet") if (folder / "busy.parquet").exists() else None
     except (OSError, pa.ArrowInvalid, ValueError) as error:
         raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
-    return Evidence(load_scenario(folder / "scenario.toml"), trace, states, metrics, events, busy=busy)
+    scenario = load_scenario(folder / "scenario.toml")
+    busy = None if scenario.radio.mac is None else read_busy(folder)
+    return Evidence(scenario, trace, states, metrics, events, busy=busy)

@@ -19,6 +19,7 @@ from emulator.channel.dot11p import airtimes_ns
 from emulator.channel.reach import reach_of
 from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
+from emulator.observe.busy import busy_windows
 from emulator.observe.checks.places import Mask, Places, Whole
 from emulator.observe.checks.verdicts import MOST_ROWS
 from emulator.observe.run_folder import Event
@@ -64,7 +65,7 @@ class Evidence:
     known_m: Array | None = None
     """True positions (periods, N, 2), where the states have not got them all."""
     busy: pa.Table | None = None
-    """How busy each vehicle found the medium, where they share one."""
+    """busy.parquet, where senders share a medium."""
 
     # Nodes and where they are.
 
@@ -98,6 +99,11 @@ class Evidence:
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
         return Places(some, self.moves, self.scenario.period_ns, reach)
+
+    @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium; no windows where senders share none."""
+        return busy_windows(self.busy, self.node_ids)
 
     # The trace, column by column.
 

@@ -273,11 +273,7 @@ def _heard_while_sending(air: _Air) -> NDArray[np.intp]:
 
 def _too_idle(air: _Air) -> int:
     """How many busy ratios are less than what their own vehicle sent."""
-    busy = air.evidence.busy
-    if busy is None or not len(busy):
-        return 0
-    count = len(air.evidence.node_ids)
-    ratio: Array = np.asarray(busy["busy_ratio"].to_numpy()).reshape(-1, count)
+    ratio = air.evidence.busy_ratio
     sent_ns = np.zeros(ratio.shape)
     for shift in range(int((air.end_ns - air.begin_ns).max(initial=0)) // WINDOW_NS + 2):
         window = air.begin_ns // WINDOW_NS + shift

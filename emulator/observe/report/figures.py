@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from emulator.channel.medium import WINDOW_NS
 from emulator.channel.outcomes import Outcome
 from emulator.observe.metrics import anees_band
 from emulator.observe.report.canvas import (
@@ -31,8 +32,8 @@ from emulator.observe.report.canvas import (
     QUIET,
     RED,
     RUST,
+    SAND,
     SKY,
-    YELLOW,
     Canvas,
     Span,
     canvas,
@@ -51,7 +52,7 @@ from vnet.roads.lanes import Array
 
 OUTCOME_COLOURS = {
     "delivered": GREEN,
-    "faded": YELLOW,
+    "faded": SAND,
     "collided": RUST,
     "lost": RED,
     "peer_cap": ORANGE,
@@ -108,8 +109,10 @@ class Chart:
 # Against time.
 
 
-def time_figure(lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = ()) -> Canvas:
-    """Lines against time, with the spans of faults behind them."""
+def time_figure(
+    lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = (), linear: bool = False
+) -> Canvas:
+    """Lines against time, spans of faults behind them; logarithmic if they spread far, unless `linear`."""
     rows = 1 if len(lines) > 1 else 0
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
@@ -123,7 +126,7 @@ def time_figure(lines: Sequence[Line], y_label: str, end_s: float, spans: Sequen
         made.axes.plot(*thin(line.time_s, line.value), **shown)
     everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
     positive = everything[everything > 0]
-    if len(positive) and positive.max() > WIDE_RANGE * positive.min():
+    if not linear and len(positive) and positive.max() > WIDE_RANGE * positive.min():
         logarithmic(made.axes)
     else:
         from_zero(made.axes)
@@ -223,8 +226,21 @@ def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
         raise VnetError("no frame was sent to anybody in range")
     column = trace["outcome"].combine_chunks()
     code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
-    decided_ns = pc.coalesce(trace["arrival_ns"], trace["sent_ns"]).to_numpy()
+    left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
+    decided_ns = pc.coalesce(trace["arrival_ns"], trace[left]).to_numpy()
     return column.dictionary.to_pylist(), code, decided_ns / 1e9
+
+
+def busy(source: Source) -> Drawing:
+    percent = 100 * source.busy_ratio
+    end_s = np.arange(1, len(percent) + 1) * WINDOW_NS / 1e9
+    lines = [
+        Line("mean", end_s, percent.mean(axis=1), BLUE),
+        Line("busiest", end_s, percent.max(axis=1), RED, DASHES[1]),
+    ]
+    made = time_figure(lines, "busy ratio (%)", source.end_s, source.spans, linear=True)
+    text = "The share of the time in which vehicles sensed the medium taken, in windows of 100 ms."
+    return Drawing(made, text + _faults_note(made, source))
 
 
 # Over the whole run.
@@ -285,18 +301,25 @@ def links(source: Source) -> Drawing:
     else:
         _draw_bins(made, distance_km, share)
     text = f"The share that was delivered on each of {len(used):,} links, from one vehicle to another."
-    loss = source.scenario.radio.loss
-    typical = int(np.median(rows[used]))
-    low, high = (100 * edge / typical for edge in binom.interval(LINK_BAND, typical, 1 - loss))
+    lowest = float(share.min())
+    if not source.scenario.radio.is_physical:
+        low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
+        lowest, text = min(lowest, low), text + band + _why_less(source)
+    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
+    made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
+    legend(made)
+    return Drawing(made, text)
+
+
+def _draw_expected(made: Canvas, loss: float, frames: int) -> tuple[float, str]:
+    """What links of so many frames deliver where distance makes no difference; how low that is, and in words."""
+    low, high = (100 * edge / frames for edge in binom.interval(LINK_BAND, frames, 1 - loss))
     label = f"expected: {100 * (1 - loss):g} %"
     made.axes.axhline(100 * (1 - loss), color=RED, linestyle=DASHES[1], label=label, zorder=2.5)
-    if low < high:
-        made.axes.axhspan(low, high, color=RED, alpha=0.12, linewidth=0, zorder=0.6)
-        text += f" Band: where {LINK_BAND:.0%} of links with {typical:,} frames are by chance alone."
-    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
-    made.axes.set_ylim(max(0, np.floor((min(share.min(), low) - 3) / 10) * 10), 102)
-    legend(made)
-    return Drawing(made, text + _why_less(source))
+    if low == high:
+        return low, ""
+    made.axes.axhspan(low, high, color=RED, alpha=0.12, linewidth=0, zorder=0.6)
+    return low, f" Band: where {LINK_BAND:.0%} of links with {frames:,} frames are by chance alone."
 
 
 def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
@@ -440,6 +463,7 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "position": ("Position", position),
     "outcomes": ("Outcomes over time", outcomes),
     "totals": ("Outcomes in total", totals),
+    "busy": ("Busy ratio of the medium", busy),
     "links": ("Delivery against distance", links),
     "latency": ("Latency", latency),
     "consensus": ("Consensus error", consensus),

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
+from emulator.observe.busy import busy_windows, read_busy
 from emulator.observe.checks.evidence import Evidence
 from emulator.observe.metrics import STATES as ALL_STATES
 from emulator.observe.report.canvas import Span
@@ -36,6 +37,8 @@ TRACE = {
     "cause": pa.string(),
     "arrival_ns": pa.int64(),
 }
+ON_AIR = {"left_ns": pa.int64()}
+"""A column that the trace has where senders share a medium."""
 STATES = {name: ALL_STATES.field(name).type for name in ("period", "time_ns", "node", "position_m", "values")}
 FIGURES = (
     "common_error_rmse_m",
@@ -98,9 +101,20 @@ class Source:
         return events
 
     @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium. Raises VnetError if senders share none."""
+        if self.scenario.radio.mac is None:
+            raise VnetError("senders share no medium ([radio.mac])")
+        windows = busy_windows(read_busy(self.folder), self.evidence.node_ids)
+        if not len(windows):
+            raise VnetError("the run was over within the first window")
+        return windows
+
+    @cached_property
     def evidence(self) -> Evidence:
         """The tables, so far as reports need them, as arrays."""
-        trace, states = self._table("trace", TRACE), self._table("states", STATES)
+        on_air = {} if self.scenario.radio.mac is None else ON_AIR
+        trace, states = self._table("trace", TRACE | on_air), self._table("states", STATES)
         return Evidence(self.scenario, trace, states, self.metrics, self.events)
 
     @cached_property
