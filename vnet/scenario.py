@@ -159,7 +159,7 @@ class Radio(Section):
     """
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
-    """All within it hear each other, unless there are `links`."""
+    """All within it hear each other, unless there are `links` or a `path_loss`."""
     links: Path | tuple[tuple[int, ...], ...] | None = None
     """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
     (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
@@ -179,7 +179,8 @@ class Radio(Section):
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
-    """A frame takes its payload's bits over this to send; each sender sends one at a time."""
+    """A frame takes its payload's bits over this to send; each sender sends one at a time. With a path loss or a
+    medium it is one of 802.11p's (3, 4.5, 6, 9, 12, 18, 24 or 27), and frames take as long as there."""
     queue_frames: int = Field(64, ge=1, le=MANY)
     """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
     path_loss: PathLoss | None = None

@@ -235,7 +235,7 @@ def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
     scenario = tomllib.loads(scene["scenario"])
     radio = scenario["radio"]
     can_be = {
-        Outcome.faded: "path_loss" in radio or "fading" in radio,
+        Outcome.faded: "path_loss" in radio,
         Outcome.collided: "mac" in radio,
         Outcome.held_back: "congestion" in radio,
         Outcome.lost: radio["loss"] > 0,

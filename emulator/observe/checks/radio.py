@@ -30,9 +30,6 @@ SIGMAS = 4.9
 CERTAIN = 1e-6
 TELLING_VARIANCE = 5.0
 """Of how many faded on a link: with less, a sum is not yet normal."""
-CERTAIN = 1e-6
-TELLING_VARIANCE = 5.0
-"""Of how many faded on a link: with less, a sum is not yet normal."""
 GRID_DB = 0.25
 FACTORS = 1024
 NEVER_SENT = ("queue_full", "oversize", "held_back")
