@@ -78,7 +78,7 @@ PathLoss = Annotated[FreeSpace | LogDistance | DualSlope | TwoRay, Field(discrim
 
 
 class Shadowing(Section):
-    """`[radio.shadowing]`: log-normal, the same both ways of a link, and alike where both ends are alike."""
+    """`[radio.shadowing]`: log-normal, the same both ways of a link, and similar on links whose ends are near."""
 
     sigma_db: float = Field(3.0, ge=0, le=50)
     """Standard deviation."""

@@ -109,8 +109,9 @@ def _default(key: dict[str, Any]) -> str:
 
 
 def _allowed(key: dict[str, Any]) -> str:
-    """The bounds of a key, in words."""
-    return ", ".join(_bounds(key))
+    """The bounds of a key, in words, and those of each of its values if it takes a list."""
+    each = ", ".join(_bounds(key.get("items", {})))
+    return ", ".join([*_bounds(key), *([f"each {each}"] if each else [])])
 
 
 def _bounds(key: dict[str, Any]) -> Iterator[str]:

@@ -145,6 +145,18 @@ class Period:
         n = len(self.node_ids)
         return np.bincount(pairs[:, 1] * n + pairs[:, 0], pairs[:, 3], n * n).astype(np.int32).reshape(n, n)
 
+    def ages_ms(self) -> Floats:
+        """How long before the end of the period the newest frame that was delivered in it was sent, (n, n).
+
+        A row receives, a column sends; NaN where nothing was delivered.
+        """
+        n = len(self.node_ids)
+        ages_ms = np.full((n, n), np.nan, dtype=np.float32)
+        delivered = self.pairs[:, 2] == Outcome.delivered
+        sender, receiver = self.pairs[delivered, :2].T
+        ages_ms[receiver, sender] = self.numbers("pairs_age_ms")[delivered]
+        return ages_ms
+
     def clouds(self) -> dict[str, Floats]:
         """Hypotheses of the common error by node, (k, 2)."""
         return {node: unpack(cloud, 2) for node, cloud in self.message["clouds"].items()}

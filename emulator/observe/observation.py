@@ -171,16 +171,21 @@ def period_message(
 def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
     """What became of frames in [start, end).
 
-    `pairs`: int32 (k, 4), sender, receiver, outcome and how many rows of the trace were so decided; `outcomes`: how
-    many by name; `latency_counts`: int32 (LATENCY_BINS,), deliveries by time on the way in bins of LATENCY_BIN_NS,
-    the last for all that took longer; `sent_bytes`, `received_bytes` (n): of the frames that were sent (with the
-    copies that faults make, and without those that nobody was in range of: no trace is kept of them) and delivered.
+    `pairs`: int32 (k, 4), sender, receiver, outcome and how many rows of the trace were so decided; `pairs_age_ms`
+    (k): how long before the end the newest of their frames was sent; `outcomes`: how many by name;
+    `latency_counts`: int32 (LATENCY_BINS,), deliveries by time on the way in bins of LATENCY_BIN_NS, the last for
+    all that took longer; `sent_bytes`, `received_bytes` (n): of the frames that were sent (with the copies that
+    faults make, and without those that nobody was in range of: no trace is kept of them) and delivered.
     """
     time_ns = decided_ns(rows)
     decided = rows[(rows["outcome"] != Outcome.pending) & (start_ns <= time_ns) & (time_ns < end_ns)]
     sender, receiver = decided["sender"].astype(np.int64), decided["receiver"]
-    key, number = np.unique((sender * count + receiver) * _OUTCOMES + decided["outcome"], return_counts=True)
+    key, which, number = np.unique(
+        (sender * count + receiver) * _OUTCOMES + decided["outcome"], return_inverse=True, return_counts=True
+    )
     place = key // _OUTCOMES
+    newest_ns = np.zeros(len(key), np.int64)
+    np.maximum.at(newest_ns, which, decided["sent_ns"])
     pairs = np.column_stack([place // count, place % count, key % _OUTCOMES, number])
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
@@ -188,6 +193,7 @@ def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> d
     sent = _one_each(rows[(start_ns <= rows["left_ns"]) & (rows["left_ns"] < end_ns)])
     return {
         "pairs": pairs.astype("<i4").tobytes(),
+        "pairs_age_ms": pack((end_ns - newest_ns) / 1e6),
         "outcomes": {Outcome(kind).name: number for kind, number in enumerate(outcomes) if number},
         "latency_counts": np.bincount(bins, minlength=LATENCY_BINS).astype("<i4").tobytes(),
         "sent_bytes": pack(np.bincount(sent["sender"], sent["size_bytes"], count)),

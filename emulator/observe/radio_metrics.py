@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.observe.checks.evidence import Evidence
@@ -20,6 +21,8 @@ from vnet.roads.lanes import Array
 
 NS_PER_MS = 1e6
 BIN_M = 50.0
+LEAST_PAIRS = 10
+"""Links with fewer pairs are not called bad."""
 _SHARE = 0.95
 
 Whole = NDArray[np.int64]
@@ -85,6 +88,11 @@ class RadioMetrics:
     vehicles: pa.Table
     distances: pa.Table
     totals: dict[str, float | None]
+
+    def worst_links(self, count: int) -> pa.Table:
+        """The `count` links on which the least was delivered, of those with `LEAST_PAIRS` pairs."""
+        tried = self.links.filter(pc.greater_equal(self.links["pairs"], LEAST_PAIRS))
+        return tried.sort_by([("delivery_ratio", "ascending"), ("pairs", "descending")]).slice(0, count)
 
 
 @dataclass(frozen=True)

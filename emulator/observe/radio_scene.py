@@ -1,4 +1,5 @@
-"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; the load."""
+"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; how old it
+is what receivers know; the load."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from emulator.observe.drawing import (
     GREEN,
     ORANGE,
     OUTCOME_COLOURS,
+    PURPLE,
     SKY,
     Canvas,
     Floats,
@@ -54,6 +56,40 @@ class Window:
         return len(self._kept)
 
 
+class Ages:
+    """How old is the newest that receivers have of senders, and how much time passes from one to the next.
+
+    `age_ms` (n, n), a row receives and a column sends, is that at the end of the last period; NaN on links that have
+    not brought anything yet, or have no frames any more. Times between receptions are taken between sendings.
+    """
+
+    def __init__(self, count: int, periods: int, period_ms: float) -> None:
+        self._period_ms = period_ms
+        self.age_ms: Floats = np.full((count, count), np.nan, dtype=np.float32)
+        self._gaps_ms, self._gaps = Window(periods), Window(periods)
+
+    def period(self, period: Period, tried: NDArray[Any]) -> None:
+        """Take a period; `tried` (n, n) is where there were frames of late."""
+        before_ms, new_ms = self.age_ms + np.float32(self._period_ms), period.ages_ms()
+        newer = new_ms < before_ms
+        self._gaps_ms.add(np.where(newer, before_ms - new_ms, 0).sum(axis=1, dtype=float))
+        self._gaps.add(np.where(newer, period.counts(Outcome.delivered), 0).sum(axis=1))
+        self.age_ms = np.fmin(before_ms, new_ms)
+        self.age_ms[(tried == 0) | ~period.up | ~period.up[:, None]] = np.nan
+
+    @property
+    def mean_gap_ms(self) -> float:
+        """The mean time between receptions over all links of late; NaN if nothing came twice."""
+        gaps = int(self._gaps.total.sum())
+        return float(self._gaps_ms.total.sum()) / gaps if gaps else float("nan")
+
+    def by_receiver_ms(self) -> Floats:
+        """The mean age at each receiver (n,); 0 where it has nothing of anybody."""
+        known = np.isfinite(self.age_ms)
+        total_ms = np.where(known, self.age_ms, 0).sum(axis=1)
+        return np.asarray(total_ms / np.maximum(1, known.sum(axis=1)))
+
+
 class RadioScene:
     """Draws what concerns the radio below `/radio`, from the scene and period messages of a run."""
 
@@ -67,6 +103,7 @@ class RadioScene:
         self._tried, self._delivered = Window(periods), Window(periods)
         self._latency, self._sent, self._received = Window(periods), Window(periods), Window(periods)
         self._latency_bins = LEAST_LATENCY_BINS
+        self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods, 1e3 * self._period_s)
         self._announced: set[str] = set()
         self._next_s = 0.0
         loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
@@ -80,6 +117,7 @@ class RadioScene:
         if self._count <= LARGEST_MATRIX:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
+            self._age(period)
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
         self._sent.add(period.numbers("sent_bytes").astype(float))
         self._received.add(period.numbers("received_bytes").astype(float))
@@ -118,6 +156,18 @@ class RadioScene:
             self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
         self._canvas.plot("radio/busy", float(ratio.mean()), float(ratio.max()))
 
+    def _age(self, period: Period) -> None:
+        self._ages.period(period, self._tried.total)
+        ages_ms = self._ages.age_ms[np.isfinite(self._ages.age_ms)]
+        if not len(ages_ms):
+            return
+        if "radio/age" not in self._announced:
+            self._announced.add("radio/age")
+            lines = (("age: mean", SKY, 2.0), ("age: 95 % of links", BLUE, 1.0))
+            self._canvas.series("radio/age", [*lines, ("between receptions: mean", PURPLE, 2.0)])
+        late_ms = np.quantile(ages_ms, 0.95, method="higher")
+        self._canvas.plot("radio/age", float(ages_ms.mean()), float(late_ms), self._ages.mean_gap_ms)
+
     def _charts(self, period: Period) -> None:
         canvas, span_s = self._canvas, len(self._latency) * self._period_s
         latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
@@ -131,8 +181,11 @@ class RadioScene:
             self._links(period)
 
     def _links(self, period: Period) -> None:
-        """Delivery by link, and by distance."""
+        """Delivery by link, by vehicle and by distance; ages by vehicle."""
         tried, delivered = self._tried.total, self._delivered.total
+        vehicles, heard = np.arange(self._count), 100 * delivered.sum(axis=1) / np.maximum(1, tried.sum(axis=1))
+        self._canvas.bars("radio/heard", heard, vehicles, 0.8, GREEN)
+        self._canvas.bars("radio/ages", self._ages.by_receiver_ms(), vehicles, 0.8, SKY)
         share = np.divide(delivered, tried, out=np.full(tried.shape, np.nan), where=tried > 0)
         axes = ("receiver", "sender")
         self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))

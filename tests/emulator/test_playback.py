@@ -163,7 +163,7 @@ def test_a_fault_acts_in_the_periods_that_it_touches(watched: Watched) -> None:
 def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
     """Against the trace, counted another way."""
     trace = read_trace(watched.folder / "trace.parquet")
-    rows = trace.to_pylist()
+    rows, ids = trace.to_pylist(), watched.told[0][1]["node_ids"]
     for message in watched.periods:
         start_ns, end_ns = message["time_ns"], message["time_ns"] + 100_000_000
         decided = [r for r in rows if start_ns <= (r["arrival_ns"] or r["sent_ns"]) < end_ns]
@@ -177,6 +177,18 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
             (r["sender"], r["seq"], r["copy"]): r["size_bytes"] for r in rows if start_ns <= r["sent_ns"] < end_ns
         }
         assert unpack(message["sent_bytes"]).sum() == sum(sent.values())
+        ages_ms = {}
+        for row in delivered:
+            link = row["sender"], row["receiver"]
+            ages_ms[link] = min(ages_ms.get(link, np.inf), (end_ns - row["sent_ns"]) / 1e6)
+        told = {
+            (ids[sender], ids[receiver]): age_ms
+            for (sender, receiver, outcome, _), age_ms in zip(
+                pairs, unpack(message["pairs_age_ms"])[:, 0], strict=True
+            )
+            if outcome == Outcome.delivered
+        }
+        assert told == pytest.approx(ages_ms)
         bins = [min((r["arrival_ns"] - r["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1) for r in delivered]
         assert np.frombuffer(message["latency_counts"], "<i4").tolist() == [
             bins.count(k) for k in range(LATENCY_BINS)

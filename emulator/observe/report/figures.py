@@ -21,6 +21,7 @@ from scipy.stats import binom
 from emulator.channel.medium import WINDOW_NS
 from emulator.channel.outcomes import Outcome
 from emulator.observe.metrics import anees_band
+from emulator.observe.radio_metrics import BIN_M
 from emulator.observe.report.canvas import (
     BLUE,
     GREEN,
@@ -294,7 +295,9 @@ def links(source: Source) -> Drawing:
     known = np.isfinite(apart_m)
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
-    made = canvas("distance (km)", "delivered (%)", legend_rows=1)
+    physical, binned = source.scenario.radio.is_physical, evidence.moves or source.scenario.radio.is_physical
+    labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
+    made = canvas("distance (km)", "delivered (%)", legend_rows=int(np.ceil(labels / 3)))
     if len(used) <= MOST_LINKS:
         dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
         made.axes.plot(distance_km, share, color=BLUE, alpha=0.55, label="a link", **dots)
@@ -302,13 +305,49 @@ def links(source: Source) -> Drawing:
         _draw_bins(made, distance_km, share)
     text = f"The share that was delivered on each of {len(used):,} links, from one vehicle to another."
     lowest = float(share.min())
-    if not source.scenario.radio.is_physical:
+    if not physical:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
         lowest, text = min(lowest, low), text + band + _why_less(source)
+    if binned:
+        bins = source.radio.distances
+        middle_km = (bins["from_m"].to_numpy() + bins["to_m"].to_numpy()) / 2000
+        share = 100 * bins["delivery_ratio"].to_numpy()
+        made.axes.plot(middle_km, share, color=INK, label=f"all frames, by {BIN_M:g} m")
+        lowest = min(lowest, float(share.min(initial=100)))
     made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
     made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
     legend(made)
     return Drawing(made, text)
+
+
+def ages(source: Source) -> Drawing:
+    links, share = source.radio.links, np.linspace(0, 1, 101)
+    lines = {
+        "between receptions: mean": ("inter_reception_mean_ms", BLUE),
+        "95 %": ("inter_reception_p95_ms", SKY),
+        "age: mean": ("age_mean_ms", RED),
+    }
+    made = canvas("links, from the best to the worst (%)", "time (ms)", legend_rows=1)
+    drawn = []
+    for (label, (name, colour)), dash in zip(lines.items(), (DASHES[0], DASHES[2], DASHES[1]), strict=True):
+        values_ms = links[name].drop_null().to_numpy()
+        if len(values_ms):
+            drawn.append(np.quantile(values_ms, share, method="inverted_cdf"))
+            made.axes.plot(100 * share, drawn[-1], color=colour, linestyle=dash, label=label)
+    if not drawn:
+        raise VnetError("nothing was received twice on a link")
+    made.axes.set_xlim(0, 100)
+    least, most = np.min(drawn), np.max(drawn)
+    if 0 < WIDE_RANGE * least < most:
+        logarithmic(made.axes)
+    else:
+        from_zero(made.axes)
+    legend(made)
+    return Drawing(
+        made,
+        "How long receivers wait from one frame of a sender to the next, and how old the newest is that they have; "
+        f"each line sorts the {len(links):,} links by its own figure.",
+    )
 
 
 def _draw_expected(made: Canvas, loss: float, frames: int) -> tuple[float, str]:
@@ -466,6 +505,7 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "busy": ("Busy ratio of the medium", busy),
     "links": ("Delivery against distance", links),
     "latency": ("Latency", latency),
+    "ages": ("Time between receptions, and age of information", ages),
     "consensus": ("Consensus error", consensus),
     "consistency": ("Consistency of the filters", consistency),
     "degrees": ("Degrees of the network", degrees),
