@@ -96,7 +96,7 @@ DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 
 ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
 ProgramOption = Annotated[
-    str | None, typer.Option(metavar="MODULE:FUNCTION", help="What every vehicle runs, as agents.beacon:main.")
+    str | None, typer.Option(metavar="MODULE:FUNCTION", help="What every vehicle runs, as hello:main.")
 ]
 PacingOption = Annotated[
     Pacing | None,

@@ -132,7 +132,7 @@ async def test_stops(vnet_emulation):
 """,
     )
     result.assert_outcomes(failed=1)
-    (folder,) = Path(pytester.path).parent.glob("**/vnet-1")
+    (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
     assert verdict_of(folder)["emulated_s"] == 0.5
 
 
@@ -261,7 +261,7 @@ async def test_both(vnet_emulation, live):
 def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) -> None:
     """What the test did, instant by instant, is in the scenario that it leaves."""
     run_tests(pytester, LIVE_OR_NOT).assert_outcomes(passed=2)
-    folders = sorted(Path(pytester.path).parent.glob("**/vnet-1"))
+    folders = sorted((pytester.path.parent / "basetemp").glob("**/vnet-1"))
     again = pytester.path / "again"
     command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(folders[0] / "scenario.toml")]
     subprocess.run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, check=False, timeout=120)
