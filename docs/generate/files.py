@@ -25,7 +25,7 @@ FOLDER = {
     "scenario.toml": "the scenario with every default and the digests of its input files; it reproduces the run",
     "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
-    "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy their medium was, if they share one",
+    "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",

@@ -59,7 +59,7 @@ class Window:
 class Ages:
     """How old is the newest that receivers have of senders, and how much time passes from one to the next.
 
-    `age_ms` (n, n), a row receives and a column sends, is that at the end of the last period; NaN on links that have
+    `age_ms` (n, n), a row receives, a column sends, is that at the end of the last period; NaN on links that have
     not brought anything yet, or have no frames any more. Times between receptions are those between sendings.
     """
 
