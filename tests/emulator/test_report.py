@@ -121,7 +121,7 @@ def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
     assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text
     worst = figures.worst_links(1).to_pylist()[0]
     assert f"{worst['sender']} {worst['receiver']} {worst['pairs']}" in page.text
-    assert "time (ms)" in page.text and "all frames, by 50 m" in page.text
+    assert "time (ms)" in page.text and "all frames, by 200 m" in page.text
     (run / "busy.parquet").unlink()
     assert "busy" not in page_of(run).ids
     reason = r"Not shown, and why .*Busy ratio of the medium.*: .*no busy\.parquet in it"

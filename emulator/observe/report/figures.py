@@ -70,6 +70,7 @@ MOST_BARS = 10
 MOST_LINKS = 800
 """With more links than that, bins are shown instead of a point for each."""
 MOST_IN_MATRIX = 150
+DISTANCE_BINS = 25
 WIDE_RANGE = 8.0
 """With more than that between the least and the largest value, an axis is logarithmic."""
 LINK_BAND = 0.99
@@ -309,11 +310,7 @@ def links(source: Source) -> Drawing:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
         lowest, text = min(lowest, low), text + band + _why_less(source)
     if binned:
-        bins = source.radio.distances
-        middle_km = (bins["from_m"].to_numpy() + bins["to_m"].to_numpy()) / 2000
-        share = 100 * bins["delivery_ratio"].to_numpy()
-        made.axes.plot(middle_km, share, color=INK, label=f"all frames, by {BIN_M:g} m")
-        lowest = min(lowest, float(share.min(initial=100)))
+        lowest = min(lowest, _draw_frames(made, source.radio.distances))
     made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
     made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
     legend(made)
@@ -323,8 +320,8 @@ def links(source: Source) -> Drawing:
 def ages(source: Source) -> Drawing:
     links, share = source.radio.links, np.linspace(0, 1, 101)
     lines = {
-        "between receptions: mean": ("inter_reception_mean_ms", BLUE),
-        "95 %": ("inter_reception_p95_ms", SKY),
+        "gap: mean": ("inter_reception_mean_ms", BLUE),
+        "gap: 95 %": ("inter_reception_p95_ms", SKY),
         "age: mean": ("age_mean_ms", RED),
     }
     made = canvas("links, from the best to the worst (%)", "time (ms)", legend_rows=1)
@@ -345,8 +342,8 @@ def ages(source: Source) -> Drawing:
     legend(made)
     return Drawing(
         made,
-        "How long receivers wait from one frame of a sender to the next, and how old the newest is that they have; "
-        f"each line sorts the {len(links):,} links by its own figure.",
+        "Gap: from one reception of a sender's frames to the next. Age: how long ago the newest was sent that the "
+        f"receiver has. Each line sorts the {len(links):,} links by its own figure.",
     )
 
 
@@ -370,6 +367,17 @@ def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
     low, median, high = np.array([np.percentile(share[place == p], [5, 50, 95]) for p in there]).T
     made.axes.fill_between(middle, low, high, color=BLUE, alpha=0.25, linewidth=0, label="9 of 10 links")
     made.axes.plot(middle, median, color=BLUE, label="median")
+
+
+def _draw_frames(made: Canvas, bins: pa.Table) -> float:
+    """The share of all frames by distance, in at most `DISTANCE_BINS` bins; returns the least."""
+    from_m, pairs, delivered = (bins[name].to_numpy() for name in ("from_m", "pairs", "delivered"))
+    width_m = BIN_M * int(np.ceil((from_m.max(initial=0) + BIN_M) / BIN_M / DISTANCE_BINS))
+    place = (from_m // width_m).astype(np.intp)
+    there = np.unique(place)
+    share = 100 * np.bincount(place, delivered)[there] / np.bincount(place, pairs)[there]
+    made.axes.plot((there + 0.5) * width_m / 1000, share, color=INK, label=f"all frames, by {width_m:g} m")
+    return float(share.min(initial=100))
 
 
 def _why_less(source: Source) -> str:
@@ -505,7 +513,7 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "busy": ("Busy ratio of the medium", busy),
     "links": ("Delivery against distance", links),
     "latency": ("Latency", latency),
-    "ages": ("Time between receptions, and age of information", ages),
+    "ages": ("Age of information, and gaps", ages),
     "consensus": ("Consensus error", consensus),
     "consistency": ("Consistency of the filters", consistency),
     "degrees": ("Degrees of the network", degrees),

@@ -107,14 +107,18 @@ def pairs(rows: Mapping[str, object]) -> str:
     return f'<dl class="pairs">{"".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in rows.items())}</dl>'
 
 
-def table(rows: Sequence[Mapping[str, Any]], caption: str = "") -> str:
-    """Rows of named values; columns in which nothing stands are left out."""
+def table(rows: Sequence[Mapping[str, Any]], caption: str = "", decimals: int | None = None) -> str:
+    """Rows of named values; columns in which nothing stands are left out. `decimals` are those of all fractions."""
+
+    def shown(value: Any) -> str:
+        return cell(value) if decimals is None or not isinstance(value, float) else f"{value:,.{decimals}f}"
+
     names = dict.fromkeys(key for row in rows for key in row)
     columns = [name for name in names if any(row.get(name) not in (None, "") for row in rows)]
     numeric = {c for c in columns if all(isinstance(row.get(c), (int, float, type(None))) for row in rows)}
     head = "".join(f'<th scope="col"{_class(c in numeric)}>{escape(c)}</th>' for c in columns)
     body = "".join(
-        f"<tr>{''.join(f'<td{_class(c in numeric)}>{escape(cell(row.get(c)), 300)}</td>' for c in columns)}</tr>"
+        f"<tr>{''.join(f'<td{_class(c in numeric)}>{escape(shown(row.get(c)), 300)}</td>' for c in columns)}</tr>"
         for row in rows
     )
     title = f"<caption>{escape(caption)}</caption>" if caption else ""

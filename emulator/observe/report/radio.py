@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
-
 import pyarrow as pa
 
 from emulator.observe.report.page import escape, table
@@ -71,14 +70,12 @@ def _listed(title: str, rows: pa.Table, columns: Mapping[str, str]) -> Iterator[
         return
     more = f": {len(shown)} of {len(rows):,}" if len(shown) < len(rows) else ""
     listed = [
-        {head: _rounded(name, row[name]) for head, name in columns.items()}
+        {head: _cell(name, row[name]) for head, name in columns.items()}
         for row in shown.select(list(columns.values())).to_pylist()
     ]
-    yield f"<details><summary>{title}{more}</summary>{table(listed)}</details>"
+    yield f"<details><summary>{title}{more}</summary>{table(listed, decimals=1)}</details>"
 
 
-def _rounded(name: str, value: Any) -> Any:
-    """A cell: ratios in percent, and no more digits than one can read."""
-    if not isinstance(value, float):
-        return value
-    return round(100 * value if "ratio" in name else value, 1)
+def _cell(name: str, value: Any) -> Any:
+    """Ratios in percent, and all else as it is."""
+    return 100 * value if "ratio" in name and value is not None else value
