@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
+
 import pyarrow as pa
 
 from emulator.observe.report.page import escape, table
