@@ -22,7 +22,7 @@ demo: $(READY)
 	$(BIN)/vnet run scenarios/quickstart.toml --rerun save
 
 test: lint
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

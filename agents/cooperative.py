@@ -56,8 +56,11 @@ SUMS_GATE_SIGMAS = 5.0
 CLOUD_REPORT_PARTICLES = 50
 CLOCK_FIXES = 10
 """So many fixes a clock is judged by: after it has jumped ahead it is wrong for so long."""
-SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.85, 0.97
-"""Shares of the period: within the first every vehicle sends, at the end of the second it computes."""
+SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.7, 0.97
+"""Shares of the period: within the first every vehicle sends, at the end of the second it computes, if the last slot
+is over by `GRACE_SHARE` then. All compute at once: where many share a processor they must be done by the next fix.
+"""
+GRACE_SHARE = 0.15
 
 
 class Estimator:
@@ -272,6 +275,8 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
     periods_a_second = max(1, NS_PER_S // node.period_ns)
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
+    last_slot_share = SENDING_SHARE * (options.slots - 1) / options.slots
+    listening_ns = round(max(LISTENING_SHARE, last_slot_share + GRACE_SHARE) * node.period_ns)
     clock = _GnssClock(node)
     async for fix in node.gnss:
         # After standing still a vehicle goes on from the newest fix: nobody wants what it saw meanwhile.
@@ -283,7 +288,7 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
         if usable(fix):
             payload = estimator.frame(fix, node.radio.max_payload)
             await node.radio.broadcast(payload)
-        await clock.sleep_until(fix.time_ns + round(LISTENING_SHARE * node.period_ns))
+        await clock.sleep_until(fix.time_ns + listening_ns)
         packets = node.radio.drain()
         estimator.read(packets, clock.now_ns)
         estimator.filter(fix)
