@@ -78,9 +78,9 @@ def radio() -> rrb.Vertical:
                 _against_time("radio/busy", "Busy ratio of the medium (%)"),
             ),
             rrb.Tabs(
-                _bars("radio/heard", f"Delivered by receiving vehicle (%), {last}"),
-                _bars("radio/ages", "Age of information by receiving vehicle (ms), now"),
-                _bars("radio/bytes", f"Load by vehicle (kB/s), {last}", legend=True),
+                _bars("radio/heard", f"Delivered by receiver (%), {last}"),
+                _bars("radio/ages", "Age by receiver (ms)"),
+                _bars("radio/bytes", "Load by vehicle (kB/s)", legend=True),
             ),
         ),
         row_shares=[5, 4, 4],
