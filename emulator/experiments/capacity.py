@@ -174,7 +174,7 @@ def draw(points: Sequence[Point]) -> Figure:
     for axes, size_bytes in zip(panels, SIZES, strict=True):
         _draw_size(axes, points, size_bytes)
     panels[0].set_ylabel("delivered of what was handed over")
-    panels[0].legend(loc="lower left")
+    panels[0].legend(loc="lower left", frameon=True, framealpha=1, edgecolor="none")
     figure.suptitle(
         f"Delivery within {reach_m():.0f} m against the number of others there, {RATE_HZ} frames a second"
     )
