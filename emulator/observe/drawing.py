@@ -145,17 +145,10 @@ class Period:
         n = len(self.node_ids)
         return np.bincount(pairs[:, 1] * n + pairs[:, 0], pairs[:, 3], n * n).astype(np.int32).reshape(n, n)
 
-    def ages_ms(self) -> Floats:
-        """How long before the end of the period the newest frame that was delivered in it was sent, (n, n).
-
-        A row receives, a column sends; NaN where nothing was delivered.
-        """
-        n = len(self.node_ids)
-        ages_ms = np.full((n, n), np.nan, dtype=np.float32)
+    def received(self) -> tuple[NDArray[np.int32], Floats]:
+        """Links that delivered, (k, 3): sender, receiver, how many; and (k,) the age of each newest frame in ms."""
         delivered = self.pairs[:, 2] == Outcome.delivered
-        sender, receiver = self.pairs[delivered, :2].T
-        ages_ms[receiver, sender] = self.numbers("pairs_age_ms")[delivered]
-        return ages_ms
+        return self.pairs[delivered][:, [0, 1, 3]], self.numbers("pairs_age_ms")[delivered]
 
     def clouds(self) -> dict[str, Floats]:
         """Hypotheses of the common error by node, (k, 2)."""

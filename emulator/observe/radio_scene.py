@@ -59,35 +59,37 @@ class Window:
 class Ages:
     """How old is the newest that receivers have of senders, and how much time passes from one to the next.
 
-    `age_ms` (n, n), a row receives, a column sends, is that at the end of the last period; NaN on links that have
-    not brought anything yet, or have no frames any more. Times between receptions are those between sendings.
+    Times between receptions are those between the sendings of what is received.
     """
 
-    def __init__(self, count: int, periods: int, period_ms: float) -> None:
-        self._period_ms = period_ms
-        self.age_ms: Floats = np.full((count, count), np.nan, dtype=np.float32)
-        self._gaps_ms, self._gaps = Window(periods), Window(periods)
+    def __init__(self, count: int, periods: int) -> None:
+        self._sent_ms = np.full((count, count), np.nan)
+        self._gaps = Window(periods)
 
-    def period(self, period: Period, tried: NDArray[Any]) -> None:
-        """Take a period; `tried` (n, n) is where there were frames of late."""
-        before_ms, new_ms = self.age_ms + np.float32(self._period_ms), period.ages_ms()
-        newer = new_ms < before_ms
-        self._gaps_ms.add(np.where(newer, before_ms - new_ms, 0).sum(axis=1, dtype=float))
-        self._gaps.add(np.where(newer, period.counts(Outcome.delivered), 0).sum(axis=1))
-        self.age_ms = np.fmin(before_ms, new_ms)
-        self.age_ms[(tried == 0) | ~period.up | ~period.up[:, None]] = np.nan
+    def period(self, period: Period, end_ms: float) -> None:
+        """Take a period that ended then."""
+        links, age_ms = period.received()
+        sender, receiver, number = links.T
+        sent_ms, before_ms = end_ms - age_ms, self._sent_ms[receiver, sender]
+        newer = sent_ms > before_ms
+        self._gaps.add(np.array([(sent_ms - before_ms)[newer].sum(), number[newer].sum()]))
+        self._sent_ms[receiver, sender] = np.fmax(before_ms, sent_ms)
+        if not period.up.all():
+            self._sent_ms[~period.up] = self._sent_ms[:, ~period.up] = np.nan
+
+    def at(self, end_ms: float, tried: NDArray[Any]) -> NDArray[np.float64]:
+        """The ages in ms (n, n), a row receives, a column sends; NaN on links that have not brought anything yet.
+
+        Links on which there were no frames of late, by `tried` (n, n), begin anew.
+        """
+        self._sent_ms[tried == 0] = np.nan
+        return end_ms - self._sent_ms
 
     @property
     def mean_gap_ms(self) -> float:
         """The mean time between receptions over all links of late; NaN if nothing came twice."""
-        gaps = int(self._gaps.total.sum())
-        return float(self._gaps_ms.total.sum()) / gaps if gaps else float("nan")
-
-    def by_receiver_ms(self) -> Floats:
-        """The mean age at each receiver (n,); 0 where it has nothing of anybody."""
-        known = np.isfinite(self.age_ms)
-        total_ms = np.where(known, self.age_ms, 0).sum(axis=1)
-        return np.asarray(total_ms / np.maximum(1, known.sum(axis=1)))
+        total_ms, gaps = self._gaps.total
+        return float(total_ms / gaps) if gaps else float("nan")
 
 
 class RadioScene:
@@ -103,7 +105,7 @@ class RadioScene:
         self._tried, self._delivered = Window(periods), Window(periods)
         self._latency, self._sent, self._received = Window(periods), Window(periods), Window(periods)
         self._latency_bins = LEAST_LATENCY_BINS
-        self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods, 1e3 * self._period_s)
+        self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)
         self._announced: set[str] = set()
         self._next_s = 0.0
         loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
@@ -117,7 +119,7 @@ class RadioScene:
         if self._count <= LARGEST_MATRIX:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
-            self._age(period)
+            self._ages.period(period, self._end_ms(period))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
         self._sent.add(period.numbers("sent_bytes").astype(float))
         self._received.add(period.numbers("received_bytes").astype(float))
@@ -156,17 +158,20 @@ class RadioScene:
             self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
         self._canvas.plot("radio/busy", float(ratio.mean()), float(ratio.max()))
 
-    def _age(self, period: Period) -> None:
-        self._ages.period(period, self._tried.total)
-        ages_ms = self._ages.age_ms[np.isfinite(self._ages.age_ms)]
-        if not len(ages_ms):
+    def _age(self, end_ms: float) -> None:
+        """Ages by vehicle, and over all links."""
+        ages_ms = self._ages.at(end_ms, self._tried.total)
+        known = np.isfinite(ages_ms)
+        by_receiver_ms = np.where(known, ages_ms, 0).sum(axis=1) / np.maximum(1, known.sum(axis=1))
+        self._canvas.bars("radio/ages", by_receiver_ms, np.arange(self._count), 0.8, SKY)
+        if not known.any():
             return
         if "radio/age" not in self._announced:
             self._announced.add("radio/age")
             lines = (("age: mean", SKY, 2.0), ("age: 95 % of links", BLUE, 1.0))
             self._canvas.series("radio/age", [*lines, ("between receptions: mean", PURPLE, 2.0)])
-        late_ms = np.quantile(ages_ms, 0.95, method="higher")
-        self._canvas.plot("radio/age", float(ages_ms.mean()), float(late_ms), self._ages.mean_gap_ms)
+        late_ms = np.quantile(ages_ms[known], 0.95, method="higher")
+        self._canvas.plot("radio/age", float(ages_ms[known].mean()), float(late_ms), self._ages.mean_gap_ms)
 
     def _charts(self, period: Period) -> None:
         canvas, span_s = self._canvas, len(self._latency) * self._period_s
@@ -179,13 +184,16 @@ class RadioScene:
             canvas.bars(f"radio/bytes/{name}", rate, np.arange(self._count) + 0.2 * side, 0.4, colour)
         if self._count <= LARGEST_MATRIX:
             self._links(period)
+            self._age(self._end_ms(period))
+
+    def _end_ms(self, period: Period) -> float:
+        return (period.time_ns + self._period_ns) / 1e6
 
     def _links(self, period: Period) -> None:
-        """Delivery by link, by vehicle and by distance; ages by vehicle."""
+        """Delivery by link, by vehicle and by distance."""
         tried, delivered = self._tried.total, self._delivered.total
         vehicles, heard = np.arange(self._count), 100 * delivered.sum(axis=1) / np.maximum(1, tried.sum(axis=1))
         self._canvas.bars("radio/heard", heard, vehicles, 0.8, GREEN)
-        self._canvas.bars("radio/ages", self._ages.by_receiver_ms(), vehicles, 0.8, SKY)
         share = np.divide(delivered, tried, out=np.full(tried.shape, np.nan), where=tried > 0)
         axes = ("receiver", "sender")
         self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))
