@@ -26,8 +26,6 @@ from emulator.viewing_cli import LATEST, RunArgument
 from vnet.errors import VnetError
 
 WORST_LINKS = 10
-LEAST_PAIRS = 10
-"""Links with fewer pairs are not called bad."""
 FIGURES = {
     "latency": "latency_mean_ms",
     "between two receptions": "inter_reception_mean_ms",
@@ -83,9 +81,10 @@ def _print(metrics: RadioMetrics, console: Console) -> None:
     console.print(f"{counts}: {totals['delivery_ratio']:.2%}", highlight=False)
     for text, name in FIGURES.items():
         console.print(f"{text:24}{_cell(totals[name])} ms", highlight=False)
+    if totals["busy_ratio_mean"] is not None:
+        console.print(f"{'busy ratio':24}{totals['busy_ratio_mean']:.1%}", highlight=False)
     console.print(_table("delivered, by distance in m", metrics.distances, DISTANCE_COLUMNS))
-    links = metrics.links.filter(pa.compute.greater_equal(metrics.links["pairs"], LEAST_PAIRS))
-    worst = links.sort_by([("delivery_ratio", "ascending"), ("pairs", "descending")]).slice(0, WORST_LINKS)
+    worst = metrics.worst_links(WORST_LINKS)
     console.print(_table("the worst links; distances in m, times in ms", worst, LINK_COLUMNS))
 
 

@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from vnet.errors import ScenarioError, did_you_mean, printable, shown
 from vnet.faults import Fault
+from vnet.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from vnet.sections import Section, first_problem
 from vnet.sumo import input_files
 from vnet.toml_text import DEEPEST, check_plain, parse_toml, read_toml
@@ -170,10 +171,13 @@ class WorldSection(Section):
 
 
 class Radio(Section):
-    """`[radio]`: what stands between one vehicle's broadcast and another's reception."""
+    """`[radio]`: what stands between one vehicle's broadcast and another's reception.
+
+    The subsections make it a physical radio, stage by stage; docs/radio.md says what each of them does.
+    """
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
-    """All within it hear each other, unless there are `links`."""
+    """All within it hear each other, unless there are `links` or a `path_loss`."""
     links: Path | tuple[tuple[int, ...], ...] | None = None
     """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
     (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
@@ -193,9 +197,43 @@ class Radio(Section):
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
-    """A frame takes its payload's bits over this to send; each sender sends one at a time."""
+    """A frame takes its payload's bits over this to send; each sender sends one at a time. With a path loss or a
+    medium it is one of 802.11p's (3, 4.5, 6, 9, 12, 18, 24 or 27), and frames take as long as there."""
     queue_frames: int = Field(64, ge=1, le=MANY)
     """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
+    path_loss: PathLoss | None = None
+    """How much weaker signals arrive; in place of the range, the power decides who hears whom."""
+    shadowing: Shadowing | None = None
+    """What stands in the way of some signals and not of others."""
+    fading: Fading | None = None
+    """How the power of one frame differs from the mean."""
+    receiver: Receiver | None = None
+    """Noise, and what is detected; its defaults hold wherever signals have a power."""
+    mac: Mac | None = None
+    """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
+    congestion: Congestion | None = None
+    """Senders send less where the medium is busy."""
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether signals have a power, and frames the air time of 802.11p."""
+        return self.path_loss is not None or self.mac is not None
+
+    @model_validator(mode="after")
+    def _stages_fit_together(self) -> Radio:
+        if self.path_loss is not None and self.links is not None:
+            raise ValueError("path_loss and links both say who hears whom: leave one of them out")
+        for name in ("shadowing", "fading"):
+            if getattr(self, name) is not None and self.path_loss is None:
+                raise ValueError(f"{name} needs path_loss: without it no signal is weaker than another")
+        if self.receiver is not None and not self.is_physical:
+            raise ValueError("receiver needs path_loss or mac: without them there is no signal and no interference")
+        if self.congestion is not None and self.mac is None:
+            raise ValueError("congestion needs mac: without it nobody senses how busy the channel is")
+        if self.is_physical and self.bitrate_mbps not in RATES_MBPS:
+            rates = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
+            raise ValueError(f"bitrate_mbps = {self.bitrate_mbps:g}: 802.11p has {rates}")
+        return self
 
     @field_validator("links", mode="before")
     @classmethod

@@ -12,6 +12,7 @@ from docs.generate.keys import unit
 from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.channel.outcomes import Outcome
+from emulator.observe.busy import busy_table
 from emulator.observe.metrics import STATES, Metrics, PeriodFigures
 from emulator.observe.trace import Trace
 
@@ -24,6 +25,7 @@ FOLDER = {
     "scenario.toml": "the scenario with every default and the digests of its input files; it reproduces the run",
     "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
+    "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
@@ -38,8 +40,11 @@ OUTCOMES = {
     Outcome.delivered: "it arrived, at `arrival_ns`",
     Outcome.out_of_range: "counted in `verdict.json`, and has no row",
     Outcome.peer_cap: "the receiver hears `radio.max_peers` nearer senders",
+    Outcome.faded: "too weak to be detected, or to be read, with nobody else on the air",
+    Outcome.collided: "it would have been received had nobody else been on the air",
     Outcome.lost: "by `radio.loss`",
     Outcome.queue_full: "the sender's queue was full",
+    Outcome.held_back: "congestion control gave a newer frame its place",
     Outcome.oversize: "longer than `radio.max_payload_bytes`",
     Outcome.fault: "cut or lost by the fault in `cause`",
     Outcome.receiver_down: "it arrived at a vehicle that was down, at `arrival_ns`",
@@ -56,6 +61,13 @@ TRACE = {
     "cause": "the fault behind an outcome `fault`, a copy or changed bytes, as `loss-0`; else empty",
     "arrival_ns": "when it arrived; null if it did not",
     "copy": "0; 1, 2, … for what a fault sends, or lets arrive, again",
+    "on_air_ns": "with `[radio.mac]` only: when its transmission began; null if it never did",
+    "left_ns": "with `[radio.mac]` only: when its transmission ended, or it was given up",
+}
+BUSY = {
+    "time_ns": "when the 100 ms began",
+    "node": "id of the vehicle",
+    "busy_ratio": "the share of them in which it sent, or sensed `radio.mac.carrier_sense_dbm` or more",
 }
 STATE = {
     "period": "counts from 0",
@@ -123,7 +135,7 @@ VERDICT = {
 
 def page() -> str:
     """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
-    trace, metrics = Trace(["v01"]).to_table().schema, _metrics_schema()
+    trace, metrics = Trace(["v01"], knows_air=True).to_table().schema, _metrics_schema()
     assert {**OUTCOMES, Outcome.pending: ""}.keys() == set(Outcome), "an outcome without a text"
     parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
     parts += [
@@ -134,6 +146,7 @@ def page() -> str:
     parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", what] for outcome, what in OUTCOMES.items())))
     parts += ["## `states.parquet`", columns(STATES, STATE)]
+    parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += [
         "## `metrics.parquet`",
         docstring(PeriodFigures),

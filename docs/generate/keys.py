@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
@@ -14,6 +15,9 @@ HEADER = ("key", "type", "default", "unit", "allowed", "what")
 UNITS = {
     "m_s": "m/s",
     "mbps": "Mbit/s",
+    "dbm": "dBm",
+    "ghz": "GHz",
+    "db": "dB",
     "bytes": "bytes",
     "ppm": "ppm",
     "rad": "rad",
@@ -57,14 +61,20 @@ def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
     return table(HEADER, rows)
 
 
-def subsections(model: type[BaseModel]) -> dict[str, type[BaseModel]]:
-    """The keys of a model that are models themselves, but for selectors, which are written in one line."""
-    kinds = {name: field.annotation for name, field in model.model_fields.items()}
-    return {
-        name: kind
-        for name, kind in kinds.items()
-        if isinstance(kind, type) and issubclass(kind, BaseModel) and kind.__name__ != "Selector"
-    }
+def subsections(model: type[BaseModel]) -> dict[str, list[type[BaseModel]]]:
+    """The keys of a model that are models themselves, or one of several; without selectors, which take one line."""
+    found = {name: list(_models(field.annotation)) for name, field in model.model_fields.items()}
+    return {name: kinds for name, kinds in found.items() if kinds and kinds[0].__name__ != "Selector"}
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models of an annotation that is a model, or a union of some or of one and None."""
+    if isinstance(annotation, type):
+        if issubclass(annotation, BaseModel):
+            yield annotation
+    elif get_origin(annotation) in (Annotated, Union, UnionType):
+        for part in get_args(annotation):
+            yield from _models(part)
 
 
 def unit(name: str) -> str:
@@ -99,8 +109,9 @@ def _default(key: dict[str, Any]) -> str:
 
 
 def _allowed(key: dict[str, Any]) -> str:
-    """The bounds of a key, in words."""
-    return ", ".join(_bounds(key))
+    """The bounds of a key, in words, and those of each of its values if it takes a list."""
+    each = ", ".join(_bounds(key.get("items", {})))
+    return ", ".join([*_bounds(key), *([f"each {each}"] if each else [])])
 
 
 def _bounds(key: dict[str, Any]) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterator
+from typing import get_args
 
 from pydantic import BaseModel
 
@@ -42,8 +43,12 @@ def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
     """The section at `path` and all below it."""
     if path:
         yield from _section(f"[{path}]", model, without=("exceptions",))
-    for name, section in subsections(model).items():
-        yield from _sections(f"{path}.{name}" if path else name, section)
+    for name, kinds in subsections(model).items():
+        below = f"{path}.{name}" if path else name
+        if len(kinds) == 1:
+            yield from _sections(below, kinds[0])
+        else:
+            yield from _choice(below, model.model_fields[name].description or "", kinds)
     if path == "program":
         yield from _section("[[program.exceptions]]", ProgramException)
     if not path:
@@ -55,6 +60,17 @@ def _section(heading: str, model: type[BaseModel], without: tuple[str, ...] = ()
     yield f"## `{heading}`"
     yield sentence(docstring(model).partition("`: ")[2])
     yield key_table(model, without)
+
+
+def _choice(path: str, said: str, kinds: list[type[BaseModel]]) -> Iterator[str]:
+    """A section that is of one of several kinds."""
+    yield f"## `[{path}]`"
+    yield said
+    for kind in kinds:
+        (name,) = get_args(kind.model_fields["kind"].annotation)
+        yield f'### `kind = "{name}"`'
+        yield docstring(kind)
+        yield key_table(kind, without=("kind",))
 
 
 def _options() -> Iterator[str]:

@@ -19,3 +19,10 @@ class Outcome(IntEnum):
     fault = 7
     receiver_down = 8
     transport = 9
+    faded = 10
+    collided = 11
+    held_back = 12
+
+
+PENDING, OUT_OF_RANGE = Outcome.pending.value, Outcome.out_of_range.value
+"""The same as plain numbers, with which numpy compares ten times as fast."""

@@ -21,13 +21,14 @@ from rich.table import Table
 from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from emulator.channel.stages import Topology
+from emulator.channel.reach import reach_of
+from emulator.channel.topology import Topology
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
 from vnet.errors import ScenarioError, VnetError
 from vnet.roads.lanes import Array
-from vnet.scenario import Radio, Scenario
+from vnet.scenario import Scenario
 
 Links = NDArray[np.bool_]
 FASTEST = "fastest-mixing"
@@ -47,7 +48,7 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     if scenario.network.moves:
         raise ScenarioError("analyze: says what one graph is like, and where vehicles move the network has many")
     world = build_world(scenario)
-    hears = hears_matrix(scenario.radio, world)
+    hears = hears_matrix(scenario, world)
     weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
     result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
     if run is not None:
@@ -113,10 +114,11 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 # Graphs.
 
 
-def hears_matrix(radio: Radio, world: World) -> Links:
-    """Who (row) hears whom (column) at the start, (N, N): range or links, and the peer cap."""
-    topology = Topology(world.at(0).position_m, radio.range_m, radio.max_peers, world.links)
-    return np.asarray(topology.admitted.T)
+def hears_matrix(scenario: Scenario, world: World) -> Links:
+    """Who (row) hears whom (column) at the start, (N, N): range, links or path loss, and the peer cap."""
+    reach = reach_of(scenario.radio, scenario.run.seed, world.links)
+    topology = Topology(world.at(0).position_m, reach, scenario.radio.max_peers)
+    return np.asarray(topology.now.admitted.T)
 
 
 def mutual(hears: Links) -> Links:

@@ -192,6 +192,21 @@ def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutO
         print(path)
 
 
+@app.command()
+def capacity(
+    seconds: Annotated[float, typer.Option(min=1, help="Emulated seconds of each network.")] = 5.0,
+    seeds: SeedsOption = 2,
+    out: OutOption = None,
+) -> None:
+    """How many peers an 802.11p channel has room for: delivery against the number of senders in reach."""
+    from emulator.experiments.capacity import run_capacity
+
+    with one_line_errors():
+        path = run_capacity(seconds, range(1, seeds + 1), _folder(out, "capacity"))
+        Console().print(Markdown(path.read_text()))
+        print(path)
+
+
 def _folder(out: Path | None, name: str) -> Path:
     folder = out or FOLDER / name
     try:

@@ -121,7 +121,7 @@ def graph(network: dict[str, Any]) -> tuple[tuple[str, ...], Links]:
     """The vehicles of a `[network]`, and who of them are linked, (N, N)."""
     scenario = _scenario(network, "ratio", 1, 0)
     world = build_world(scenario)
-    return world.node_ids, mutual(hears_matrix(scenario.radio, world))
+    return world.node_ids, mutual(hears_matrix(scenario, world))
 
 
 def _cell(

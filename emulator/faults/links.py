@@ -1,19 +1,21 @@
-"""What the acting faults do to the channel: stages of their own, and what they change in the radio's.
+"""What the acting faults do to the channel: which pairs they lose, and what else they change on the way.
 
-`LinkFaults.update` is told which faults act; the stages then look only at what it has made of them.
+`LinkFaults.update` is told which faults act and makes of them the `effects` of that time, which every frame keeps
+that is handed over while they last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.channel.draws import Draws
-from emulator.channel.outcomes import Outcome
-from emulator.channel.stages import NS_PER_MS, Frame, Pairs, Topology, TransmitQueue
+from emulator.channel.frames import NS_PER_MS, Copied, Frame, Pairs
+from emulator.channel.outcomes import PENDING
+from emulator.channel.queue import Access
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Mask
 from vnet.faults import BurstLoss, Corrupt, Delay, Duplicate, Jitter, Loss, Range, Reorder, Throttle
@@ -29,39 +31,89 @@ class _Random:
     bad: Mask = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
 
-class LinkFaults:
-    """The faults of the channel that act now, and the stages they act through."""
+@dataclass(frozen=True)
+class LinkEffects:
+    """What the faults of one time do to the frames that are handed over in it.
 
-    def __init__(self, seed: int, topology: Topology, queue: TransmitQueue, count: int) -> None:
+    `cut` are links (N, N) that a fault cuts altogether, `short` nodes and the range that a fault leaves them.
+    """
+
+    cut: Sequence[tuple[int, Mask]] = ()
+    short: Sequence[tuple[int, Mask, float]] = ()
+    losing: Sequence[_Random] = ()
+    delaying: Sequence[_Random] = ()
+    copying: Sequence[_Random] = ()
+    corrupting: Sequence[_Random] = ()
+
+    @property
+    def lose(self) -> bool:
+        """Whether any pair may be lost."""
+        return bool(self.cut or self.short or self.losing)
+
+    @property
+    def change(self) -> bool:
+        """Whether anything else may happen on the way."""
+        return bool(self.delaying or self.copying or self.corrupting)
+
+    def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
+        """By which fault the frame is lost at which receivers (N,), in the order in which they act."""
+        for number, cut in self.cut:
+            yield number, cut[frame.sender]
+        for number, nodes, range_m in self.short:
+            beyond = frame.surroundings.distance_m[frame.sender] > range_m
+            yield number, beyond & (nodes | nodes[frame.sender])
+        for one in self.losing:
+            yield one.planned.number, _lost(one, frame) & _links(one)[frame.sender]
+
+    def changes(self, frame: Frame, place: int, pairs: Pairs) -> None:
+        """Let what is left of frame number `place` arrive later, once more, or with other bytes."""
+        pending = pairs.outcome[place] == PENDING
+        count = len(pending)
+        for one in self.delaying:
+            draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
+            later = _links(one)[frame.sender] & pending
+            pairs.arrival_ns[place] += np.where(later, _later_ns(one.planned, draws), 0)
+        for one in self.copying:
+            fault = one.planned.fault
+            assert isinstance(fault, Duplicate)
+            draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
+            again = _links(one)[frame.sender] & (draws < fault.probability)
+            pairs.copies += [
+                Copied(place, again, round((number + 1) * fault.delay_ms * NS_PER_MS), one.planned.number)
+                for number in range(fault.copies)
+            ]
+        for one in self.corrupting:
+            _corrupt(one, frame, place, pairs, pending)
+
+
+class LinkFaults:
+    """The faults of the channel, and their `effects` now. `access` is told whom they throttle."""
+
+    def __init__(self, seed: int, access: Access, count: int) -> None:
         self._seed = seed
-        self._topology = topology
-        self._queue = queue
+        self._access = access
         self._count = count
         self._random: dict[int, _Random] = {}
-        self._cut: Sequence[tuple[int, Mask]] = ()
-        self._short: Sequence[tuple[int, Mask, float]] = ()
-        self._losing: Sequence[_Random] = ()
-        self._delaying: Sequence[_Random] = ()
-        self._copying: Sequence[_Random] = ()
-        self._corrupting: Sequence[_Random] = ()
+        self.effects = LinkEffects()
 
     def update(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """From now on, at `time_ns`, these act and no others."""
-        self._cut = [(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None]
-        self._short = [(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)]
         random = {p.number: self._go_on(p) for p in active if p.links is not None}
         self._random = random
-        self._losing = _of(random, Loss, BurstLoss)
-        self._delaying = _of(random, Delay, Jitter, Reorder)
-        self._copying = _of(random, Duplicate)
-        self._corrupting = _of(random, Corrupt)
-        self._queue.throttle(self._throttled(active))
+        self.effects = LinkEffects(
+            cut=[(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None],
+            short=[(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)],
+            losing=_of(random, Loss, BurstLoss),
+            delaying=_of(random, Delay, Jitter, Reorder),
+            copying=_of(random, Duplicate),
+            corrupting=_of(random, Corrupt),
+        )
+        self._access.throttle(self._throttled(active))
 
     def _go_on(self, planned: PlannedFault) -> _Random:
         """What has been drawn for a fault so far, acting from now on where it says."""
-        one = self._random.get(planned.number) or self._begin(planned)
-        one.planned = planned
-        return one
+        one = self._random.get(planned.number)
+        return self._begin(planned) if one is None else replace(one, planned=planned)
 
     def _begin(self, planned: PlannedFault) -> _Random:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, BurstLoss) else (0, 0), dtype=bool)
@@ -90,57 +142,31 @@ class LinkFaults:
                     slowest[node] = min(rate_mbps, slowest.get(node, rate_mbps))
         return slowest
 
-    def lose(self, frame: Frame, pairs: Pairs) -> None:
-        """A stage: decide `fault` where a link is cut, or loses this frame."""
-        for number, cut in self._cut:
-            pairs.decide(cut[frame.sender], Outcome.fault, cause=number)
-        for number, nodes, range_m in self._short:
-            beyond = self._topology.distance_m[frame.sender] > range_m
-            pairs.decide(beyond & (nodes | nodes[frame.sender]), Outcome.fault, cause=number)
-        for one in self._losing:
-            number, lost = one.planned.number, self._lost(one, frame)
-            pairs.decide(lost & _links(one)[frame.sender], Outcome.fault, cause=number)
 
-    def _lost(self, one: _Random, frame: Frame) -> Mask:
-        fault = one.planned.fault
-        draws = one.draws.uniform(frame.sender, frame.seq, 2 * self._count, frame.draw).reshape(-1, 2).T
-        if isinstance(fault, Loss):
-            return np.asarray(draws[0] < fault.probability)
-        assert isinstance(fault, BurstLoss), fault
-        bad = one.bad[frame.sender]
-        bad[:] = np.where(bad, draws[0] >= fault.leave, draws[0] < fault.enter)
-        return np.asarray(draws[1] < np.where(bad, fault.loss_bad, fault.loss_good))
+def _lost(one: _Random, frame: Frame) -> Mask:
+    fault, count = one.planned.fault, len(_links(one))
+    draws = one.draws.uniform(frame.sender, frame.seq, 2 * count, frame.draw).reshape(-1, 2).T
+    if isinstance(fault, Loss):
+        return np.asarray(draws[0] < fault.probability)
+    assert isinstance(fault, BurstLoss), fault
+    bad = one.bad[frame.sender]
+    bad[:] = np.where(bad, draws[0] >= fault.leave, draws[0] < fault.enter)
+    return np.asarray(draws[1] < np.where(bad, fault.loss_bad, fault.loss_good))
 
-    def change(self, frame: Frame, pairs: Pairs) -> None:
-        """A stage, after the latency: what does not lose a pair; later arrivals, copies, other bytes."""
-        for one in self._delaying:
-            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
-            later = _links(one)[frame.sender] & (pairs.outcome == Outcome.pending)
-            pairs.arrival_ns = pairs.arrival_ns + np.where(later, _later_ns(one.planned, draws), 0)
-        for one in self._copying:
-            fault = one.planned.fault
-            assert isinstance(fault, Duplicate)
-            draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
-            again = _links(one)[frame.sender] & (draws < fault.probability)
-            pairs.copies += [
-                (again, round((number + 1) * fault.delay_ms * NS_PER_MS), one.planned.number)
-                for number in range(fault.copies)
-            ]
-        for one in self._corrupting:
-            self._corrupt(one, frame, pairs)
 
-    def _corrupt(self, one: _Random, frame: Frame, pairs: Pairs) -> None:
-        fault = one.planned.fault
-        assert isinstance(fault, Corrupt)
-        draws = one.draws.uniform(frame.sender, frame.seq, self._count, frame.draw)
-        hit = _links(one)[frame.sender] & (pairs.outcome == Outcome.pending) & (draws < fault.probability)
-        for receiver in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
-            # What is left of the draw beneath the probability says which bytes: each receiver gets its own.
-            rng = np.random.default_rng(int(draws[receiver] * 2**53))
-            place = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
-            change = rng.integers(1, 256, size=len(place))
-            pairs.flips.setdefault(receiver, []).extend(zip(place.tolist(), change.tolist(), strict=True))
-            pairs.cause[receiver] = one.planned.number
+def _corrupt(one: _Random, frame: Frame, place: int, pairs: Pairs, pending: Mask) -> None:
+    fault = one.planned.fault
+    assert isinstance(fault, Corrupt)
+    draws = one.draws.uniform(frame.sender, frame.seq, len(pending), frame.draw)
+    hit = _links(one)[frame.sender] & pending & (draws < fault.probability)
+    for receiver in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
+        # What is left of the draw beneath the probability says which bytes: each receiver gets its own.
+        rng = np.random.default_rng(int(draws[receiver] * 2**53))
+        places = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
+        change = rng.integers(1, 256, size=len(places))
+        flips = zip(places.tolist(), change.tolist(), strict=True)
+        pairs.flips.setdefault((place, receiver), []).extend(flips)
+        pairs.cause[place, receiver] = one.planned.number
 
 
 def _links(one: _Random) -> Mask:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.channel.stages import NO_CAUSE
+from emulator.channel.frames import NO_CAUSE
 from emulator.faults.plan import PlannedFault
 from vnet.faults import DataReplay, DoS, SenderFault, StaleMessages, Sybil
 from vnet.scenario import NS_PER_S
@@ -40,6 +40,11 @@ class SenderFaults:
         self._next_copy = next_copy
         self._acting: dict[int, list[PlannedFault]] = {}
         self._sent: dict[int, deque[tuple[int, int, bytes]]] = {}
+
+    @property
+    def misbehave(self) -> bool:
+        """Whether any of them does."""
+        return bool(self._acting)
 
     def update(self, active: Sequence[PlannedFault]) -> None:
         """From now on these act and no others."""

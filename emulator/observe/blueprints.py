@@ -70,10 +70,18 @@ def radio() -> rrb.Vertical:
         rrb.Horizontal(
             _bars("radio/distance", f"Delivered (%) by distance (m), {last}"),
             _bars("radio/latency", f"Deliveries by time on the way (ms), {last}"),
+            _against_time("radio/age", "Age of information, time between receptions (ms)"),
         ),
         rrb.Horizontal(
-            _against_time("radio/load", "Load of a vehicle (kB/s)"),
-            _bars("radio/bytes", f"Load by vehicle number (kB/s), {last}", legend=True),
+            rrb.Tabs(
+                _against_time("radio/load", "Load of a vehicle (kB/s)"),
+                _against_time("radio/busy", "Busy ratio of the medium (%)"),
+            ),
+            rrb.Tabs(
+                _bars("radio/heard", f"Delivered by receiver (%), {last}"),
+                _bars("radio/ages", "Age by receiver (ms)"),
+                _bars("radio/bytes", "Load by vehicle (kB/s)", legend=True),
+            ),
         ),
         row_shares=[5, 4, 4],
         name="Radio",

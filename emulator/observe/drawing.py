@@ -35,13 +35,18 @@ BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
     (150, 150, 150),
     (100, 100, 100),
 )
+DARK_YELLOW, DARK_RED, DARK_BLUE = (140, 130, 50), (150, 66, 8), (40, 90, 140)
+"""Shades of yellow, red and blue, where there are more things than colours."""
 OUTCOME_COLOURS: dict[Outcome, Colour] = {
     Outcome.delivered: GREEN,
+    Outcome.faded: DARK_YELLOW,
+    Outcome.collided: DARK_RED,
     Outcome.lost: RED,
     Outcome.peer_cap: ORANGE,
     Outcome.fault: PURPLE,
     Outcome.receiver_down: GREY,
     Outcome.queue_full: BLUE,
+    Outcome.held_back: DARK_BLUE,
     Outcome.oversize: DARK,
     Outcome.transport: SKY,
 }
@@ -139,6 +144,11 @@ class Period:
             pairs = pairs[np.isin(pairs[:, 2], outcomes)]
         n = len(self.node_ids)
         return np.bincount(pairs[:, 1] * n + pairs[:, 0], pairs[:, 3], n * n).astype(np.int32).reshape(n, n)
+
+    def received(self) -> tuple[NDArray[np.int32], Floats]:
+        """Links that delivered, (k, 3): sender, receiver, how many; and (k,) the age of each newest frame in ms."""
+        delivered = self.pairs[:, 2] == Outcome.delivered
+        return self.pairs[delivered][:, [0, 1, 3]], self.numbers("pairs_age_ms")[delivered]
 
     def clouds(self) -> dict[str, Floats]:
         """Hypotheses of the common error by node, (k, 2)."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emulator.channel.outcomes import Outcome
+from emulator.channel.reach import distances_m, reach_of
 from emulator.observe.metrics import PeriodFigures, collect
 from emulator.observe.run_folder import Event
 from emulator.observe.trace import decided_ns
@@ -53,20 +54,23 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
     """What does not change during a run, but for the faults in `scenario` that are planned while it is on.
 
     `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`: infinite for a line that goes both ways
-    from its point), `range_m` (None where the scenario gives links, and the range says nothing about who hears
-    whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is not there yet),
-    `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether they move, and
-    the resolved scenario as TOML.
+    from its point), `range_m` (None where the scenario gives links or a path loss, and the range says nothing about
+    who hears whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is not there
+    yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether they move,
+    and the resolved scenario as TOML.
     """
     start = world.at(0)
-    label = components(start.position_m, scenario.radio.range_m, world.links)
+    radio = scenario.radio
+    reach = reach_of(radio, scenario.run.seed, world.links)
+    in_range = reach.in_range(start.position_m, distances_m(start.position_m))
+    label = components(start.position_m, radio.range_m, in_range)
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),
         "lane_point_m": pack(world.lane_map.point_m),
         "lane_heading_rad": pack(world.lane_map.heading_rad),
         "lane_length_m": pack(world.lane_map.length_m),
-        "range_m": scenario.radio.range_m if scenario.radio.links is None else None,
+        "range_m": radio.range_m if radio.links is None and radio.path_loss is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),
         "area_m": pack([np.nanmin(world.course_m, axis=(0, 1)), np.nanmax(world.course_m, axis=(0, 1))]),
@@ -136,12 +140,13 @@ def period_message(
     up: ArrayLike,
     faults: Sequence[str],
     events: Iterable[Event],
+    busy_ratio: Array,
 ) -> dict[str, Any]:
     """One period, [instant.time_ns, end_ns).
 
     Truth, fixes, what was reported, `figures`, `faults` acting in it (labels), `events` since the last message,
-    `up` (uint8, n) at its end, and what became of frames, from `rows` of the trace: all that were sent or decided
-    in the period, and any others.
+    `up` (uint8, n) at its end, how busy the medium was (n), NaN where senders share none, and what became of
+    frames, from `rows` of the trace: all that were sent or decided in the period, and any others.
     """
     return {
         "period": instant.period,
@@ -160,6 +165,7 @@ def period_message(
         "up": np.asarray(up, dtype=np.uint8).tobytes(),
         "faults": list(faults),
         "events": list(map(event_message, events)),
+        "busy_ratio": pack(busy_ratio),
         **_frames(rows, instant.time_ns, end_ns, len(node_ids)),
     }
 
@@ -167,23 +173,29 @@ def period_message(
 def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
     """What became of frames in [start, end).
 
-    `pairs`: int32 (k, 4), sender, receiver, outcome and how many rows of the trace were so decided; `outcomes`: how
-    many by name; `latency_counts`: int32 (LATENCY_BINS,), deliveries by time on the way in bins of LATENCY_BIN_NS,
-    the last for all that took longer; `sent_bytes`, `received_bytes` (n): of the frames that were sent (with the
-    copies that faults make, and without those that nobody was in range of: no trace is kept of them) and delivered.
+    `pairs`: int32 (k, 4), sender, receiver, outcome and how many rows of the trace were so decided; `pairs_age_ms`
+    (k): how long before the end the newest of their frames was sent; `outcomes`: how many by name;
+    `latency_counts`: int32 (LATENCY_BINS,), deliveries by time on the way in bins of LATENCY_BIN_NS, the last for
+    all that took longer; `sent_bytes`, `received_bytes` (n): of the frames that were sent (with the copies that
+    faults make, and without those that nobody was in range of: no trace is kept of them) and delivered.
     """
     time_ns = decided_ns(rows)
     decided = rows[(rows["outcome"] != Outcome.pending) & (start_ns <= time_ns) & (time_ns < end_ns)]
     sender, receiver = decided["sender"].astype(np.int64), decided["receiver"]
-    key, number = np.unique((sender * count + receiver) * _OUTCOMES + decided["outcome"], return_counts=True)
+    key, which, number = np.unique(
+        (sender * count + receiver) * _OUTCOMES + decided["outcome"], return_inverse=True, return_counts=True
+    )
     place = key // _OUTCOMES
+    newest_ns = np.zeros(len(key), np.int64)
+    np.maximum.at(newest_ns, which, decided["sent_ns"])
     pairs = np.column_stack([place // count, place % count, key % _OUTCOMES, number])
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
     bins = np.minimum((delivered["arrival_ns"] - delivered["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1)
-    sent = _one_each(rows[(start_ns <= rows["sent_ns"]) & (rows["sent_ns"] < end_ns)])
+    sent = _one_each(rows[(start_ns <= rows["left_ns"]) & (rows["left_ns"] < end_ns)])
     return {
         "pairs": pairs.astype("<i4").tobytes(),
+        "pairs_age_ms": pack((end_ns - newest_ns) / 1e6),
         "outcomes": {Outcome(kind).name: number for kind, number in enumerate(outcomes) if number},
         "latency_counts": np.bincount(bins, minlength=LATENCY_BINS).astype("<i4").tobytes(),
         "sent_bytes": pack(np.bincount(sent["sender"], sent["size_bytes"], count)),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from emulator.channel.outcomes import Outcome
 from emulator.observe.drawing import (
     BLUE,
     COMMON_RINGS_M,
@@ -82,7 +83,7 @@ class OverviewScene:
         canvas.strips("map/lanes", lanes, static=True)
         self._set_styles()
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
-        draw_legend(canvas)
+        draw_legend(canvas, scene)
         canvas.rings("common", COMMON_RINGS_M)
         canvas.rings("position", POSITION_RINGS_M)
         common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
@@ -219,10 +220,11 @@ def draw_scale(canvas: Canvas, point_m: Floats) -> None:
     canvas.labels("map/scale/length", [[x + length_m / 2, y]], GREY, [in_length(length_m)])
 
 
-def draw_legend(canvas: Canvas) -> None:
+def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
     """What the colours of the map mean, in a view of its own: two rows of points with their names."""
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
-    links = [(outcome_title(outcome), colour) for outcome, colour in OUTCOME_COLOURS.items()]
+    never = impossible(scene)
+    links = [(outcome_title(one), colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
         place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
         canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
@@ -231,18 +233,41 @@ def draw_legend(canvas: Canvas) -> None:
         canvas.points(f"legend/{entity}", place, static=True)
 
 
+def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
+    """The outcomes that nothing in this run can have, whatever faults there will be."""
+    scenario = tomllib.loads(scene["scenario"])
+    radio = scenario["radio"]
+    can_be = {
+        Outcome.faded: "path_loss" in radio,
+        Outcome.collided: "mac" in radio,
+        Outcome.held_back: "congestion" in radio,
+        Outcome.lost: radio["loss"] > 0,
+        Outcome.peer_cap: scene["max_peers"] < len(scene["node_ids"]) - 1,
+        Outcome.transport: scenario["run"]["pacing"] == "realtime",
+    }
+    return {outcome for outcome, is_possible in can_be.items() if not is_possible}
+
+
+def in_reach(radio: Mapping[str, Any]) -> str:
+    """Who hears whom, in words, by the scenario's section."""
+    if "path_loss" not in radio:
+        return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
+    stages = {"shadowing": "shadowing", "fading": "fading", "mac": "CSMA", "congestion": "congestion"}
+    words = [f"radio: {radio['path_loss']['kind'].replace('_', ' ')}"]
+    return ", ".join(words + [text for name, text in stages.items() if name in radio])
+
+
 def describe(scene: Mapping[str, Any]) -> str:
     """A run in a heading and a line, as Markdown."""
     scenario = tomllib.loads(scene["scenario"])
     run, radio, program = scenario["run"], scenario["radio"], scenario["program"]
     count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
     fusion = program["options"].get("fusion")
-    reach = "radio by given links" if scene["range_m"] is None else f"radio {scene['range_m']:g} m"
     at_first = " at first" if scene["moves"] else ""
     parts = [
         f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}{at_first}",
         program["entry"].removesuffix(":main") + (f" ({fusion})" if fusion else ""),
-        f"{reach}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
+        f"{in_reach(radio)}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
         f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
     ]
     return f"### {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from emulator.observe.busy import busy_windows, mean_busy, read_busy
 from emulator.observe.checks.evidence import Evidence
 from emulator.observe.metrics import PeriodFigures
 from emulator.observe.observation import event_message, period_message, scene_message
@@ -18,6 +19,7 @@ from emulator.observe.run_folder import Event, read_events
 from emulator.observe.run_tables import StatesReader, TableFile, TraceReader
 from emulator.world.world import World, build_world
 from vnet.errors import VnetError
+from vnet.roads.lanes import Array
 from vnet.scenario import Scenario, load_scenario
 
 Message = tuple[str, dict[str, Any]]
@@ -37,7 +39,8 @@ def messages(folder: Path) -> Iterator[Message]:
     states = StatesReader(folder / "states.parquet", number, world.period_ns)
     trace = TraceReader(folder / "trace.parquet", number)
     figures = _figures(TableFile(folder / "metrics.parquet", [field.name for field in fields(PeriodFigures)]))
-    return _Playback(scenario, world, events, figures, trace, states).messages()
+    busy = busy_windows(None if scenario.radio.mac is None else read_busy(folder), world.node_ids)
+    return _Playback(scenario, world, events, figures, trace, states, busy).messages()
 
 
 def _figures(file: TableFile) -> list[PeriodFigures]:
@@ -57,6 +60,7 @@ class _Playback:
     figures: Sequence[PeriodFigures]
     trace: TraceReader
     states: StatesReader
+    busy: Array
 
     def messages(self) -> Iterator[Message]:
         """See the function."""
@@ -81,8 +85,9 @@ class _Playback:
             up = ~down.at(end_ns - 1)
             rows = self.trace.until(end_ns)
             instant, beliefs = state
+            busy = mean_busy(self.busy, len(self.world.node_ids), start_ns, end_ns)
             message = period_message(
-                self.world.node_ids, instant, end_ns, beliefs, figures, rows, up, faults, happened
+                self.world.node_ids, instant, end_ns, beliefs, figures, rows, up, faults, happened, busy
             )
             yield "period", message
         if next(states, None) is not None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from emulator.observe.checks.evidence import Evidence
@@ -20,6 +21,8 @@ from vnet.roads.lanes import Array
 
 NS_PER_MS = 1e6
 BIN_M = 50.0
+LEAST_PAIRS = 10
+"""Links with fewer pairs are not called bad."""
 _SHARE = 0.95
 
 Whole = NDArray[np.int64]
@@ -60,10 +63,11 @@ VEHICLES = pa.schema(
         "latency_mean_ms": pa.float64(),
         "inter_reception_mean_ms": pa.float64(),
         "age_mean_ms": pa.float64(),
+        "busy_ratio_mean": pa.float64(),
     }
 )
 """A row for each vehicle: as a sender, then as a receiver; latency, inter-reception time and age are means over the
-links by which it hears."""
+links by which it hears. How busy it found the medium is null where senders share none."""
 DISTANCES = pa.schema(
     {
         "from_m": pa.float64(),
@@ -84,6 +88,11 @@ class RadioMetrics:
     vehicles: pa.Table
     distances: pa.Table
     totals: dict[str, float | None]
+
+    def worst_links(self, count: int) -> pa.Table:
+        """The `count` links on which the least was delivered, of those with `LEAST_PAIRS` pairs."""
+        tried = self.links.filter(pc.greater_equal(self.links["pairs"], LEAST_PAIRS))
+        return tried.sort_by([("delivery_ratio", "ascending"), ("pairs", "descending")]).slice(0, count)
 
 
 @dataclass(frozen=True)
@@ -107,7 +116,8 @@ def radio_metrics(evidence: Evidence, bin_m: float = BIN_M) -> RadioMetrics:
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(evidence.node_ids, codes, count, figures)
     vehicles = _vehicles_table(evidence, codes, count, figures)
-    return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), _totals(pairs, figures))
+    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(evidence.busy_ratio)}
+    return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
 
 def _pairs(evidence: Evidence, count: int) -> _Pairs:
@@ -247,6 +257,8 @@ def _vehicles_table(evidence: Evidence, codes: NDArray[np.intp], count: int, fig
         "heard_vehicles": np.bincount(receiver[figures["delivered"] > 0], minlength=count),
         **{name: mean(name) for name in ("latency_mean_ms", "inter_reception_mean_ms", "age_mean_ms")},
     }
+    busy = evidence.busy_ratio
+    columns["busy_ratio_mean"] = busy.mean(axis=0) if len(busy) else np.full(count, np.nan)
     named = {"node": pa.array(evidence.node_ids, pa.string())}
     return pa.table(named | {name: _column(values) for name, values in columns.items()}).cast(VEHICLES)
 
@@ -283,7 +295,7 @@ def _totals(pairs: _Pairs, figures: dict[str, Array]) -> dict[str, float | None]
 
 
 def _mean(values: Array) -> float | None:
-    return float(values.mean()) if len(values) else None
+    return float(values.mean()) if values.size else None
 
 
 def _column(values: Numbers) -> pa.Array:

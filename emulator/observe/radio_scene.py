@@ -1,4 +1,5 @@
-"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; the load."""
+"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; how old it
+is what receivers know; the load."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from emulator.observe.drawing import (
     GREEN,
     ORANGE,
     OUTCOME_COLOURS,
+    PURPLE,
     SKY,
     Canvas,
     Floats,
@@ -54,6 +56,42 @@ class Window:
         return len(self._kept)
 
 
+class Ages:
+    """How old is the newest that receivers have of senders, and how much time passes from one to the next.
+
+    Times between receptions are those between the sendings of what is received.
+    """
+
+    def __init__(self, count: int, periods: int) -> None:
+        self._sent_ms = np.full((count, count), np.nan)
+        self._gaps = Window(periods)
+
+    def period(self, period: Period, end_ms: float) -> None:
+        """Take a period that ended then."""
+        links, age_ms = period.received()
+        sender, receiver, number = links.T
+        sent_ms, before_ms = end_ms - age_ms, self._sent_ms[receiver, sender]
+        newer = sent_ms > before_ms
+        self._gaps.add(np.array([(sent_ms - before_ms)[newer].sum(), number[newer].sum()]))
+        self._sent_ms[receiver, sender] = np.fmax(before_ms, sent_ms)
+        if not period.up.all():
+            self._sent_ms[~period.up] = self._sent_ms[:, ~period.up] = np.nan
+
+    def at(self, end_ms: float, tried: NDArray[Any]) -> NDArray[np.float64]:
+        """The ages in ms (n, n), a row receives, a column sends; NaN on links that have not brought anything yet.
+
+        Links on which there were no frames of late, by `tried` (n, n), begin anew.
+        """
+        self._sent_ms[tried == 0] = np.nan
+        return end_ms - self._sent_ms
+
+    @property
+    def mean_gap_ms(self) -> float:
+        """The mean time between receptions over all links of late; NaN if nothing came twice."""
+        total_ms, gaps = self._gaps.total
+        return float(total_ms / gaps) if gaps else float("nan")
+
+
 class RadioScene:
     """Draws what concerns the radio below `/radio`, from the scene and period messages of a run."""
 
@@ -67,6 +105,7 @@ class RadioScene:
         self._tried, self._delivered = Window(periods), Window(periods)
         self._latency, self._sent, self._received = Window(periods), Window(periods), Window(periods)
         self._latency_bins = LEAST_LATENCY_BINS
+        self._ages = Ages(self._count if self._count <= LARGEST_MATRIX else 0, periods)
         self._announced: set[str] = set()
         self._next_s = 0.0
         loads = (("sent: mean", SKY, 2.0), ("sent: most", BLUE, 1.0), ("received: mean", GREEN, 2.0))
@@ -76,9 +115,11 @@ class RadioScene:
         """Draw a period."""
         self._stack(period)
         self._load(period)
+        self._busy(period)
         if self._count <= LARGEST_MATRIX:
             self._tried.add(period.counts())
             self._delivered.add(period.counts(Outcome.delivered))
+            self._ages.period(period, self._end_ms(period))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
         self._sent.add(period.numbers("sent_bytes").astype(float))
         self._received.add(period.numbers("received_bytes").astype(float))
@@ -108,6 +149,30 @@ class RadioScene:
         rates = [period.numbers(name) / self._period_s / 1e3 for name in ("sent_bytes", "received_bytes")]
         self._canvas.plot("radio/load", *(float(value) for rate in rates for value in (rate.mean(), rate.max())))
 
+    def _busy(self, period: Period) -> None:
+        ratio = 100 * period.numbers("busy_ratio")[period.up]
+        if not len(ratio) or np.isnan(ratio).any():  # senders share no medium, or no window is over
+            return
+        if "radio/busy" not in self._announced:
+            self._announced.add("radio/busy")
+            self._canvas.series("radio/busy", [("mean", SKY, 2.0), ("most", BLUE, 1.0)])
+        self._canvas.plot("radio/busy", float(ratio.mean()), float(ratio.max()))
+
+    def _age(self, end_ms: float) -> None:
+        """Ages by vehicle, and over all links."""
+        ages_ms = self._ages.at(end_ms, self._tried.total)
+        known = np.isfinite(ages_ms)
+        by_receiver_ms = np.where(known, ages_ms, 0).sum(axis=1) / np.maximum(1, known.sum(axis=1))
+        self._canvas.bars("radio/ages", by_receiver_ms, np.arange(self._count), 0.8, SKY)
+        if not known.any():
+            return
+        if "radio/age" not in self._announced:
+            self._announced.add("radio/age")
+            lines = (("age: mean", SKY, 2.0), ("age: 95 % of links", BLUE, 1.0))
+            self._canvas.series("radio/age", [*lines, ("between receptions: mean", PURPLE, 2.0)])
+        late_ms = np.quantile(ages_ms[known], 0.95, method="higher")
+        self._canvas.plot("radio/age", float(ages_ms[known].mean()), float(late_ms), self._ages.mean_gap_ms)
+
     def _charts(self, period: Period) -> None:
         canvas, span_s = self._canvas, len(self._latency) * self._period_s
         latency, width_ms = self._latency.total, LATENCY_BIN_NS / 1e6
@@ -119,10 +184,16 @@ class RadioScene:
             canvas.bars(f"radio/bytes/{name}", rate, np.arange(self._count) + 0.2 * side, 0.4, colour)
         if self._count <= LARGEST_MATRIX:
             self._links(period)
+            self._age(self._end_ms(period))
+
+    def _end_ms(self, period: Period) -> float:
+        return (period.time_ns + self._period_ns) / 1e6
 
     def _links(self, period: Period) -> None:
-        """Delivery by link, and by distance."""
+        """Delivery by link, by vehicle and by distance."""
         tried, delivered = self._tried.total, self._delivered.total
+        vehicles, heard = np.arange(self._count), 100 * delivered.sum(axis=1) / np.maximum(1, tried.sum(axis=1))
+        self._canvas.bars("radio/heard", heard, vehicles, 0.8, GREEN)
         share = np.divide(delivered, tried, out=np.full(tried.shape, np.nan), where=tried > 0)
         axes = ("receiver", "sender")
         self._canvas.log("radio/links", rr.Tensor(share.astype(np.float32), dim_names=axes, value_range=(0, 1)))

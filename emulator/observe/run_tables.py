@@ -24,11 +24,13 @@ ROWS_AT_ONCE = 1 << 14
 
 
 class TableFile:
-    """A Parquet file and those of its columns that are wanted. Raises VnetError if it has not got them."""
+    """A Parquet file and those of its columns that are wanted. Raises VnetError if it has not got them.
 
-    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+    Columns that it has `perhaps` may be missing.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], perhaps: Sequence[str] = ()) -> None:
         self.path = path
-        self._columns = list(columns)
         try:
             self._file = pq.ParquetFile(path)
         except FileNotFoundError:
@@ -38,6 +40,7 @@ class TableFile:
         missing = [column for column in columns if column not in self._file.schema_arrow.names]
         if missing:
             raise self.error(f"has no column {missing[0]!r}")
+        self._columns = [*columns, *(name for name in perhaps if name in self._file.schema_arrow.names)]
 
     def error(self, text: str) -> VnetError:
         """What is wrong with the file."""
@@ -67,7 +70,7 @@ class TraceReader:
 
     def __init__(self, path: Path, number: Mapping[str, int]) -> None:
         columns = ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "arrival_ns", "copy")
-        self._file = TableFile(path, columns)
+        self._file = TableFile(path, columns, perhaps=["left_ns"])
         self._codes = {"sender": number, "receiver": number, "outcome": {o.name: o.value for o in Outcome}}
         self._pieces = self._file.pieces()
         self._ahead = np.zeros(0, ROW)
@@ -99,6 +102,7 @@ class TraceReader:
         for name, codes in self._codes.items():
             rows[name] = self._coded(piece, name, codes)
         rows["arrival_ns"] = self._whole(piece, "arrival_ns", NOT_ARRIVING)
+        rows["left_ns"] = self._whole(piece, "left_ns") if "left_ns" in piece.column_names else rows["sent_ns"]
         sent_ns = rows["sent_ns"]
         if len(rows):
             if sent_ns[0] < self._last_ns or (np.diff(sent_ns) < 0).any():

@@ -8,22 +8,38 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from emulator.channel.outcomes import Outcome
-from emulator.channel.stages import NO_CAUSE, Frame
+from emulator.channel.frames import NO_CAUSE
+from emulator.channel.outcomes import PENDING, Outcome
 
 NOT_ARRIVING = -1
-FIRST_ROWS = 1 << 22
+FIRST_PAIRS, FIRST_FRAMES = 1 << 22, 1 << 17
 """Room from the start: the system hands out zeroed pages only as they are written, and growing means copying."""
 
+_FRAME = np.dtype(
+    [
+        ("sent_ns", "<i8"),
+        ("seq", "<i8"),
+        ("sender", "<i4"),
+        ("size_bytes", "<i4"),
+        ("payload_digest", "<u8"),
+        ("on_air_ns", "<i8"),
+        ("left_ns", "<i8"),
+        ("copy", "<i2"),
+    ]
+)
+_PAIR = np.dtype(
+    [("frame", "<i4"), ("receiver", "<i4"), ("outcome", "u1"), ("cause", "<i2"), ("arrival_ns", "<i8")]
+)
 ROW = np.dtype(
     [
         ("sent_ns", "<i8"),
@@ -36,60 +52,94 @@ ROW = np.dtype(
         ("cause", "<i2"),
         ("arrival_ns", "<i8"),
         ("copy", "<i2"),
+        ("on_air_ns", "<i8"),
+        ("left_ns", "<i8"),
     ]
 )
-_PLAIN = ("sent_ns", "seq", "size_bytes", "payload_digest", "arrival_ns", "copy")
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
 def decided_ns(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """When each of these records of type `ROW` is decided: as it arrives, or as it is sent if it does not."""
-    return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["sent_ns"], rows["arrival_ns"]))
+    """When each of these records of type `ROW` is decided: as it arrives, or else as it leaves its sender."""
+    return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["left_ns"], rows["arrival_ns"]))
+
+
+class _Table:
+    """Records of one type, as many as are added."""
+
+    def __init__(self, kind: np.dtype[np.void], room: int) -> None:
+        self._records = np.zeros(room, kind)
+        self.count = 0
+
+    @property
+    def records(self) -> NDArray[np.void]:
+        """Those that were added."""
+        return self._records[: self.count]
+
+    def add(self, count: int) -> NDArray[np.void]:
+        """So many more, to be written."""
+        first, end = self.count, self.count + count
+        if end > len(self._records):
+            grown = np.zeros(max(2 * len(self._records), end), self._records.dtype)
+            grown[:first] = self._records[:first]
+            self._records = grown
+        self.count = end
+        return self._records[first:end]
 
 
 class Trace:
-    """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`."""
+    """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
-    def __init__(self, node_ids: Sequence[str]) -> None:
+    What the rows of a frame have in common is kept once. `knows_air` says that frames have times at which they went
+    on air and left it; else they leave as they are sent.
+    """
+
+    def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
         self._node_ids = list(node_ids)
+        self._knows_air = knows_air
         self._causes = [""]
-        self._rows = np.zeros(FIRST_ROWS, dtype=ROW)
-        self._count = 0
+        self._pairs = _Table(_PAIR, FIRST_PAIRS)
+        self._frames = _Table(_FRAME, FIRST_FRAMES)
+        self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
-        return self._count
+        return self._pairs.count
 
     def append(
         self,
-        frame: Frame,
-        receivers: NDArray[np.intp],
-        payload_digest: int | NDArray[np.uint64],
+        frames: Mapping[str, ArrayLike],
+        each: NDArray[np.intp],
+        receiver: ArrayLike,
         outcome: NDArray[np.uint8],
-        arrival_ns: NDArray[np.int64],
-        cause: NDArray[np.int16],
+        cause: ArrayLike,
+        arrival_ns: ArrayLike,
     ) -> int:
-        """Add the rows of one frame, one a receiver; returns the number of the first.
+        """Add the rows of frames: of `each` (K,) of them so many, one after the other; returns the first's number.
 
-        `payload_digest` is of what arrives; `cause` are numbers of faults, whose names `name_cause` has told.
+        `frames` are the columns (K,) that are the same for all rows of a frame; the others are of the rows (n,).
+        `cause` are numbers of faults, whose names `name_cause` has told; `arrival_ns` counts only where the outcome
+        is pending.
         """
-        first, end = self._count, self._count + len(receivers)
-        if end > len(self._rows):
-            grown = np.zeros(max(2 * len(self._rows), end), dtype=ROW)
-            grown[:first] = self._rows[:first]
-            self._rows = grown
-        rows = self._rows[first:end]
-        rows["sent_ns"] = frame.sent_ns
-        rows["sender"] = frame.sender
-        rows["seq"] = frame.seq
-        rows["receiver"] = receivers
-        rows["size_bytes"] = frame.size_bytes
-        rows["payload_digest"] = payload_digest
-        rows["outcome"] = outcome
-        rows["cause"] = cause - NO_CAUSE
-        rows["arrival_ns"] = np.where(outcome == Outcome.pending, arrival_ns, NOT_ARRIVING)
-        rows["copy"] = frame.copy
-        self._count = end
+        first, first_frame = self._pairs.count, self._frames.count
+        new = self._frames.add(len(each))
+        for name, values in frames.items():
+            new[name] = values
+        if not self._knows_air:
+            new["left_ns"] = new["sent_ns"]
+        rows = self._pairs.add(len(outcome))
+        rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
+        rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
+        rows["cause"] -= NO_CAUSE
+        rows["arrival_ns"] = np.where(outcome == PENDING, arrival_ns, NOT_ARRIVING)
         return first
+
+    def alter(self, row: int, payload_digest: int) -> None:
+        """What arrives by this row has other bytes than its frame."""
+        self._altered[row] = payload_digest
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A column of the trace so far, as numbers."""
+        return np.asarray(self.rows(slice(None))[name])
 
     def name_cause(self, number: int, name: str) -> None:
         """Say what fault `number` is called."""
@@ -99,15 +149,28 @@ class Trace:
 
     def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
         """Give rows their outcome."""
-        self._rows["outcome"][rows] = outcome
+        self._pairs.records["outcome"][rows] = outcome.value
 
     def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
-        """These rows as records of type `ROW`, which they are: to be read only."""
-        return self._rows[which]
+        """These rows as records of type `ROW`."""
+        pairs = self._pairs.records[which]
+        frames = self._frames.records[pairs["frame"]]
+        rows = np.zeros(len(pairs), ROW)
+        for name in ROW.fields or ():
+            rows[name] = pairs[name] if name in (_PAIR.fields or ()) else frames[name]
+        if self._altered:
+            number = np.arange(self._pairs.count)[which]
+            for place in np.flatnonzero(np.isin(number, list(self._altered))).tolist():
+                rows["payload_digest"][place] = self._altered[int(number[place])]
+        return rows
 
     def to_table(self) -> pa.Table:
-        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy)."""
-        rows = self._rows[: self._count]
+        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
+
+        Where senders share the air there are two columns more: `on_air_ns`, when a frame's transmission began (null
+        if it never did), and `left_ns`, when it ended, or the frame was given up.
+        """
+        rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
         rows = rows[order]
         outcome_names = [outcome.name for outcome in Outcome]
@@ -117,7 +180,8 @@ class Trace:
                 pa.array(rows[column].astype(np.int32)), pa.array(list(names), pa.string())
             )
 
-        arrival = pa.array(rows["arrival_ns"], mask=rows["arrival_ns"] == NOT_ARRIVING)
+        times = ("arrival_ns", "on_air_ns")
+        arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
         return pa.table(
             {
                 "sent_ns": pa.array(rows["sent_ns"]),
@@ -130,6 +194,7 @@ class Trace:
                 "cause": named("cause", self._causes).cast(pa.string()),
                 "arrival_ns": arrival,
                 "copy": pa.array(rows["copy"]),
+                **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
             }
         )
 
@@ -156,7 +221,7 @@ def sha256_of_table(table: pa.Table) -> str:
             codes, names = _canonical_codes(array)
             digest.update(json.dumps([column, names]).encode())
         else:
-            filled = pc.fill_null(array, NOT_ARRIVING) if column == "arrival_ns" else array
+            filled = pc.fill_null(array, NOT_ARRIVING) if column in ("arrival_ns", "on_air_ns") else array
             codes = filled.to_numpy(zero_copy_only=False)
             digest.update(json.dumps([column]).encode())
         digest.update(np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder("<")).tobytes())

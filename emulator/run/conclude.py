@@ -12,9 +12,11 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.channel.outcomes import Outcome
+from emulator.observe.busy import BUSY, busy_table
 from emulator.observe.checks import Evidence, Judgement, Verdict, judge
 from emulator.observe.checks.replay import AGAIN, check_replay
 from emulator.observe.checks.verdicts import Finding, unknown
@@ -44,7 +46,10 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     folder.put("trace.parquet", lambda path: pq.write_table(trace, path, compression="zstd"))
     folder.put("states.parquet", lambda path: pq.write_table(states, path, compression="zstd"))
     folder.put("metrics.parquet", lambda path: pq.write_table(metrics, path, compression="zstd"))
-    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events))
+    busy = _busy(emulation)
+    if busy is not None:
+        folder.put(BUSY, lambda path: pq.write_table(busy, path, compression="zstd"))
+    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
     verdict = {
         "format": FORMAT,
         **_judged(judgement),
@@ -67,6 +72,15 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     }
     folder.put_json("verdict.json", verdict)
     return judgement, verdict
+
+
+def _busy(emulation: Emulation) -> pa.Table | None:
+    """How busy the medium was; None where senders share none."""
+    if emulation.scenario.radio.mac is None:
+        return None
+    windows = emulation.engine.busy_ratios(emulation.emulated_ns)
+    nodes = emulation.world.node_ids
+    return busy_table(np.array(windows).reshape(-1, len(nodes)), nodes)
 
 
 def _judged(judgement: Judgement) -> dict[str, Any]:

@@ -28,14 +28,19 @@ GREEN, RED, ORANGE, SKY, PURPLE, YELLOW, BLUE, GREY = (
     Style(color=colour)
     for colour in ("#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#0072B2", "#969696")
 )
+# Shades, for more outcomes than there are such colours.
+DARK_YELLOW, DARK_RED, DARK_BLUE = (Style(color=colour) for colour in ("#8C8232", "#964208", "#285A8C"))
 PLAIN, BOLD, DIM = Style(), Style(bold=True), Style(dim=True)
 BAD = RED + BOLD
 # The signs tell outcomes apart where there are no colours.
 OUTCOMES = {
     "delivered": (GREEN, "█"),
+    "faded": (DARK_YELLOW, "▧"),
+    "collided": (DARK_RED, "▨"),
     "lost": (RED, "▒"),
     "peer_cap": (ORANGE, "░"),
     "queue_full": (BLUE, "▚"),
+    "held_back": (DARK_BLUE, "▦"),
     "oversize": (YELLOW, "▞"),
     "fault": (PURPLE, "▓"),
     "receiver_down": (GREY, "▤"),

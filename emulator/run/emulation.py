@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.channel.stages import Topology
+from emulator.channel.reach import distances_m, reach_of
 from emulator.engine import Delivery, Engine
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
@@ -66,6 +66,7 @@ class Emulation:
         self.scenario = scenario
         self.world = world
         self.folder = folder
+        self._reach = reach_of(scenario.radio, scenario.run.seed, world.links)
         self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
@@ -92,14 +93,17 @@ class Emulation:
 
     def _nodes_at(self, period: int) -> Nodes:
         """What the selectors of faults look at in a period."""
-        world, radio = self.world, self.scenario.radio
-        position_m = world.position_m(period)
-        degree = Topology(position_m, radio.range_m, radio.max_peers, world.links).in_range.sum(axis=0)
-        return Nodes(world.node_ids, position_m, np.where(world.present(period), degree, -1))
+        world = self.world
+        degree = self._in_range(period).sum(axis=0)
+        return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
+
+    def _in_range(self, period: int) -> NDArray[np.bool_]:
+        position_m = self.world.position_m(period)
+        return self._reach.in_range(position_m, distances_m(position_m))
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Which connected component each vehicle belongs to."""
-        return components(self.world.position_m(period), self.scenario.radio.range_m, self.world.links)
+        return components(self.world.position_m(period), self.scenario.radio.range_m, self._in_range(period))
 
     def _absent(self, period: int) -> set[str]:
         """Who is not in the network."""
@@ -302,9 +306,13 @@ class Emulation:
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
-        deliveries = self._arrived + self.engine.advance(time_ns)
+        deliveries = [*self._arrived, *self.engine.advance(time_ns)]
         self._arrived = []
         return deliveries
+
+    def look_ahead(self, time_ns: int, nodes: Iterable[str]) -> None:
+        """Let the radio come as far as anybody can act: `time_ns`, or an arrival at one of these nodes before."""
+        self.engine.look_ahead(time_ns, [self.number[node] for node in nodes])
 
     def fix_time_ns(self, period: int) -> int | None:
         """When the fix of a period is due; None after the end of the run."""
@@ -324,6 +332,7 @@ class Emulation:
         What arrives in them, whether or not anybody waits for it, has arrived by then: `advance` hands it out.
         """
         while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
+            self.engine.look_ahead(end_ns, ())
             self._arrived += self.engine.advance(end_ns - 1)
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))

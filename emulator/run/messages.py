@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.channel.outcomes import Outcome
+from emulator.observe.busy import mean_busy
 from emulator.observe.observation import beliefs_of, event_message, period_message, scene_message
 from emulator.observe.run_folder import Event
 from emulator.observe.trace import decided_ns
@@ -56,6 +57,7 @@ class Messages:
             [emulation.up[node] for node in emulation.world.node_ids],
             [planned.label for planned in emulation.faults.faults if planned.acts_between(start_ns, end_ns)],
             self._events(),
+            mean_busy(emulation.engine.busy_ratios(end_ns), len(emulation.number), start_ns, end_ns),
         )
 
     def end(self) -> dict[str, Any]:

@@ -132,6 +132,7 @@ class Lockstep:
     def _go_on(self) -> dict[str, wire.Grant]:
         emulation = self._emulation
         while True:
+            self._look_ahead()
             wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
             change_ns = emulation.next_change_ns()
@@ -146,6 +147,17 @@ class Lockstep:
         self.now_ns = next_ns
         self._collect_packets(next_ns)
         return self._grant([lead for lead, wake in wakes.items() if wake == next_ns])
+
+    def _look_ahead(self) -> None:
+        """Let the radio come as far as the first instant at which anything else happens, and no further.
+
+        Arrivals depend on what others send before; so far nobody will, but for those whom an arrival wakes.
+        """
+        emulation = self._emulation
+        stops_ns = [emulation.duration_ns, emulation.next_change_ns(), self.horizon_ns]
+        stops_ns += [self._wake_ns(process, by_radio=False) for process in self._processes.values()]
+        waiting = [n for p in self._processes.values() for n in p.waiting_radio if n not in p.paused]
+        emulation.look_ahead(min(time_ns for time_ns in stops_ns if time_ns is not None), waiting)
 
     def _hold(self, next_ns: int) -> bool:
         """Whether what comes next lies beyond the horizon; all that lies before it is then done and recorded."""
@@ -196,8 +208,11 @@ class Lockstep:
         process.next_fix[node] = -(-self.now_ns // self._emulation.world.period_ns)
         self._woken.add(lead)
 
-    def _wake_ns(self, process: _Process) -> int | None:
-        """When a process must run next: its next timer, or what its nodes' tasks wait for."""
+    def _wake_ns(self, process: _Process, by_radio: bool = True) -> int | None:
+        """When a process must run next: its next timer, or what its nodes' tasks wait for.
+
+        With or without what is on its way to them.
+        """
         if not process.running:
             return None
         if process.nodes[0] in self._woken:
@@ -205,9 +220,9 @@ class Lockstep:
         emulation = self._emulation
         candidates = [process.next_timer_ns]
         awaited = set(process.running)
-        candidates += [
-            emulation.engine.next_arrival_ns(emulation.number[n]) for n in process.waiting_radio if n in awaited
-        ]
+        if by_radio:
+            hearing = [n for n in process.waiting_radio if n in awaited]
+            candidates += [emulation.engine.next_arrival_ns(emulation.number[n]) for n in hearing]
         candidates += [emulation.fix_time_ns(process.next_fix[n]) for n in process.waiting_gnss if n in awaited]
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return max(min(due), self.now_ns) if due else None

@@ -1,29 +1,23 @@
 """The stages of the channel one by one: each decides what is its business, and draws only what it must."""
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.stats import binom
 
 from emulator.channel.draws import Draws
+from emulator.channel.frames import Frame, Pairs, Stage
 from emulator.channel.outcomes import Outcome
-from emulator.channel.stages import (
-    NO_CAUSE,
-    Frame,
-    InRange,
-    Latency,
-    Loss,
-    Pairs,
-    PayloadLimit,
-    PeerCap,
-    Stage,
-    Topology,
-    TransmitQueue,
-)
+from emulator.channel.queue import TransmitQueue
+from emulator.channel.reach import Disc
+from emulator.channel.stages import Latency, Loss, in_range, peer_cap, sender_side
+from emulator.channel.topology import Topology
 from emulator.engine import Engine
+from emulator.faults.links import LinkEffects
 from vnet.scenario import Radio
 
 MS = 1_000_000
@@ -36,16 +30,37 @@ def radio(**changes: float) -> Radio:
     return Radio.model_validate(changes)
 
 
-def pairs(count: int, sent_ns: int = 0, outcome: Sequence[Outcome] | None = None) -> Pairs:
-    decided = np.zeros(count, np.uint8) if outcome is None else np.array(outcome, np.uint8)
-    return Pairs(decided, np.full(count, sent_ns, np.int64), np.full(count, NO_CAUSE, np.int16))
+class Row(NamedTuple):
+    """What has become of the pairs of one frame, by receiver."""
+
+    outcome: NDArray[np.uint8]
+    arrival_ns: NDArray[np.int64]
 
 
-def sent(stage: Stage, count: int, seq: int = 0, sender: int = 0, sent_ns: int = 0, size: int = 100) -> Pairs:
-    """One frame through one stage."""
-    result = pairs(count, sent_ns)
-    stage(Frame(sender, seq, sent_ns, size), result)
-    return result
+def frame_of(
+    sender: int = 0, seq: int = 0, sent_ns: int = 0, size: int = 100, among: Topology | None = None
+) -> Frame:
+    """A frame that has been sent without taking any time."""
+    surroundings = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
+    return Frame(sender, seq, sent_ns, size, surroundings, LinkEffects(), end_ns=sent_ns)
+
+
+def sent(
+    stage: Stage, count: int, seq: int = 0, sender: int = 0, sent_ns: int = 0, among: Topology | None = None
+) -> Row:
+    """One frame through one stage: its outcomes and arrivals."""
+    frame = frame_of(sender, seq, sent_ns, among=among)
+    pairs = Pairs.of([frame], count)
+    stage([frame], pairs)
+    return Row(pairs.outcome[0], pairs.arrival_ns[0])
+
+
+def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
+    """When a frame that is handed over has left its sender; None if there was no room."""
+    frame = frame_of(sender, seq, time_ns, size)
+    queue.hand_over(frame)
+    assert queue.sent.pop() is frame
+    return frame.end_ns if frame.fate == Outcome.pending else None
 
 
 @settings(max_examples=30, deadline=None)
@@ -77,16 +92,20 @@ def test_seed_stage_sender_and_sequence_each_give_other_draws() -> None:
 def test_a_pair_that_is_decided_stays_decided() -> None:
     strict = radio(loss=1.0, max_payload_bytes=10, max_peers=1)
     chain = Engine(["a", "b", "c"], strict, 1, np.zeros((3, 2)), None).chain
+    among = Topology(np.zeros((3, 2)), Disc(1.0), 1)
     for decided in set(Outcome) - {Outcome.pending}:
         for stage in chain:
-            subject = pairs(3, outcome=[decided] * 3)
-            stage(Frame(0, 0, 0, 11), subject)
-            assert subject.outcome.tolist() == [decided] * 3
+            frame = frame_of(size=11, among=among)
+            frame.fate = Outcome.oversize
+            subject = Pairs.of([frame], 3)
+            subject.outcome[:] = decided
+            stage([frame], subject)
+            assert subject.outcome.tolist() == [[decided] * 3]
 
 
 def test_the_range_is_a_closed_disc_without_its_centre() -> None:
     position = np.array([[0.0, 0.0], [3000.0, 0.0], [0.0, np.nextafter(3000.0, 4000.0)], [1800.0, 2400.0]])
-    heard = sent(InRange(Topology(position, 3000.0, 30)), 4).outcome
+    heard = sent(in_range, 4, among=Topology(position, Disc(3000.0), 30)).outcome
     assert [Outcome(o).name for o in heard] == ["out_of_range", "pending", "out_of_range", "pending"]
 
 
@@ -95,7 +114,7 @@ def test_the_range_is_a_closed_disc_without_its_centre() -> None:
 def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     places: list[tuple[int, int]], cap: int, reach: int, down: set[int]
 ) -> None:
-    topology = Topology(np.array(places, float), float(reach), cap)
+    topology = Topology(np.array(places, float), Disc(float(reach)), cap)
     count = len(places)
     for node in down & set(range(count)):
         topology.set_up(node, False)
@@ -103,8 +122,9 @@ def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     def squared(a: int, b: int) -> int:
         return sum((x - y) ** 2 for x, y in zip(places[a], places[b], strict=True))
 
-    stage = PeerCap(topology)
-    admitted = [sent(stage, count, sender=sender).outcome == Outcome.pending for sender in range(count)]
+    admitted = [
+        sent(peer_cap, count, sender=sender, among=topology).outcome == Outcome.pending for sender in range(count)
+    ]
     for receiver in range(count):
         live = [s for s in range(count) if s != receiver and s not in down and squared(s, receiver) <= reach**2]
         nearest = sorted(live, key=lambda s, r=receiver: (squared(s, r), s))[:cap]
@@ -112,18 +132,38 @@ def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
 
 
 def test_a_death_lets_the_next_one_in_and_a_restart_puts_it_out_again() -> None:
-    topology = Topology(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), 3000.0, 2)
-    assert topology.admitted[:, 0].tolist() == [False, True, True, False]
+    topology = Topology(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]), Disc(3000.0), 2)
+    assert topology.now.admitted[:, 0].tolist() == [False, True, True, False]
     topology.set_up(1, False)
     topology.move(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
-    assert topology.admitted[:, 0].tolist() == [False, False, True, True], "moving raises nobody from the dead"
+    assert topology.now.admitted[:, 0].tolist() == [False, False, True, True], "moving raises nobody from the dead"
     topology.set_up(1, True)
-    assert topology.admitted[:, 0].tolist() == [False, True, True, False]
+    assert topology.now.admitted[:, 0].tolist() == [False, True, True, False]
 
 
 @pytest.mark.parametrize(("size", "outcome"), [(0, "pending"), (1400, "pending"), (1401, "oversize")])
 def test_the_payload_limit_is_the_last_size_that_passes(size: int, outcome: str) -> None:
-    assert {Outcome(o).name for o in sent(PayloadLimit(1400), 3, size=size).outcome} == {outcome}
+    subject = Engine(["a", "b", "c"], radio(max_payload_bytes=1400), 1, np.zeros((3, 2)), None)
+    subject.transmit(0, 0, [bytes(size)])
+    assert {row["outcome"] for row in subject.trace.to_table().to_pylist()} == {outcome}
+
+
+def test_what_a_sender_did_not_send_reaches_nobody() -> None:
+    frame = frame_of()
+    frame.fate = Outcome.queue_full
+    subject = Pairs.of([frame_of(), frame], 2)
+    subject.outcome[1, 0] = Outcome.out_of_range
+    sender_side([frame_of(), frame], subject)
+    assert subject.outcome.tolist() == [[Outcome.pending] * 2, [Outcome.out_of_range, Outcome.queue_full]]
+
+
+def test_a_frame_keeps_the_surroundings_of_its_handing_over_among_others() -> None:
+    topology = Topology(np.array([[0.0, 0.0], [50.0, 0.0]]), Disc(100.0), 30)
+    near = frame_of(among=topology)
+    topology.move(np.array([[0.0, 0.0], [500.0, 0.0]]))
+    subject = Pairs.of([near, frame_of(among=topology)], 2)
+    in_range([near, frame_of(among=topology)], subject)
+    assert subject.outcome[:, 1].tolist() == [Outcome.pending, Outcome.out_of_range]
 
 
 def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]:
@@ -150,30 +190,33 @@ def test_the_queue_fills_and_drains_with_the_bit_rate(gaps: list[tuple[int, int]
     times = np.cumsum([gap for gap, _ in gaps]).tolist()
     sends = [(time, size) for time, (_, size) in zip(times, gaps, strict=True)]
     stage = TransmitQueue(1, radio(access_jitter_ms=0, bitrate_mbps=8, queue_frames=limit))
-    left = []
-    for seq, (time_ns, size) in enumerate(sends):
-        done = sent(stage, 2, seq, 0, time_ns, size)
-        full = done.outcome == Outcome.queue_full
-        assert full.all() or not full.any(), "a queue has no favourites"
-        left.append(None if full.any() else int(done.arrival_ns[0]))
+    left = [queued(stage, seq, 0, time_ns, size) for seq, (time_ns, size) in enumerate(sends)]
     assert left == expected_queue(sends, limit)
 
 
 def test_oversize_frames_and_other_senders_take_no_place_in_a_queue() -> None:
-    stage = TransmitQueue(1, radio(access_jitter_ms=0, bitrate_mbps=8, queue_frames=1, max_payload_bytes=100))
-    assert int(sent(stage, 2, 0, size=100).arrival_ns[0]) == 100_000
-    for seq in range(1, 5):
-        assert (sent(stage, 2, seq, size=101).outcome == Outcome.pending).all()
-    assert int(sent(stage, 2, 5, size=100).arrival_ns[0]) == 200_000
-    assert (sent(stage, 2, 6, size=100).outcome == Outcome.queue_full).all()
-    assert int(sent(stage, 2, 0, sender=1, size=100).arrival_ns[0]) == 100_000
+    quick = radio(access_jitter_ms=0, bitrate_mbps=8, queue_frames=1, max_payload_bytes=100, latency_ms=0.001)
+    subject = Engine(["a", "b", "c"], quick.model_copy(update={"jitter_ms": 0.0}), 1, np.zeros((3, 2)), None)
+    subject.transmit(0, 0, [bytes(100), *[bytes(101)] * 4, bytes(100), bytes(100)])
+    subject.transmit(0, 1, [bytes(100)])
+    subject.drain()
+    rows = [row for row in subject.trace.to_table().to_pylist() if row["receiver"] == "c"]
+    assert [row["outcome"] for row in rows] == [
+        "delivered",
+        *["oversize"] * 4,
+        "delivered",
+        "queue_full",
+        "delivered",
+    ]
+    arrivals = [row["arrival_ns"] for row in rows if row["outcome"] == "delivered"]
+    assert arrivals == [101_000, 201_000, 101_000]
 
 
 def test_access_is_delayed_by_up_to_the_jitter_and_differently_each_time() -> None:
     stage = TransmitQueue(7, radio(access_jitter_ms=5, bitrate_mbps=8))
-    delays = np.array(
-        [sent(stage, 2, seq, 0, seq * 100 * MS, 100).arrival_ns[0] - seq * 100 * MS for seq in range(200)]
-    )
+    ends = [queued(stage, seq, time_ns=seq * 100 * MS) for seq in range(200)]
+    delays = np.array([end - seq * 100 * MS for seq, end in enumerate(ends) if end is not None])
+    assert len(delays) == 200
     delays -= 100_000
     assert np.all((delays >= 0) & (delays < 5 * MS))
     assert delays.min() < MS

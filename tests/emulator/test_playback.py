@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from emulator.channel.outcomes import Outcome
+from emulator.observe.busy import mean_busy
 from emulator.observe.observation import LATENCY_BIN_NS, LATENCY_BINS, unpack, unpack_pairs
 from emulator.observe.playback import messages
 from emulator.observe.run_folder import RunFolder
@@ -81,6 +82,22 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
     return watch(scenario, tmp_path_factory.mktemp("playback") / "run")
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Watched:
+    """A simulated run of beacons that share a medium, which fades and is congested by rule."""
+    pauses = {"kind": "etsi", "pause_ms": (150,) * 5}
+    physical = {"path_loss": {"kind": "log_distance"}, "fading": {}, "mac": {}, "congestion": pauses}
+    scenario = Scenario.model_validate(
+        {
+            "run": {"duration_s": 1.55, "settle_s": 0.5, "name": "shared"},
+            "network": {"vehicles": NODES, "layout": "dense"},
+            "radio": physical,
+            "program": {"entry": "agents.beacon:main"},
+        }
+    )
+    return watch(scenario, tmp_path_factory.mktemp("shared") / "run")
+
+
 def test_the_files_tell_what_was_told_live(watched: Watched) -> None:
     played = list(messages(watched.folder))
     assert [stream for stream, _ in played] == [stream for stream, _ in watched.told]
@@ -96,6 +113,27 @@ def test_the_files_tell_what_was_told_live(watched: Watched) -> None:
 
 def _crossed_pair(pair: tuple[str, dict[str, Any]]) -> tuple[str, dict[str, Any]]:
     return pair[0], crossed(pair[1])
+
+
+def test_the_files_of_a_shared_medium_tell_the_same(shared: Watched) -> None:
+    played = list(messages(shared.folder))
+    for (_, live), (stream, again) in zip(shared.told, map(_crossed_pair, played), strict=True):
+        differing = [key for key in live if live[key] != again[key]]
+        assert stream == "end" or differing == [], (stream, live.get("period"))
+    busy = np.array([unpack(message["busy_ratio"])[:, 0] for message in shared.periods])
+    assert (busy.max(axis=0) > 0).all() and busy.max() < 1
+    outcomes = {name for message in shared.periods for name in message["outcomes"]}
+    assert outcomes >= {"delivered", "faded", "held_back"}
+
+
+def test_busy_ratios_are_those_of_the_windows_that_ended_in_a_period() -> None:
+    windows = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.9]])
+    ms = 1_000_000
+    assert mean_busy(windows, 2, 100 * ms, 300 * ms).tolist() == [0.4, 0.65]
+    assert mean_busy(windows, 2, 210 * ms, 260 * ms).tolist() == [0.3, 0.4], "none ended in it: the last before"
+    assert mean_busy(windows, 2, 0, 1000 * ms).tolist() == pytest.approx([0.3, 0.5]), "the run was over before"
+    assert np.isnan(mean_busy(windows, 2, 0, 99 * ms)).all()
+    assert np.isnan(mean_busy([], 2, 0, 500 * ms)).all(), "no medium is shared"
 
 
 def test_what_was_told_is_worth_comparing(watched: Watched) -> None:
@@ -125,7 +163,7 @@ def test_a_fault_acts_in_the_periods_that_it_touches(watched: Watched) -> None:
 def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
     """Against the trace, counted another way."""
     trace = read_trace(watched.folder / "trace.parquet")
-    rows = trace.to_pylist()
+    rows, ids = trace.to_pylist(), watched.told[0][1]["node_ids"]
     for message in watched.periods:
         start_ns, end_ns = message["time_ns"], message["time_ns"] + 100_000_000
         decided = [r for r in rows if start_ns <= (r["arrival_ns"] or r["sent_ns"]) < end_ns]
@@ -139,6 +177,18 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
             (r["sender"], r["seq"], r["copy"]): r["size_bytes"] for r in rows if start_ns <= r["sent_ns"] < end_ns
         }
         assert unpack(message["sent_bytes"]).sum() == sum(sent.values())
+        ages_ms = {}
+        for row in delivered:
+            link = row["sender"], row["receiver"]
+            ages_ms[link] = min(ages_ms.get(link, np.inf), (end_ns - row["sent_ns"]) / 1e6)
+        told = {
+            (ids[sender], ids[receiver]): age_ms
+            for (sender, receiver, outcome, _), age_ms in zip(
+                pairs, unpack(message["pairs_age_ms"])[:, 0], strict=True
+            )
+            if outcome == Outcome.delivered
+        }
+        assert told == pytest.approx(ages_ms)
         bins = [min((r["arrival_ns"] - r["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1) for r in delivered]
         assert np.frombuffer(message["latency_counts"], "<i4").tolist() == [
             bins.count(k) for k in range(LATENCY_BINS)

@@ -14,6 +14,8 @@ from typer.testing import CliRunner
 
 from emulator import report_cli
 from emulator.cli import app
+from emulator.observe.checks import read_evidence
+from emulator.observe.radio_metrics import radio_metrics
 from emulator.observe.report.compare_page import comparison_page
 from emulator.observe.report.comparison import Comparison
 from emulator.observe.report.index import write_index
@@ -107,6 +109,24 @@ def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path)
     page = page_of(beacon)
     assert "common-error" not in page.ids and "latency" in page.ids
     assert re.search(r"Not shown, and why .*Common error.*: no program reported what it needs", page.text)
+
+
+def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
+    run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
+    page = page_of(run)
+    assert "busy ratio (%)" in page.text and "expected: " not in page.text
+    figures = radio_metrics(read_evidence(run))
+    assert f"delivered {100 * figures.totals['delivery_ratio']:.1f} %" in page.text
+    assert f"busy ratio {100 * figures.totals['busy_ratio_mean']:.1f} %" in page.text
+    assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text
+    worst = figures.worst_links(1).to_pylist()[0]
+    assert f"{worst['sender']} {worst['receiver']} {worst['pairs']}" in page.text
+    assert "time (ms)" in page.text and "all frames, by 200 m" in page.text
+    (run / "busy.parquet").unlink()
+    assert "busy" not in page_of(run).ids
+    reason = r"Not shown, and why .*Busy ratio of the medium.*: .*no busy\.parquet in it"
+    assert re.search(reason, page_of(run).text)
+    assert "age of information" in page_of(run).text, "the rest of the radio's figures stay"
 
 
 def test_what_others_wrote_is_text(beacon: Path) -> None:

@@ -93,3 +93,18 @@ async def forgetful(node: Node) -> None:
     """Takes its randomness from the machine instead of `node.rng`: it does not replay."""
     async for _ in node.gnss:
         await node.radio.broadcast(os.urandom(8))
+
+
+async def answering(node: Node) -> None:
+    """Speaks at every fix, and answers at once, in seven bytes, what it hears of the vehicle before it."""
+    before = f"v{int(node.id[1:]) - 1:0{len(node.id) - 1}}"
+
+    async def answer() -> None:
+        async for packet in node.radio:
+            if packet.sender == before and len(packet.payload) == 300:
+                await node.radio.broadcast(packet.payload[:6] + b"!")
+
+    answers = asyncio.create_task(answer())
+    async for fix in node.gnss:
+        await node.radio.broadcast(fix.time_ns.to_bytes(6, "big") + bytes(294))
+    await answers

@@ -16,6 +16,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from emulator.observe.busy import read_busy
 from emulator.observe.checks.bits import check_bits
 from emulator.observe.checks.channel import (
     check_conservation,
@@ -45,6 +46,7 @@ from emulator.observe.checks.faults import (
     check_pause_respected,
 )
 from emulator.observe.checks.latency import check_latency
+from emulator.observe.checks.radio import check_fading, check_medium
 from emulator.observe.checks.replay import ONCE, check_replay
 from emulator.observe.checks.senders import check_copies, check_gnss
 from emulator.observe.checks.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
@@ -71,6 +73,8 @@ Checks = Callable[[Evidence], Iterable[Finding]]
 OF_THE_RADIO: tuple[Check, ...] = (check_conservation, check_range, check_peer_cap, check_loss_rate)
 """These need to know where the vehicles are; so do those of the other tuples but the last."""
 OF_FRAMES: tuple[Check, ...] = (
+    check_fading,
+    check_medium,
     check_latency,
     check_isolation,
     check_causes,
@@ -181,4 +185,6 @@ def read_evidence(folder: Path) -> Evidence:
         metrics = pq.read_table(folder / "metrics.parquet")
     except (OSError, pa.ArrowInvalid, ValueError) as error:
         raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
-    return Evidence(load_scenario(folder / "scenario.toml"), trace, states, metrics, events)
+    scenario = load_scenario(folder / "scenario.toml")
+    busy = None if scenario.radio.mac is None else read_busy(folder)
+    return Evidence(scenario, trace, states, metrics, events, busy=busy)

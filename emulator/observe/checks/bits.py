@@ -14,7 +14,7 @@ from emulator.observe.checks.latency import bounds
 from emulator.observe.checks.places import Mask
 from emulator.observe.checks.senders import is_noise
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault, SenderFault
+from vnet.faults import ClockFault, GnssFault, Infrastructure, ProcessFault, SenderFault, Throttle
 
 IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate")
 DELAYING = ("delay", "jitter", "reorder", "throttle")
@@ -87,8 +87,13 @@ def _delayed(evidence: Evidence, planned: PlannedFault) -> int:
 
 
 def _overflowed(evidence: Evidence, planned: PlannedFault) -> int:
-    """Frames for which a throttled queue was full."""
-    full = evidence.outcome_is("queue_full") & planned.nodes[evidence.sender]
+    """Pairs of frames for which a throttled queue was full, or that came to a shared medium at its pace."""
+    full = evidence.outcome_is("queue_full")
+    if evidence.shares_air:  # nobody knows how long a frame waits for it; what is throttled waits longer
+        assert isinstance(planned.fault, Throttle)
+        least_ns = evidence.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
+        full |= (evidence.on_air_ns >= 0) & (evidence.on_air_ns - evidence.sent_ns >= least_ns)
+    full &= planned.nodes[evidence.sender]
     return int((full & evidence.acting(planned, evidence.sent_ns)).sum())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from emulator.channel.outcomes import Outcome
-from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, Evidence
+from emulator.observe.checks.evidence import ARRIVED, NEVER_NS, ON_AIR, Evidence
 from emulator.observe.checks.places import Mask, Whole
 from emulator.observe.checks.verdicts import Finding, NotExercised, result, unknown
 from vnet.faults import SenderFault, StaleMessages
@@ -165,7 +165,7 @@ def check_peer_cap(evidence: Evidence) -> Finding:
 
 def _wrongly_capped(evidence: Evidence, capped: Mask) -> Mask:
     # What was sent at the very instant of a death may have come before or after it: it is not judged.
-    judged = capped | evidence.outcome_is("lost", "fault", *ARRIVED)
+    judged = capped | evidence.outcome_is("fault", *ON_AIR)
     judged &= evidence.placed & ~evidence.is_unsure(evidence.sent_ns)
     everybody = np.arange(len(evidence.node_ids))
     edges = {0, NEVER_NS} | {edge for span in evidence.down for edge in (span.start_ns, span.end_ns)}

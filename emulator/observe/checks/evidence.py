@@ -15,8 +15,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.channel.dot11p import airtimes_ns
+from emulator.channel.reach import reach_of
 from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
+from emulator.observe.busy import busy_windows
 from emulator.observe.checks.places import Mask, Places, Whole
 from emulator.observe.checks.verdicts import MOST_ROWS
 from emulator.observe.run_folder import Event
@@ -31,6 +34,8 @@ NEVER_NS = np.iinfo(np.int64).max
 REALTIME_GUARD_NS = 50_000_000
 """In real time nobody can say on which side of a fault's start or end a frame was that close to it."""
 ARRIVED = ("delivered", "receiver_down", "transport")
+ON_AIR = ("lost", "faded", "collided", *ARRIVED)
+"""What becomes of pairs that come as far as the radio."""
 ENDINGS = ("died", "crashed", "finished", "spun")
 
 
@@ -59,6 +64,8 @@ class Evidence:
     events: Sequence[Event]
     known_m: Array | None = None
     """True positions (periods, N, 2), where the states have not got them all."""
+    busy: pa.Table | None = None
+    """busy.parquet, where senders share a medium."""
 
     # Nodes and where they are.
 
@@ -87,10 +94,16 @@ class Evidence:
     @cached_property
     def places(self) -> Places:
         """Where the vehicles were. Raises ScenarioError if the scenario's links do not fit them."""
-        links = load_links(self.scenario.radio, len(self.node_ids))
+        radio = self.scenario.radio
+        reach = reach_of(radio, self.scenario.run.seed, load_links(radio, len(self.node_ids)))
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
-        return Places(some, self.moves, self.scenario.period_ns, self.scenario.radio.range_m, links)
+        return Places(some, self.moves, self.scenario.period_ns, reach)
+
+    @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium; no windows where senders share none."""
+        return busy_windows(self.busy, self.node_ids)
 
     # The trace, column by column.
 
@@ -124,6 +137,21 @@ class Evidence:
     def arrival_ns(self) -> Whole:
         """When it arrived; -1 where it did not."""
         return self.column("arrival_ns")
+
+    @cached_property
+    def shares_air(self) -> bool:
+        """Whether the trace tells when frames were on air."""
+        return "on_air_ns" in self.trace.column_names
+
+    @cached_property
+    def on_air_ns(self) -> Whole:
+        """When its transmission began; -1 where it never did."""
+        return self.column("on_air_ns")
+
+    @cached_property
+    def airtime_ns(self) -> Whole:
+        """How long its transmission takes, but for throttles."""
+        return airtimes_ns(self.scenario.radio, self.column("size_bytes"))
 
     @cached_property
     def seq(self) -> Whole:

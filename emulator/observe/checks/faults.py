@@ -10,7 +10,7 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import binomial_band, received_twice
-from emulator.observe.checks.evidence import ARRIVED, NO_FAULT, UNHEARD_OF, Evidence
+from emulator.observe.checks.evidence import NO_FAULT, ON_AIR, UNHEARD_OF, Evidence
 from emulator.observe.checks.places import Mask
 from emulator.observe.checks.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from vnet.faults import BurstLoss, Corrupt, Loss, StaleMessages
@@ -77,7 +77,7 @@ def check_partition_respected(evidence: Evidence) -> Finding:
         across |= evidence.reached(planned, -evidence.guard_ns)
     if not across.any():
         return unknown(name, "no frame was sent across a cut")
-    passed = across & evidence.outcome_is("lost", *ARRIVED)
+    passed = across & evidence.outcome_is(*ON_AIR)
     count = int(passed.sum())
     text = f"{int(across.sum()):,} pairs across a cut, and nothing passed"
     broken_text = f"{count} of {int(across.sum()):,} pairs passed a cut"
@@ -200,9 +200,7 @@ def _drew_for(evidence: Evidence, planned: PlannedFault) -> Mask:
     """Pairs that came as far as a fault of chance: cut by none, and lost to none of those before it."""
     reached = evidence.reached(planned, -evidence.guard_ns) & ~received_twice(evidence)
     later = [other.number for other in of_kinds(evidence, LOSING) if other.number >= planned.number]
-    further = evidence.outcome_is("lost", *ARRIVED) | (
-        evidence.outcome_is("fault") & np.isin(evidence.cause, later)
-    )
+    further = evidence.outcome_is(*ON_AIR) | (evidence.outcome_is("fault") & np.isin(evidence.cause, later))
     return np.asarray(reached & further)
 
 

@@ -52,11 +52,17 @@ def _queue(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array, 
     """For each row: the earliest start and the latest end of its transmission, its airtime, whether it was alone.
 
     The sender's queue is monotonic in its access delays: with none of them everything is at its earliest, with the
-    longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter.
+    longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter. Where
+    all share the air, the trace tells when each frame was on it.
     """
+    usual_ns = evidence.airtime_ns.astype(float)
+    if evidence.shares_air:
+        start_ns = evidence.on_air_ns.astype(float)
+        return start_ns, start_ns + usual_ns, usual_ns, evidence.arrived
     fast_mbps, slow_mbps = _bitrates(evidence, plan)
     bits = evidence.column("size_bytes") * 8_000
-    airtimes_ns = [np.rint(bits / mbps) for mbps in (evidence.scenario.radio.bitrate_mbps, fast_mbps, slow_mbps)]
+    slowed_ns = [np.maximum(usual_ns, np.rint(bits / mbps)) for mbps in (fast_mbps, slow_mbps)]
+    airtimes_ns = [usual_ns, *slowed_ns]
     longest_ns = int(evidence.sent_ns.max(initial=0)) + 1
     key, batch = np.unique(evidence.sender * longest_ns + evidence.sent_ns, return_inverse=True)
     offered = np.flatnonzero(~received_twice(evidence) & ~evidence.outcome_is("oversize"))
@@ -184,12 +190,14 @@ def _mean_latency(evidence: Evidence, allowed: Bounds, timed: Mask) -> dict[str,
     count = int(rows.sum())
     if not count:
         return {}
-    mean_ns = float(np.mean((evidence.arrival_ns - evidence.sent_ns)[rows] - allowed.airtime_ns[rows]))
+    from_ns = evidence.on_air_ns if evidence.shares_air else evidence.sent_ns
+    access_ms = 0.0 if evidence.shares_air else radio.access_jitter_ms
+    mean_ns = float(np.mean((evidence.arrival_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
     receivers: Whole = np.unique(evidence.emission[rows], return_counts=True)[1]
     tick_ms = radio.delivery_tick_us / 1_000
-    expected_ms = radio.latency_ms + (radio.access_jitter_ms + radio.jitter_ms + tick_ms) / 2
+    expected_ms = radio.latency_ms + (access_ms + radio.jitter_ms + tick_ms) / 2
     # The access delay is one draw for all receivers of a frame, the jitter one for each of them.
-    variance = radio.access_jitter_ms**2 / 12 * float(np.sum(receivers.astype(float) ** 2)) / count**2
+    variance = access_ms**2 / 12 * float(np.sum(receivers.astype(float) ** 2)) / count**2
     variance += radio.jitter_ms**2 / 12 / count
     band_ms = BAND_SIGMAS * sqrt(variance) + tick_ms / 2 + 1e-5
     return {"mean_ms": mean_ns / NS_PER_MS, "expected_ms": expected_ms, "band_ms": band_ms, "pairs_alone": count}

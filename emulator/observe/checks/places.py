@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.channel.reach import Reach, distances_m
 from vnet.roads.lanes import Array
 
 Mask = NDArray[np.bool_]
@@ -16,15 +19,14 @@ Whole = NDArray[np.int64]
 class Places:
     """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
 
-    `links` (N, N) says who (row) hears whom (column), or is None where `range_m` decides.
+    `reach` says who is in range of whom.
     """
 
-    def __init__(self, position_m: Array, moves: bool, period_ns: int, range_m: float, links: Mask | None) -> None:
+    def __init__(self, position_m: Array, moves: bool, period_ns: int, reach: Reach) -> None:
         self._position_m = position_m
         self._moves = moves
         self._period_ns = period_ns
-        self._range_m = range_m
-        self.links = links
+        self._reach = reach
 
     def index(self, time_ns: Whole) -> Whole:
         """Which of the K positions count at these instants."""
@@ -44,16 +46,15 @@ class Places:
 
     def distance_m(self, index: int) -> Array:
         """(N, N) between vehicles."""
-        position_m = self.position_m(index)
-        offset = position_m[:, None] - position_m[None]
-        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]))
+        return distances_m(self.position_m(index))
 
     def in_range(self, index: int) -> Mask:
         """(N, N), rows are senders: who is in range of whom."""
-        distance_m = self.distance_m(index)
-        in_range = distance_m <= self._range_m if self.links is None else self.links.T & np.isfinite(distance_m)
-        np.fill_diagonal(in_range, False)
-        return np.asarray(in_range)
+        return self._reach.in_range(self.position_m(index), self.distance_m(index))
+
+    def power_mw(self, index: int) -> Array:
+        """(N, N), rows are senders: the mean power of signals, 0 out of range."""
+        return self._reach.power_mw(self.position_m(index), self.distance_m(index))
 
     def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Array:
         """How far the two of each pair (n,) are apart at these instants; NaN where that is not known."""
@@ -66,12 +67,29 @@ class Places:
 
     def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Mask:
         """Which pairs of vehicles are in range at these instants; none where that is not known."""
-        distance_m = self.pair_distances_m(sender, receiver, time_ns)
-        if self.links is None:
-            near = distance_m <= self._range_m
-        else:
-            near = self.links[receiver, sender] & np.isfinite(distance_m)
-        return np.asarray(near & (sender != receiver))
+        return np.asarray(self._of_pairs(self.in_range, sender, receiver, time_ns) > 0)
+
+    def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: Whole) -> Array:
+        """With which mean power signals arrive at these instants; 0 out of range, or where that is not known."""
+        return self._of_pairs(self.power_mw, sender, receiver, time_ns)
+
+    def _of_pairs(
+        self,
+        matrix: Callable[[int], NDArray[Any]],
+        sender: NDArray[np.intp],
+        receiver: NDArray[np.intp],
+        time_ns: Whole,
+    ) -> Array:
+        """The entries for pairs (n,) of the matrices of their times; 0 where positions are not known."""
+        found = np.zeros(len(time_ns))
+        rows = np.flatnonzero(self.known(time_ns))
+        index = self.index(time_ns)[rows]
+        order = np.argsort(index, kind="stable")
+        rows, index = rows[order], index[order]
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(index)) + 1):
+            if len(some):
+                found[rows[some]] = matrix(int(index[some[0]]))[sender[rows[some]], receiver[rows[some]]]
+        return found
 
     @cached_property
     def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

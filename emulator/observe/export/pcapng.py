@@ -1,10 +1,11 @@
 """The frames of a run as pcapng: what a capture on every vehicle's radio would have seen.
 
-Each vehicle is an interface, with the frames that it sent (outbound, when it handed them over) and those that
-reached it (inbound, when they arrived). A packet is radiotap, a QoS data frame of 802.11 outside every BSS (as
-802.11p sends), LLC and SNAP with the ethertype for local experiments 0x88B5, and then the payload, which a run
-does not keep: it is cut off (captured length < length), and its digest is in the packet's comment. Frames that had
-nobody in range have no trace and are not in it. Times count from the start of the run, in nanoseconds.
+Each vehicle is an interface, with the frames that it sent (outbound, when it handed them over or, where senders
+share a medium, when they went on air) and those that reached it (inbound, when they arrived). A packet is radiotap,
+a QoS data frame of 802.11 outside every BSS (as 802.11p sends), LLC and SNAP with the ethertype for local
+experiments 0x88B5, and then the payload, which a run does not keep: it is cut off (captured length < length), and
+its digest is in the packet's comment. Frames that had nobody in range have no trace and are not in it. Times count
+from the start of the run, in nanoseconds.
 
 The format: draft-ietf-opsawg-pcapng. Radiotap: radiotap.org. Interface type 127 is 802.11 with radiotap.
 """
@@ -73,12 +74,19 @@ def _packets(evidence: Evidence) -> Iterator[_Packet]:
     heard = np.flatnonzero(evidence.outcome_is("delivered"))
     row = np.concatenate([sent, heard])
     interface = np.concatenate([evidence.sender[sent], evidence.receiver[heard]])
-    time_ns = np.concatenate([evidence.sent_ns[sent], evidence.arrival_ns[heard]])
+    left_ns = evidence.sent_ns[sent] if evidence.scenario.radio.mac is None else _on_air_ns(evidence, sent)
+    time_ns = np.concatenate([left_ns, evidence.arrival_ns[heard]])
     direction = np.repeat([_OUTBOUND, _INBOUND], [len(sent), len(heard)])
     order = np.argsort(time_ns, kind="stable")
     columns = (column[order].tolist() for column in (interface, time_ns, direction, row))
     for fields in zip(*columns, strict=True):
         yield _Packet(*fields)
+
+
+def _on_air_ns(evidence: Evidence, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+    """When these frames went on the air that all share; those that never did, when they were handed over."""
+    on_air_ns = evidence.column("on_air_ns")[rows]
+    return np.where(on_air_ns < 0, evidence.sent_ns[rows], on_air_ns)
 
 
 class _Fates:

@@ -33,6 +33,8 @@ def write_csv(evidence: Evidence, folder: Path) -> list[str]:
         "vehicles": figures.vehicles,
         "distances": figures.distances,
     }
+    if evidence.busy is not None:
+        tables["busy"] = evidence.busy
     for name, table in tables.items():
         pacsv.write_csv(flat(table), folder / f"{name}.csv")
     return [f"{name}.csv" for name in tables]

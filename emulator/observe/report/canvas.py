@@ -39,8 +39,11 @@ PALETTE = {
     "purple": "#cc79a7",
     "sky": "#56b4e9",
     "grey": "#8b929b",
+    "sand": "#bdb35c",
+    "rust": "#8a3a00",
+    "navy": "#004166",
 }
-INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY = PALETTE.values()
+INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY, SAND, RUST, NAVY = PALETTE.values()
 _VARIABLE = {colour: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190

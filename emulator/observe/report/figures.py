@@ -18,17 +18,22 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from emulator.channel.medium import WINDOW_NS
 from emulator.channel.outcomes import Outcome
 from emulator.observe.metrics import anees_band
+from emulator.observe.radio_metrics import BIN_M
 from emulator.observe.report.canvas import (
     BLUE,
     GREEN,
     GREY,
     INK,
+    NAVY,
     ORANGE,
     PURPLE,
     QUIET,
     RED,
+    RUST,
+    SAND,
     SKY,
     Canvas,
     Span,
@@ -48,9 +53,12 @@ from vnet.roads.lanes import Array
 
 OUTCOME_COLOURS = {
     "delivered": GREEN,
+    "faded": SAND,
+    "collided": RUST,
     "lost": RED,
     "peer_cap": ORANGE,
     "queue_full": BLUE,
+    "held_back": NAVY,
     "oversize": INK,
     "fault": PURPLE,
     "receiver_down": GREY,
@@ -62,6 +70,7 @@ MOST_BARS = 10
 MOST_LINKS = 800
 """With more links than that, bins are shown instead of a point for each."""
 MOST_IN_MATRIX = 150
+DISTANCE_BINS = 25
 WIDE_RANGE = 8.0
 """With more than that between the least and the largest value, an axis is logarithmic."""
 LINK_BAND = 0.99
@@ -102,8 +111,10 @@ class Chart:
 # Against time.
 
 
-def time_figure(lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = ()) -> Canvas:
-    """Lines against time, with the spans of faults behind them."""
+def time_figure(
+    lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = (), linear: bool = False
+) -> Canvas:
+    """Lines against time, spans of faults behind them; logarithmic if they spread far, unless `linear`."""
     rows = 1 if len(lines) > 1 else 0
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
@@ -117,7 +128,7 @@ def time_figure(lines: Sequence[Line], y_label: str, end_s: float, spans: Sequen
         made.axes.plot(*thin(line.time_s, line.value), **shown)
     everything = np.concatenate([line.value[np.isfinite(line.value)] for line in lines])
     positive = everything[everything > 0]
-    if len(positive) and positive.max() > WIDE_RANGE * positive.min():
+    if not linear and len(positive) and positive.max() > WIDE_RANGE * positive.min():
         logarithmic(made.axes)
     else:
         from_zero(made.axes)
@@ -217,8 +228,21 @@ def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
         raise VnetError("no frame was sent to anybody in range")
     column = trace["outcome"].combine_chunks()
     code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
-    decided_ns = pc.coalesce(trace["arrival_ns"], trace["sent_ns"]).to_numpy()
+    left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
+    decided_ns = pc.coalesce(trace["arrival_ns"], trace[left]).to_numpy()
     return column.dictionary.to_pylist(), code, decided_ns / 1e9
+
+
+def busy(source: Source) -> Drawing:
+    percent = 100 * source.busy_ratio
+    end_s = np.arange(1, len(percent) + 1) * WINDOW_NS / 1e9
+    lines = [
+        Line("mean", end_s, percent.mean(axis=1), BLUE),
+        Line("busiest", end_s, percent.max(axis=1), RED, DASHES[1]),
+    ]
+    made = time_figure(lines, "busy ratio (%)", source.end_s, source.spans, linear=True)
+    text = "The share of the time in which vehicles sensed the medium taken, in windows of 100 ms."
+    return Drawing(made, text + _faults_note(made, source))
 
 
 # Over the whole run.
@@ -272,25 +296,66 @@ def links(source: Source) -> Drawing:
     known = np.isfinite(apart_m)
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
-    made = canvas("distance (km)", "delivered (%)", legend_rows=1)
+    physical, binned = source.scenario.radio.is_physical, evidence.moves or source.scenario.radio.is_physical
+    labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
+    made = canvas("distance (km)", "delivered (%)", legend_rows=int(np.ceil(labels / 3)))
     if len(used) <= MOST_LINKS:
         dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
         made.axes.plot(distance_km, share, color=BLUE, alpha=0.55, label="a link", **dots)
     else:
         _draw_bins(made, distance_km, share)
     text = f"The share that was delivered on each of {len(used):,} links, from one vehicle to another."
-    loss = source.scenario.radio.loss
-    typical = int(np.median(rows[used]))
-    low, high = (100 * edge / typical for edge in binom.interval(LINK_BAND, typical, 1 - loss))
+    lowest = float(share.min())
+    if not physical:
+        low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
+        lowest, text = min(lowest, low), text + band + _why_less(source)
+    if binned:
+        lowest = min(lowest, _draw_frames(made, source.radio.distances))
+    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
+    made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
+    legend(made)
+    return Drawing(made, text)
+
+
+def ages(source: Source) -> Drawing:
+    links, share = source.radio.links, np.linspace(0, 1, 101)
+    lines = {
+        "gap: mean": ("inter_reception_mean_ms", BLUE),
+        "gap: 95 %": ("inter_reception_p95_ms", SKY),
+        "age: mean": ("age_mean_ms", RED),
+    }
+    made = canvas("links, from the best to the worst (%)", "time (ms)", legend_rows=1)
+    drawn = []
+    for (label, (name, colour)), dash in zip(lines.items(), (DASHES[0], DASHES[2], DASHES[1]), strict=True):
+        values_ms = links[name].drop_null().to_numpy()
+        if len(values_ms):
+            drawn.append(np.quantile(values_ms, share, method="inverted_cdf"))
+            made.axes.plot(100 * share, drawn[-1], color=colour, linestyle=dash, label=label)
+    if not drawn:
+        raise VnetError("nothing was received twice on a link")
+    made.axes.set_xlim(0, 100)
+    least, most = np.min(drawn), np.max(drawn)
+    if 0 < WIDE_RANGE * least < most:
+        logarithmic(made.axes)
+    else:
+        from_zero(made.axes)
+    legend(made)
+    return Drawing(
+        made,
+        "Gap: from one reception of a sender's frames to the next. Age: how long ago the newest was sent that the "
+        f"receiver has. Each line sorts the {len(links):,} links by its own figure.",
+    )
+
+
+def _draw_expected(made: Canvas, loss: float, frames: int) -> tuple[float, str]:
+    """What links of so many frames deliver where distance makes no difference; how low that is, and in words."""
+    low, high = (100 * edge / frames for edge in binom.interval(LINK_BAND, frames, 1 - loss))
     label = f"expected: {100 * (1 - loss):g} %"
     made.axes.axhline(100 * (1 - loss), color=RED, linestyle=DASHES[1], label=label, zorder=2.5)
-    if low < high:
-        made.axes.axhspan(low, high, color=RED, alpha=0.12, linewidth=0, zorder=0.6)
-        text += f" Band: where {LINK_BAND:.0%} of links with {typical:,} frames are by chance alone."
-    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
-    made.axes.set_ylim(max(0, np.floor((min(share.min(), low) - 3) / 10) * 10), 102)
-    legend(made)
-    return Drawing(made, text + _why_less(source))
+    if low == high:
+        return low, ""
+    made.axes.axhspan(low, high, color=RED, alpha=0.12, linewidth=0, zorder=0.6)
+    return low, f" Band: where {LINK_BAND:.0%} of links with {frames:,} frames are by chance alone."
 
 
 def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
@@ -302,6 +367,17 @@ def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
     low, median, high = np.array([np.percentile(share[place == p], [5, 50, 95]) for p in there]).T
     made.axes.fill_between(middle, low, high, color=BLUE, alpha=0.25, linewidth=0, label="9 of 10 links")
     made.axes.plot(middle, median, color=BLUE, label="median")
+
+
+def _draw_frames(made: Canvas, bins: pa.Table) -> float:
+    """The share of all frames by distance, in at most `DISTANCE_BINS` bins; returns the least."""
+    from_m, pairs, delivered = (bins[name].to_numpy() for name in ("from_m", "pairs", "delivered"))
+    width_m = BIN_M * int(np.ceil((from_m.max(initial=0) + BIN_M) / BIN_M / DISTANCE_BINS))
+    place = (from_m // width_m).astype(np.intp)
+    there = np.unique(place)
+    share = 100 * np.bincount(place, delivered)[there] / np.bincount(place, pairs)[there]
+    made.axes.plot((there + 0.5) * width_m / 1000, share, color=INK, label=f"all frames, by {width_m:g} m")
+    return float(share.min(initial=100))
 
 
 def _why_less(source: Source) -> str:
@@ -355,11 +431,13 @@ def degrees(source: Source) -> Drawing:
     legend(made)
     radio = source.scenario.radio
     how = f"within {radio.range_m / 1000:g} km" if radio.links is None else "by the scenario's links"
+    if radio.path_loss is not None:
+        how = f"with {radio.path_loss.floor_dbm:g} dBm or more on average"
     if evidence.moves:
         return Drawing(
             made, f"How many vehicles each can hear, {how}, in the mean over the time in which it is there."
         )
-    parts = int(components(evidence.places.position_m(0), radio.range_m, evidence.places.links).max()) + 1
+    parts = int(components(evidence.places.position_m(0), radio.range_m, evidence.places.in_range(0)).max()) + 1
     network = "one connected network" if parts == 1 else f"{parts} networks that do not hear each other"
     return Drawing(made, f"How many vehicles each can hear, {how}: {network}.")
 
@@ -432,8 +510,10 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "position": ("Position", position),
     "outcomes": ("Outcomes over time", outcomes),
     "totals": ("Outcomes in total", totals),
+    "busy": ("Busy ratio of the medium", busy),
     "links": ("Delivery against distance", links),
     "latency": ("Latency", latency),
+    "ages": ("Age of information, and gaps", ages),
     "consensus": ("Consensus error", consensus),
     "consistency": ("Consistency of the filters", consistency),
     "degrees": ("Degrees of the network", degrees),

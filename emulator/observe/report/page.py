@@ -24,14 +24,14 @@ STYLE = """
 :root { color-scheme: light dark;
   --paper: #ffffff; --panel: #f5f6f8; --ink: #1b1f24; --quiet: #59626d; --line: #d5d9df; --grid: #e6e9ed;
   --blue: #0072b2; --orange: #e69f00; --green: #009e73; --red: #d55e00; --purple: #cc79a7; --sky: #56b4e9;
-  --grey: #8b929b; --link: #00609a;
+  --grey: #8b929b; --sand: #bdb35c; --rust: #8a3a00; --navy: #004166; --link: #00609a;
   --good: #0b6b50; --good-paper: #d9f0e8; --bad: #ffffff; --bad-paper: #b54a00; --open: #6a4a00;
   --open-paper: #fbeac4;
 }
 @media (prefers-color-scheme: dark) { :root {
   --paper: #14171b; --panel: #1d2126; --ink: #e4e7ea; --quiet: #9ba4ae; --line: #363c44; --grid: #292e35;
   --blue: #3fa2e0; --orange: #f0b132; --green: #1fbf94; --red: #f5803a; --purple: #e29bc3; --sky: #8fd0f7;
-  --grey: #7d858f; --link: #6cbcf0;
+  --grey: #7d858f; --sand: #8c8240; --rust: #c05a20; --navy: #2c6f9e; --link: #6cbcf0;
   --good: #7fe0c0; --good-paper: #123a30; --bad: #1b1206; --bad-paper: #f5803a; --open: #f5cf7d;
   --open-paper: #3d3010;
 } }
@@ -107,14 +107,18 @@ def pairs(rows: Mapping[str, object]) -> str:
     return f'<dl class="pairs">{"".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in rows.items())}</dl>'
 
 
-def table(rows: Sequence[Mapping[str, Any]], caption: str = "") -> str:
-    """Rows of named values; columns in which nothing stands are left out."""
+def table(rows: Sequence[Mapping[str, Any]], caption: str = "", decimals: int | None = None) -> str:
+    """Rows of named values; columns in which nothing stands are left out. `decimals` are those of all fractions."""
+
+    def shown(value: Any) -> str:
+        return cell(value) if decimals is None or not isinstance(value, float) else f"{value:,.{decimals}f}"
+
     names = dict.fromkeys(key for row in rows for key in row)
     columns = [name for name in names if any(row.get(name) not in (None, "") for row in rows)]
     numeric = {c for c in columns if all(isinstance(row.get(c), (int, float, type(None))) for row in rows)}
     head = "".join(f'<th scope="col"{_class(c in numeric)}>{escape(c)}</th>' for c in columns)
     body = "".join(
-        f"<tr>{''.join(f'<td{_class(c in numeric)}>{escape(cell(row.get(c)), 300)}</td>' for c in columns)}</tr>"
+        f"<tr>{''.join(f'<td{_class(c in numeric)}>{escape(shown(row.get(c)), 300)}</td>' for c in columns)}</tr>"
         for row in rows
     )
     title = f"<caption>{escape(caption)}</caption>" if caption else ""

@@ -14,8 +14,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
+from emulator.observe.busy import busy_windows, read_busy
 from emulator.observe.checks.evidence import Evidence
 from emulator.observe.metrics import STATES as ALL_STATES
+from emulator.observe.radio_metrics import RadioMetrics, radio_metrics
 from emulator.observe.report.canvas import Span
 from emulator.observe.report.record import Record, read_record
 from emulator.observe.run_folder import Event, read_events
@@ -31,11 +33,15 @@ _NAME = pa.dictionary(pa.int32(), pa.string())
 TRACE = {
     "sent_ns": pa.int64(),
     "sender": _NAME,
+    "seq": pa.int64(),
     "receiver": _NAME,
     "outcome": _NAME,
     "cause": pa.string(),
     "arrival_ns": pa.int64(),
+    "copy": pa.int16(),
 }
+ON_AIR = {"left_ns": pa.int64()}
+"""A column that the trace has where senders share a medium."""
 STATES = {name: ALL_STATES.field(name).type for name in ("period", "time_ns", "node", "position_m", "values")}
 FIGURES = (
     "common_error_rmse_m",
@@ -98,10 +104,27 @@ class Source:
         return events
 
     @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium. Raises VnetError if senders share none."""
+        if self.scenario.radio.mac is None:
+            raise VnetError("senders share no medium ([radio.mac])")
+        windows = busy_windows(read_busy(self.folder), self.evidence.node_ids)
+        if not len(windows):
+            raise VnetError("the run was over within the first window")
+        return windows
+
+    @cached_property
     def evidence(self) -> Evidence:
         """The tables, so far as reports need them, as arrays."""
-        trace, states = self._table("trace", TRACE), self._table("states", STATES)
-        return Evidence(self.scenario, trace, states, self.metrics, self.events)
+        on_air = {} if self.scenario.radio.mac is None else ON_AIR
+        trace, states = self._table("trace", TRACE | on_air), self._table("states", STATES)
+        busy = maybe(lambda: read_busy(self.folder)) if on_air else None
+        return Evidence(self.scenario, trace, states, self.metrics, self.events, busy=busy)
+
+    @cached_property
+    def radio(self) -> RadioMetrics:
+        """The radio in figures."""
+        return radio_metrics(self.evidence)
 
     @cached_property
     def metrics(self) -> pa.Table:

@@ -16,6 +16,7 @@ from emulator.observe.report.figures import Chart, draw
 from emulator.observe.report.index import write_index
 from emulator.observe.report.names import REPORT
 from emulator.observe.report.page import badge, escape, page, pairs, put_page, table
+from emulator.observe.report.radio import radio_section
 from emulator.observe.report.record import Record
 from emulator.observe.report.source import Source, maybe, why_not
 from emulator.observe.run_folder import RUNS, Event
@@ -79,6 +80,7 @@ def report_page(source: Source) -> str:
         *_checks(source, record),
         *(_key_figures(record) if record else []),
         *figures_section(charts, missing),
+        *radio_section(source),
         *_events(source),
         *_scenario(source),
         *_again(source, record),
@@ -104,6 +106,7 @@ def _header(source: Source, name: str, record: Record | None) -> Iterator[str]:
         "checks": "Checks",
         "key": "Key figures",
         "figures": "Figures",
+        "radio": "Radio",
         "events": "Events",
         "scenario": "Scenario",
         "again": "Have it again",

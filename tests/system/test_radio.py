@@ -1,0 +1,35 @@
+"""A physical radio in whole runs: real processes do the same as their simulation, and so does the wall clock."""
+
+from tests.system.conftest import Vnet
+
+SCENARIO = "scenarios/80211p.toml"
+SMALL = ("--set", "network.vehicles=6", "--duration", "1.5")
+ANSWERING = ("--program", "tests.system.programs:answering")
+
+
+def test_processes_on_one_channel_do_the_same_as_their_simulation(vnet: Vnet) -> None:
+    live, simulated = (vnet(command, SCENARIO, *SMALL) for command in ("run", "simulate"))
+    for run in (live, simulated):
+        assert run.status == 0, run.stderr + run.stdout
+        assert {run.check(name)["verdict"] for name in ("fading", "medium", "latency")} == {"valid"}
+    assert live.fingerprint == simulated.fingerprint
+    assert (live.folder / "busy.parquet").read_bytes() == (simulated.folder / "busy.parquet").read_bytes()
+
+
+def test_whoever_answers_what_it_hears_is_woken_at_the_same_instant(vnet: Vnet) -> None:
+    """Arrivals depend on what others send before: looking ahead must stop where anybody may answer."""
+    apart = vnet("run", SCENARIO, *SMALL, *ANSWERING)
+    together = vnet("run", SCENARIO, *SMALL, *ANSWERING, "--set", "run.nodes_per_process=3")
+    simulated = vnet("simulate", SCENARIO, *SMALL, *ANSWERING)
+    assert apart.status == together.status == simulated.status == 0, apart.stderr + apart.stdout
+    assert simulated.fingerprint == apart.fingerprint == together.fingerprint
+    answers = [row for row in simulated.trace() if row["size_bytes"] == 7]
+    assert len(answers) > 50
+
+
+def test_on_the_wall_clock_frames_share_the_medium_too(vnet: Vnet) -> None:
+    run = vnet("run", SCENARIO, *SMALL, "--program", "agents.beacon:main", "--pacing", "realtime")
+    assert run.status in (0, 3), run.stderr + run.stdout
+    assert run.outcomes["delivered"] > 50
+    checks = {name: run.check(name)["verdict"] for name in ("conservation", "range", "fading", "medium", "latency")}
+    assert set(checks.values()) == {"valid"}, checks
