@@ -59,8 +59,7 @@ CLOCK_FIXES = 10
 """So many fixes a clock is judged by: after it has jumped ahead it is wrong for so long."""
 SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.7, 0.97
 """Shares of the period: within the first every vehicle sends, at the end of the second it computes, or
-`GRACE_SHARE` after the last slot. All compute at once: where many share a processor they must be done by the next fix.
-"""
+`GRACE_SHARE` after the last slot. All compute at once: many on one processor must be done by the next fix."""
 GRACE_SHARE = 0.15
 
 
