@@ -55,9 +55,9 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
 
     `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`: infinite for a line that goes both ways
     from its point), `range_m` (None where the scenario gives links or a path loss, and the range says nothing
-    about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is not there
-    yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether they move,
-    and the resolved scenario as TOML.
+    about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is
+    not there yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether
+    they move, and the resolved scenario as TOML.
     """
     start = world.at(0)
     radio = scenario.radio
