@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -11,12 +12,23 @@ from rich.console import Console
 from rich.table import Table
 
 from emulator.terminal import one_line_errors
+from emulator.world.maps.city import SIZE_M, city_roads
 from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import MapReport, examine
 from emulator.world.maps.roads import Roads
 from emulator.world.projection import Frame
+from emulator.world.trips.files import check_trips_name, write_trips
+from emulator.world.trips.generate import generate_motion
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import Array
+
+
+class DriveOn(StrEnum):
+    """The side of the road."""
+
+    RIGHT = "right"
+    LEFT = "left"
+
 
 app = typer.Typer(no_args_is_help=True, help="Look at maps, and convert them.")
 
@@ -55,6 +67,43 @@ def convert(map_file: MapArgument, out: OutArgument, origin: OriginOption = None
         writer_of(out)  # before a large file is read
         write_roads(read_roads(map_file, _pair("--origin", origin)), out)
         print(f"wrote {out}")
+
+
+@app.command()
+def city(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="*.geojson or *.npz.")],
+    seed: Annotated[int, typer.Option(min=0, help="Another seed, another city.")] = 1,
+    size_m: Annotated[
+        float, typer.Option(metavar="METRES", help="From one end to the other, 1000 to 10000.")
+    ] = SIZE_M,
+) -> None:
+    """Generate a city, the one in which vehicles drive with network.kind = "city"."""
+    with one_line_errors():
+        writer_of(out)
+        roads = city_roads(seed, size_m)
+        write_roads(roads, out)
+        print(f"wrote {out}: {float(roads.length_m.sum()) / 1000:.1f} km of road")
+
+
+@app.command()
+def trips(
+    map_file: MapArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="*.csv or *.parquet.")],
+    vehicles: Annotated[int, typer.Option(min=1, max=10_000, help="How many.")] = 50,
+    duration: Annotated[float, typer.Option(min=1, max=86_400, metavar="SECONDS", help="For how long.")] = 300.0,
+    rate_hz: Annotated[float, typer.Option(min=0.1, max=100, metavar="HZ", help="Samples a second.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed, other trips.")] = 1,
+    drive_on: Annotated[DriveOn, typer.Option(help="On which side people drive.")] = DriveOn.RIGHT,
+) -> None:
+    """Generate trips along a map: a file for network.kind = "trips", in the map's metres."""
+    with one_line_errors():
+        check_trips_name(out)
+        periods = round(duration * rate_hz) + 1
+        motion = generate_motion(
+            map_file, read_roads(map_file), vehicles, seed, periods, round(1e9 / rate_hz), drive_on.value
+        )
+        count = write_trips(motion, out, rate_hz)
+        print(f"wrote {out}: {len(motion.node_ids)} vehicles, {count:,} samples")
 
 
 def _pair(option: str, text: str | None) -> tuple[float, float] | None:

@@ -72,9 +72,9 @@ OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field
 class Network(Section):
     """`[network]`: which vehicles there are and where they are, or how they drive."""
 
-    kind: Literal["generated", "file", "trips", "sumo"] = "generated"
-    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive, and
-    `sumo` has SUMO drive."""
+    kind: Literal["generated", "file", "trips", "sumo", "city"] = "generated"
+    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive,
+    `sumo` has SUMO drive, and in a `city`, a generated one or that of `[map]`, `vehicles` drive anywhere."""
     path: Path | None = None
     """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
     CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
@@ -82,8 +82,10 @@ class Network(Section):
     """How many are generated; they are called v01, v02, …"""
     layout: Literal["urban", "dense"] = "urban"
     """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
+    size_m: float = Field(3000.0, ge=1000, le=10_000)
+    """How far the generated city reaches from one end to the other."""
     seed: int = Field(1, ge=0, lt=2**63)
-    """Draws the generated network, or SUMO's traffic, and nothing of the run."""
+    """Draws the generated network, the city and its traffic, or SUMO's traffic, and nothing of the run."""
     start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
     """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
     max_vehicles: int | None = Field(None, ge=1, le=10_000)
@@ -100,14 +102,14 @@ class Network(Section):
     @property
     def moves(self) -> bool:
         """Whether vehicles drive, enter and leave."""
-        return self.kind in ("trips", "sumo")
+        return self.kind in ("trips", "sumo", "city")
 
     @model_validator(mode="after")
     def _keys_go_with_their_kind(self) -> Network:
-        if (self.kind != "generated") != (self.path is not None):
+        if (self.kind not in ("generated", "city")) != (self.path is not None):
             raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
         given = [name for name in OF_TRIPS if getattr(self, name) is not None]
-        if given and not self.moves:
+        if given and self.kind not in ("trips", "sumo"):
             raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         return self
 

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from emulator.world.lateral import stray
 from emulator.world.links import load_links
 from emulator.world.maps.around import read_lanes
 from emulator.world.networks import Network, generate_network, load_network
-from emulator.world.trips.drive import drive
+from emulator.world.trips.drive import drive, drive_through_city
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
 from vnet.link.node import Fix
@@ -156,12 +157,7 @@ def _draw_lateral(scenario: Scenario, count: int) -> Array:
         [_stream(scenario.run.seed, "lateral", i).standard_normal(periods) for i in range(count)]
     )
     keep = math.exp(-scenario.period_ns / NS_PER_S / lateral.tau_s)
-    offset = np.empty_like(normal)
-    offset[0] = _reflect(lateral.sigma_m * normal[0], lateral.half_width_m)
-    for k in range(1, periods):
-        step = keep * offset[k - 1] + lateral.sigma_m * math.sqrt(1 - keep**2) * normal[k]
-        offset[k] = _reflect(step, lateral.half_width_m)
-    return offset
+    return stray(normal, lateral.sigma_m, keep, lateral.half_width_m)
 
 
 def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
@@ -177,12 +173,16 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
     return World(scenario, Motion(network.node_ids, position_m, heading_rad), lane_map, np.argsort(order))
 
 
-def _drive_trips(scenario: Scenario) -> World:
-    """A world in which vehicles drive their trips; programs know the roads of `[map]`, if there is one."""
-    motion = drive(scenario.network, periods_of(scenario), scenario.period_ns)
+def _drive(scenario: Scenario) -> World:
+    """A world in which vehicles drive: trips, on the roads of `[map]` if there is one, or through a city."""
+    section, periods = scenario.map, periods_of(scenario)
     lanes: LaneMap | RoadMap = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
-    if scenario.map is not None:
-        lanes = read_lanes(scenario.map, motion.position_m, motion.origin_deg)
+    if scenario.network.kind == "city":
+        motion, lanes = drive_through_city(scenario.network, section, periods, scenario.period_ns)
+    else:
+        motion = drive(scenario.network, periods, scenario.period_ns)
+        if section is not None:
+            lanes = read_lanes(section, motion.position_m, motion.origin_deg)
     return World(scenario, motion, lanes, np.zeros(0, dtype=np.intp))
 
 
@@ -206,7 +206,7 @@ def build_world(scenario: Scenario) -> World:
     """The world of a scenario. Raises ScenarioError if its network or its links cannot be used."""
     network = scenario.network
     if network.moves:
-        return _drive_trips(scenario)
+        return _drive(scenario)
     if network.path is not None:
         return _stand_on_lanes(scenario, load_network(network.path))
     return _stand_on_lanes(scenario, generate_network(network.layout, network.vehicles, network.seed))
@@ -225,12 +225,6 @@ def components(position_m: Array, range_m: float, links: NDArray[np.bool_] | Non
     label = np.full(len(there), -1, dtype=np.intp)
     label[there] = connected_components(linked, directed=False)[1]
     return label
-
-
-def _reflect(offset_m: Array, half_width_m: float) -> Array:
-    """Fold offsets back into ±half_width, as between two mirrors."""
-    folded = np.mod(offset_m + half_width_m, 4 * half_width_m)
-    return np.asarray(np.where(folded > 2 * half_width_m, 4 * half_width_m - folded, folded) - half_width_m)
 
 
 def _stream(seed: int, what: str, vehicle: int) -> np.random.Generator:

@@ -5,14 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from emulator.world.maps.around import lanes_around
+from emulator.world.maps.city import city_roads
+from emulator.world.maps.files import read_roads
 from emulator.world.trips.clean import Rules
 from emulator.world.trips.fcd import drive_sumo, read_fcd
+from emulator.world.trips.generate import generate_motion
 from emulator.world.trips.matrices import read_npz
 from emulator.world.trips.motion import Frame, Motion, motion_of
 from emulator.world.trips.samples import Samples
 from emulator.world.trips.tables import read_csv, read_parquet
 from vnet.errors import ScenarioError
-from vnet.scenario import NS_PER_S, Network
+from vnet.roads.road_map import RoadMap
+from vnet.scenario import NS_PER_S, Map, Network
 from vnet.sumo import read_begin_s
 
 READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
@@ -42,6 +47,24 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
     return replace(motion, origin_deg=samples.origin_deg)
+
+
+def drive_through_city(
+    network: Network, section: Map | None, periods: int, period_ns: int
+) -> tuple[Motion, RoadMap]:
+    """Generated trips through a generated city, or through the map of `section`, and the lanes there are.
+
+    Raises ScenarioError where the map cannot be read, or nobody can drive on it.
+    """
+    if section is None:
+        source: object = "the generated city"
+        roads, drive_on = city_roads(network.seed, network.size_m), "right"
+    else:
+        source, drive_on = section.path, section.drive_on
+        roads = read_roads(section.path, section.origin_deg)
+    motion = generate_motion(source, roads, network.vehicles, network.seed, periods, period_ns, drive_on)
+    lanes = roads.lane_map() if section is None else lanes_around(roads, section, motion.position_m)
+    return motion, lanes
 
 
 def _read(path: Path, window_s: tuple[float, float] | None) -> Samples:

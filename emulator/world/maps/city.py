@@ -1,0 +1,328 @@
+"""A generated city with the character of a middle-sized American town, which Ann Arbor is.
+
+Arterial roads form a grid, slightly turned and bent. Around the middle the squares between them are cut into dense
+blocks, with streets that are one way in pairs, and alleys; further out streets bend until they point anywhere, and
+many end. There are roads that cut across, a river with a road along it, service roads beside the arterials and in
+front of shops, and a motorway around two sides, with ramps.
+
+Streets are drawn on a plan of straight lines, squares and angles, which is then bent as a whole.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.world.maps.roads import Roads, RoadsBuilder
+from emulator.world.maps.streets import Street, add_streets, divided
+from emulator.world.projection import Frame
+from vnet.errors import ScenarioError
+from vnet.roads.lanes import Array
+
+SIZE_M = 3000.0
+SMALLEST_M, LARGEST_M = 1000.0, 10_000.0
+ORIGIN_DEG = (42.0, -40.0)
+"""In the Atlantic, where no town is."""
+
+_MARGIN = 1.1
+"""What is turned and bent takes more room."""
+_ARTERIAL_M = (420.0, 640.0)
+_CORE = 0.22
+"""The dense core's radius, as a part of the city's size."""
+_BLOCK_M, _CORE_BLOCK_M = 125.0, 95.0
+_MOTORWAY_ASIDE_M = 11.0
+_NEAR_MOTORWAY_M = 115.0
+_RAMP_M, _RAMP_ASIDE_M = 290.0, 62.0
+_BEND_STEP_M = 11.0
+
+
+def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:
+    """The roads of a generated city, about `size_m` across; the same arguments give the same city.
+
+    Raises ScenarioError unless `size_m` is from `SMALLEST_M` to `LARGEST_M`.
+    """
+    if not SMALLEST_M <= size_m <= LARGEST_M:
+        raise ScenarioError(f"size_m = {size_m:g}: {SMALLEST_M:g} to {LARGEST_M:g} allowed")
+    rng = np.random.default_rng((seed, 0))
+    city = _City(rng, size_m / _MARGIN)
+    builder = RoadsBuilder(f"city of seed {seed}")
+    add_streets(builder, city.streets(), _Bend(rng, size_m))
+    return builder.build(builder.places(), Frame.around(*ORIGIN_DEG))
+
+
+class _Bend:
+    """Turns the plan a little, and bends it in long waves."""
+
+    def __init__(self, rng: np.random.Generator, size_m: float) -> None:
+        self._turn_rad = math.radians(rng.uniform(4, 14)) * rng.choice([-1, 1])
+        self._wave_m = rng.uniform(0.7, 1.2, 2) * max(size_m, 2000.0)
+        self._high_m = rng.uniform(0.025, 0.04, 2) * self._wave_m
+        self._phase = rng.uniform(0, 2 * math.pi, 2)
+
+    def __call__(self, plan_m: Array) -> Array:
+        waves = self._high_m * np.sin(2 * math.pi * plan_m[:, ::-1] / self._wave_m + self._phase)
+        cosine, sine = math.cos(self._turn_rad), math.sin(self._turn_rad)
+        return np.asarray((plan_m + waves) @ np.array([[cosine, sine], [-sine, cosine]]))
+
+
+class _City:
+    """Draws the streets on the plan, a square with its middle at 0, 0."""
+
+    def __init__(self, rng: np.random.Generator, size_m: float) -> None:
+        self._rng = rng
+        self._half_m = size_m / 2
+        self._core_m = max(_CORE * size_m, 300.0)
+        self._lines = tuple(self._arterial_lines() for _ in range(2))
+        self._river = rng.uniform(0.5, 0.62) * self._half_m, rng.uniform(0, 2 * math.pi, 2)
+        self._motorway_m = self._motorway_line()
+        self._shops: list[tuple[Array, Array]] = []
+
+    def streets(self) -> list[Street]:
+        """All streets of the city."""
+        return [
+            *self._arterials(),
+            *self._diagonals(),
+            *self._river_road(),
+            *self._motorway(),
+            *self._services(),
+            *self._cells(),
+        ]
+
+    # The large lines.
+
+    def _arterial_lines(self) -> Array:
+        """Where arterials cross one axis: in the middle, and outwards at irregular distances."""
+        last_m = self._half_m - 330.0
+        lines = [0.0]
+        for side in (-1, 1):
+            at_m = 0.0
+            while (at_m := at_m + self._rng.uniform(*_ARTERIAL_M)) < last_m:
+                lines.append(side * at_m)
+        return np.array(sorted(lines))
+
+    def _arterials(self) -> list[Street]:
+        streets = []
+        for axis, lines in enumerate(self._lines):
+            middle = int(np.argmin(np.abs(lines)))
+            for number, at_m in enumerate(lines.tolist()):
+                line = np.full((2, 2), at_m)
+                line[:, 1 - axis] = -self._half_m, self._half_m
+                far = abs(number - middle)
+                kind = "primary" if not far else "secondary" if far % 2 == 0 or len(lines) < 4 else "tertiary"
+                streets.append(Street(f"{'Avenue' if axis else 'Road'} {number + 1}", kind, divided(line)))
+        return streets
+
+    def _diagonals(self) -> list[Street]:
+        """Roads from near the core outwards, across the grid."""
+        streets = []
+        quadrants = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+        for number, way in enumerate(quadrants[self._rng.permutation(4)[:2]].tolist()):
+            start = np.array([self._next_line(axis, way[axis]) for axis in range(2)])
+            aim = (
+                np.array(way)
+                * self._half_m
+                * np.array([self._rng.uniform(0.75, 0.95), self._rng.uniform(0.55, 0.8)])
+            )
+            aside = np.array([aim[1] - start[1], start[0] - aim[0]]) * self._rng.uniform(-0.12, 0.12)
+            part = np.linspace(0, 1, 60)[:, None]
+            line = (1 - part) * start + part * aim + 4 * part * (1 - part) * aside
+            streets.append(Street(f"Cross Road {number + 1}", "secondary", divided(line)))
+        return streets
+
+    def _next_line(self, axis: int, side: int) -> float:
+        """The first arterial off the middle on one side, or the plan's edge."""
+        beyond = [at_m for at_m in self._lines[axis].tolist() if at_m * side > 1]
+        return min(beyond, key=abs) if beyond else side * 0.5 * self._half_m
+
+    def _river_m(self, east_m: Array) -> Array:
+        """How far north the river is."""
+        at_m, (early, late) = self._river
+        return np.asarray(at_m + 90 * np.sin(east_m / 330 + early) + 45 * np.sin(east_m / 130 + late))
+
+    def _river_road(self) -> list[Street]:
+        east_m = np.arange(-self._half_m, self._half_m, _BEND_STEP_M)
+        line = np.column_stack([east_m, self._river_m(east_m) - 75])
+        return [Street("River Road", "tertiary", line[~self._near_motorway(line)])]
+
+    def _motorway_line(self) -> Array:
+        """From the north edge down the east side, around the corner, and along the south side."""
+        side_m, radius_m = self._half_m - 155.0, 0.35 * self._half_m
+        turn = np.radians(np.linspace(0, -90, 40))[:, None]
+        corner = np.array([side_m - radius_m, radius_m - side_m])
+        arc = corner + radius_m * np.hstack([np.cos(turn), np.sin(turn)])
+        line = np.vstack([[[side_m, 1.1 * self._half_m]], arc, [[-1.1 * self._half_m, -side_m]]])
+        return divided(line, 10.0)
+
+    def _near_motorway(self, points_m: Array, near_m: float = _NEAR_MOTORWAY_M) -> NDArray[np.bool_]:
+        """Which points (n, 2) are near the motorway, (n,)."""
+        offset = points_m[:, None] - self._motorway_m[None, ::4]
+        return np.asarray(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < near_m)
+
+    def _motorway(self) -> list[Street]:
+        """Both carriageways, and ramps to a road on the east side and one on the south side."""
+        line = self._motorway_m
+        along = np.gradient(line, axis=0)
+        along /= np.hypot(*along.T)[:, None]
+        right = np.column_stack([along[:, 1], -along[:, 0]])
+        crossings = [self._crossing(line, 1, 0), self._crossing(line, 0, len(line))]
+        streets = []
+        for side, name in ((1, "west"), (-1, "east")):
+            place = line + side * _MOTORWAY_ASIDE_M * right
+            steps = round(_RAMP_M / 10.0)
+            joints = []
+            for number, at in enumerate(crossings):
+                leave, join = at - side * steps, at + side * steps
+                joints += [leave, join]
+                foot = line[at] + side * _RAMP_ASIDE_M * right[at]
+                ahead = side * along[at]
+                ramps = ((place[leave], foot, "off"), (foot, place[join], "on"))
+                for start, end, what in ramps:
+                    curve = _curve(start, start + 130 * ahead, end - 130 * ahead, end, 30)
+                    joint = 0 if what == "off" else len(curve) - 1
+                    label = f"Motorway {name}, ramp {what} {number + 1}"
+                    streets.append(Street(label, "motorway_link", curve, True, joints=(joint,)))
+            order = slice(None, None, side)
+            numbers = tuple(n if side > 0 else len(line) - 1 - n for n in joints)
+            streets.append(Street(f"Motorway {name}", "motorway", place[order], True, True, numbers))
+        return streets
+
+    def _crossing(self, line: Array, axis: int, after: int) -> int:
+        """The point of the motorway at which the middle arterial goes across, which lies on `axis` = 0."""
+        away = np.abs(line[:, axis])
+        half = len(line) // 2
+        return int(np.argmin(away[:half])) if not after else half + int(np.argmin(away[half:]))
+
+    # The streets between.
+
+    def _services(self) -> list[Street]:
+        """Roads beside arterials, and the lanes of car parks in front of shops."""
+        streets: list[Street] = []
+        for axis, lines in enumerate(self._lines):
+            across = self._lines[1 - axis]
+            for at_m in lines[np.abs(lines) > 1].tolist():
+                for low_m, high_m in zip(across[:-1].tolist(), across[1:].tolist(), strict=True):
+                    if self._rng.random() < 0.4:
+                        streets += self._frontage(axis, at_m, low_m, high_m)
+        return streets
+
+    def _frontage(self, axis: int, at_m: float, low_m: float, high_m: float) -> list[Street]:
+        """A road beside the arterial at `at_m`; behind it, it may be, the rows of a car park."""
+        inwards = -math.copysign(1, at_m)
+        start_m, end_m = low_m + 70, low_m + self._rng.uniform(0.5, 0.8) * (high_m - low_m)
+        rows = int(self._rng.integers(3, 6)) if self._rng.random() < 0.5 else 1
+        depth_m = [at_m + inwards * (27 + 24 * row) for row in range(rows)]
+        if rows > 1:
+            end_m = start_m + self._rng.uniform(110, 170)
+        lines = [[(depth, start_m), (depth, end_m)] for depth in depth_m]
+        lines += [[(at_m, along), (depth_m[-1], along)] for along in (start_m, end_m)]
+        plan = [np.array(line)[:, :: -1 if axis else 1] for line in lines]
+        corners = np.vstack(plan)
+        if self._in_park(corners).any() or self._near_motorway(corners).any():
+            return []
+        self._shops.append((corners.min(axis=0) - 12, corners.max(axis=0) + 12))
+        return [Street("Service Road", "service", divided(line)) for line in plan]
+
+    def _in_park(self, points_m: Array) -> Array:
+        """Which points (n, 2) lie by the river, where nobody builds, (n,)."""
+        north_m = points_m[:, 1] - self._river_m(points_m[:, 0])
+        return np.asarray((north_m > -105) & (north_m < 55))
+
+    def _is_free(self, line: Array) -> bool:
+        """Whether a street may be here."""
+        if self._in_park(line).any() or self._near_motorway(line).any():
+            return False
+        return not any(((line > low) & (line < high)).all(axis=1).any() for low, high in self._shops)
+
+    def _cells(self) -> list[Street]:
+        """The streets in all squares between arterials."""
+        edges = [np.concatenate([[-self._half_m], lines, [self._half_m]]) for lines in self._lines]
+        streets = []
+        for column in range(len(edges[0]) - 1):
+            for row in range(len(edges[1]) - 1):
+                low = np.array([edges[0][column], edges[1][row]])
+                high = np.array([edges[0][column + 1], edges[1][row + 1]])
+                near = np.hypot(*((low + high) / 2)) < self._core_m
+                cell = _Cell(self._rng, low, high, bool(near))
+                streets += [street for street in cell.streets() if self._is_free(street.points_m)]
+        return streets
+
+
+class _Cell:
+    """The streets in one square between arterials: a lattice, which outside the core is bent and has gaps."""
+
+    def __init__(self, rng: np.random.Generator, low_m: Array, high_m: Array, core: bool) -> None:
+        self._rng, self._low_m, self._high_m, self._core = rng, low_m, high_m, core
+        block_m = _CORE_BLOCK_M if core else _BLOCK_M * rng.uniform(0.8, 1.25)
+        self._count = np.maximum(1, np.round((high_m - low_m) / block_m)).astype(int)
+        self._turn_rad = 0.0 if core else rng.uniform(0.5, 1.5) * rng.choice([-1, 1])
+        self._shift_m = np.zeros(2) if core else rng.uniform(-30, 30, 2)
+        self._name = f"{'Core' if core else 'Quarter'} {low_m[0] / 100:.0f}/{low_m[1] / 100:.0f}"
+
+    def streets(self) -> list[Street]:
+        """The streets of the cell; arterials at its edges are not among them."""
+        found = []
+        for axis in range(2):
+            for line in range(1, int(self._count[axis])):
+                one_way = self._direction(axis, line)
+                for step in range(int(self._count[1 - axis])):
+                    edge = step in (0, self._count[1 - axis] - 1)
+                    if self._core or self._rng.random() < (0.45 if edge else 0.8):
+                        found.append(self._street(axis, line, step, one_way))
+        if self._core:
+            found += self._alleys()
+        return found
+
+    def _direction(self, axis: int, line: int) -> int:
+        """1 or -1 where a street of the core is one way, else 0: those next to the middle arterials, in pairs."""
+        if not self._core:
+            return 0
+        after = abs(self._low_m[axis]) < 1 and line == 1
+        before = abs(self._high_m[axis]) < 1 and line == self._count[axis] - 1
+        return (1 if after else -1 if before else 0) * (1 if axis == 0 else -1)
+
+    def _street(self, axis: int, line: float, step: float, one_way: int) -> Street:
+        """The street of the lattice on `line` of `axis`, from `step` to the next."""
+        points = 2 if self._core else 13
+        lattice = np.full((points, 2), float(line))
+        lattice[:, 1 - axis] = np.linspace(step, step + 1, points)
+        plan = self._bent(lattice / self._count)
+        if one_way < 0:
+            plan = plan[::-1]
+        name = f"{self._name} {'Street' if axis == 0 else 'Place'} {line:g}"
+        if one_way:
+            return Street(name, "secondary", divided(plan), True)
+        wide = self._core and line % 2 == 0
+        return Street(name, "tertiary" if wide else "residential", divided(plan))
+
+    def _alleys(self) -> list[Street]:
+        """Service streets in the middle of some blocks."""
+        alleys = []
+        for line in range(int(self._count[0])):
+            for step in range(int(self._count[1])):
+                if self._rng.random() < 0.25:
+                    alley = self._street(0, line + 0.5, step, 0)
+                    alleys.append(Street(alley.name, "service", alley.points_m))
+        return alleys
+
+    def _bent(self, part: Array) -> Array:
+        """Where points (n, 2) of the lattice, from 0 to 1, are: turned about the middle, most where furthest in."""
+        weight = np.sin(np.pi * part).prod(axis=1)
+        size_m = self._high_m - self._low_m
+        from_middle = (part - 0.5) * size_m
+        turn_rad = self._turn_rad * weight
+        cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+        turned = np.column_stack(
+            [
+                cosine * from_middle[:, 0] - sine * from_middle[:, 1],
+                sine * from_middle[:, 0] + cosine * from_middle[:, 1],
+            ]
+        )
+        return np.asarray((self._low_m + self._high_m) / 2 + turned + weight[:, None] * self._shift_m)
+
+
+def _curve(start: Array, one: Array, other: Array, end: Array, count: int) -> Array:
+    """A cubic Bézier curve (count, 2)."""
+    t = np.linspace(0, 1, count)[:, None]
+    return np.asarray((1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * one + 3 * t**2 * (1 - t) * other + t**3 * end)

@@ -1,0 +1,47 @@
+"""Trips as files that `[network] kind = "trips"` reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+from emulator.world.trips.motion import Motion
+from vnet.errors import ScenarioError
+
+ENDINGS = (".csv", ".parquet")
+
+
+def check_trips_name(path: Path) -> None:
+    """Raises ScenarioError unless a file of this name can be written."""
+    if path.suffix.lower() not in ENDINGS:
+        raise ScenarioError(f"{path}: trips are written as {' or '.join('*' + ending for ending in ENDINGS)}")
+
+
+def write_trips(motion: Motion, path: Path, rate_hz: float) -> int:
+    """Write where each vehicle is while it is there, in metres, vehicle by vehicle; returns how many samples.
+
+    Raises ScenarioError.
+    """
+    vehicle, period = np.nonzero(np.isfinite(motion.position_m[..., 0]).T)
+    position_m = motion.position_m[period, vehicle]
+    table = pa.table(
+        {
+            "id": pa.array(motion.node_ids).take(pa.array(vehicle)),
+            "time_s": period / rate_hz,
+            "x_m": np.round(position_m[:, 0], 3),
+            "y_m": np.round(position_m[:, 1], 3),
+            "heading_rad": np.round(motion.heading_rad[period, vehicle], 5),
+        }
+    )
+    try:
+        if path.suffix.lower() == ".csv":
+            pyarrow.csv.write_csv(table, path)
+        else:
+            pq.write_table(table, path)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be written: {error.strerror or error}") from None
+    return len(table)
