@@ -95,7 +95,9 @@ def test_every_event_is_there() -> None:
 
 
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
-    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 3}})
+    scenario = Scenario.model_validate(
+        {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "radio": {"range_m": 1e5, "mac": {}}}
+    )
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
     conclude(emulation, simulate(emulation)[0], "simulate")
     left = {path.name + "/" * path.is_dir() for path in (tmp_path / "run").iterdir()}
@@ -103,7 +105,7 @@ def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
     verdict = json.loads((tmp_path / "run" / "verdict.json").read_text())
     assert verdict.keys() == files.VERDICT.keys()
     assert verdict["frames_by_outcome"].keys() == {outcome.name for outcome in Outcome} - {"pending"}
-    for name, said in (("trace", files.TRACE), ("states", files.STATE)):
+    for name, said in (("trace", files.TRACE), ("states", files.STATE), ("busy", files.BUSY)):
         assert pq.read_schema(tmp_path / "run" / f"{name}.parquet").names == list(said)
 
 
