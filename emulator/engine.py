@@ -140,6 +140,7 @@ class Engine:
             if not self._senders.misbehave:
                 self._hand_over(time_ns, node, Outgoing(payload, seq))
                 continue
+            self._settle()  # copies that arrive of frames sent before are numbered before new ones are sent
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
                 self._hand_over(time_ns, node, outgoing)
 
