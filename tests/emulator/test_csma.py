@@ -318,6 +318,25 @@ def test_a_full_queue_and_oversize_are_as_without_a_medium() -> None:
     assert [row["on_air_ns"] is None for row in rows(subject)] == [True, False, False, True, True]
 
 
+def test_a_throttled_sender_has_no_longer_a_queue_than_others() -> None:
+    """Six want more than twice what the medium has room for; v0's frames come to it slowly, but not too slowly."""
+    subject = engine(line(*range(0, 60, 10)), mac={}, path_loss={"kind": "free_space"}, queue_frames=4)
+    slow = Throttle(kind="throttle", bitrate_mbps=5.0, **VILLAIN)  # 2.24 ms a frame
+    subject.set_faults([planned(0, slow, (0, 10**10), 6, 0)], 0)
+    for number in range(200):
+        for node in range(6):
+            subject.transmit(number * 5 * MS + node * 300 * US, node, [bytes(1400)])
+    subject.drain()
+    trace = subject.trace.rows(slice(None))
+    mine = trace[(trace["sender"] == 0) & (trace["receiver"] == 1)]
+    full = mine["outcome"] == Outcome.queue_full
+    assert 80 < full.sum() < 180
+    sent, waits = mine[~full]["sent_ns"], mine[~full]["on_air_ns"]
+    waiting = [np.count_nonzero((sent <= time_ns) & (waits > time_ns)) for time_ns in sent]
+    assert max(waiting) == 4 + 1, "and one that is still on its way to the queue"
+    assert np.all(mine[full]["left_ns"] >= mine[full]["sent_ns"])
+
+
 @settings(max_examples=30, deadline=None)
 @given(seeds, crowds, options)
 def test_every_pair_has_one_outcome_and_the_cause_is_exact(
