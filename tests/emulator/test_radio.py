@@ -11,13 +11,24 @@ from scipy import stats
 from scipy.integrate import quad
 
 from emulator.channel.congestion import SLICE_NS, WINDOW_NS, Ear, LimericGate, ReactiveGate
-from emulator.channel.dot11p import airtime_ns, arrival_probability, cost
+from emulator.channel.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.channel.outcomes import Outcome
 from emulator.channel.propagation import QUANTILES, Nakagami, ShadowField, loss_db
 from emulator.channel.reach import distances_m
+from emulator.channel.signals import reception_draws
 from emulator.engine import Engine
 from vnet.errors import ScenarioError
-from vnet.radio import DualSlope, EtsiReactive, Fading, FreeSpace, Limeric, LogDistance, Shadowing, TwoRay
+from vnet.radio import (
+    RATES_MBPS,
+    DualSlope,
+    EtsiReactive,
+    Fading,
+    FreeSpace,
+    Limeric,
+    LogDistance,
+    Shadowing,
+    TwoRay,
+)
 from vnet.scenario import Radio, Scenario, dump_scenario, load_scenario
 
 MS = 1_000_000
@@ -203,6 +214,25 @@ def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, hal
 def test_costs_add_up_however_time_is_cut(pieces: list[int], snr: float, rate: float) -> None:
     one = cost(np.array([snr]), rate)
     assert (one * np.array(pieces)[:, None]).sum() == (one * sum(pieces)).sum()
+
+
+@pytest.mark.parametrize("rate", RATES_MBPS)
+def test_even_the_longest_frame_without_any_signal_has_a_cost_that_can_be_told(rate: float) -> None:
+    """Else it would come round and be less than nothing: a frame that is destroyed would arrive."""
+    longest = max(bound.le for bound in Radio.model_fields["max_payload_bytes"].metadata if hasattr(bound, "le"))
+    worst = int(cost(np.zeros(1), rate)[0])
+    assert worst * airtime_ns(longest, rate) < 2**63
+    assert worst * 1000 / COST_STEPS > -math.log(reception_draws(np.zeros(1, np.uint64))[0]), "a microsecond"
+
+
+def test_the_longest_frames_destroy_each_other_between_hidden_terminals() -> None:
+    radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 3.0, "max_payload_bytes": 65_000}
+    subject = engine(line(0, 450, 900), **radio)
+    subject.transmit(0, 0, [bytes(65_000)])
+    subject.transmit(50_000, 2, [bytes(65_000)])
+    subject.drain()
+    outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist() if row["receiver"] == "v1"]
+    assert outcomes == ["collided", "collided"]
 
 
 # The chain without a medium.
