@@ -260,6 +260,16 @@ def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: Evidence) -
     assert found(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
 
 
+def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:
+    """Carrier sense above all that anybody sends with: Aloha."""
+    evidence = run(tmp_path / "run", mac={"carrier_sense_dbm": 40.0})
+    judgement = judge(evidence)
+    assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
+    airtime_ns = np.bincount(evidence.sender, evidence.airtime_ns * (evidence.on_air_ns >= 0), minlength=12)
+    assert airtime_ns.min() > 0
+    assert evidence.busy_ratio.sum(axis=0).min() > 0
+
+
 def test_frames_held_back_too_briefly_are_seen(tmp_path: Path) -> None:
     pauses = {"kind": "etsi", "pause_ms": (250, 250, 250, 250, 250)}
     held = run(tmp_path / "run", mac={}, congestion=pauses)
