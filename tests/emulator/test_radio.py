@@ -180,7 +180,7 @@ def nist_qpsk_half(snr: float, bits: int) -> float:
 @pytest.mark.parametrize("snr_db", [2, 4, 5, 5.5, 6, 6.5, 7, 8, 9, 12])
 def test_arrival_is_the_nist_models(snr_db: float) -> None:
     snr = 10 ** (snr_db / 10)
-    found = arrival_probability(np.array([snr]), 300, 6.0)[0]
+    found = arrival_probability(np.array([snr]), airtime_ns(300, 6.0), 6.0)[0]
     assert found == pytest.approx(nist_qpsk_half(snr, 51 * 48), abs=1e-6)
 
 
@@ -200,7 +200,7 @@ def test_arrival_is_the_nist_models(snr_db: float) -> None:
 def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, half_db: float) -> None:
     """The ratios at which half of all frames of 300 bytes arrive, as the error model of ns-3 3.37 gives them."""
     snr = 10 ** (np.arange(-5, 35, 0.01) / 10)
-    arrives = arrival_probability(snr, 300, rate)
+    arrives = arrival_probability(snr, airtime_ns(300, rate), rate)
     assert np.all(np.diff(arrives) >= 0)
     assert arrives[0] == 0
     assert arrives[-1] == 1
