@@ -273,7 +273,8 @@ def trace_of(count: int) -> Trace:
 
 
 @pytest.mark.parametrize(
-    "which", [slice(None), slice(3, 9), slice(8, 2, -2), slice(-4, None), np.array([7, 1, 1, 11]), np.array([], int)]
+    "which",
+    [slice(None), slice(3, 9), slice(8, 2, -2), slice(-4, None), np.array([7, 1, 1, 11]), np.array([], int)],
 )
 def test_what_arrives_with_other_bytes_has_another_digest_whichever_rows_are_asked_for(
     which: slice | np.ndarray,

@@ -1,6 +1,7 @@
 """The stages of a physical radio one by one, against formulas and figures from elsewhere."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,16 @@ from scipy.integrate import quad
 from emulator.channel.congestion import SLICE_NS, WINDOW_NS, Ear, LimericGate, ReactiveGate
 from emulator.channel.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.channel.outcomes import Outcome
-from emulator.channel.propagation import QUANTILES, Nakagami, ShadowField, loss_db
-from emulator.channel.reach import distances_m
+from emulator.channel.propagation import QUANTILES, MeanPower, Nakagami, ShadowField, loss_db
+from emulator.channel.reach import distances_m, reach_of
 from emulator.channel.signals import reception_draws
+from emulator.channel.topology import Topology
 from emulator.engine import Engine
+from emulator.observe.run_folder import RunFolder
+from emulator.run.emulation import Emulation
+from emulator.run.simulate import simulate
+from emulator.world.world import build_world
+from tests.emulator.motion import along, scenario_of_trips, write_trips
 from vnet.errors import ScenarioError
 from vnet.radio import (
     RATES_MBPS,
@@ -233,6 +240,53 @@ def test_the_longest_frames_destroy_each_other_between_hidden_terminals() -> Non
     subject.drain()
     outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist() if row["receiver"] == "v1"]
     assert outcomes == ["collided", "collided"]
+
+
+class Counted:
+    """How often mean powers have been worked out."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.times = 0
+        dbm = MeanPower.dbm
+
+        def counted(power: MeanPower, position_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+            self.times += 1
+            return dbm(power, position_m, distance_m)
+
+        monkeypatch.setattr(MeanPower, "dbm", counted)
+
+
+@pytest.mark.parametrize(
+    "radio",
+    [{"path_loss": {"kind": "log_distance"}, "shadowing": {}}, {"range_m": 900.0, "mac": {}}, {"range_m": 900.0}],
+    ids=["path loss", "disc with a medium", "disc"],
+)
+def test_who_is_in_range_is_told_by_the_powers_where_there_are_any(
+    radio: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Radio.model_validate(radio)
+    reach, nakagami = reach_of(model, 1, None), Nakagami(None) if model.is_physical else None
+    counted = Counted(monkeypatch)
+    first_m, then_m = np.random.default_rng(2).uniform(0, 4000, (2, 30, 2))
+    then_m[7] = np.nan
+    topology = Topology(first_m, reach, 1000, nakagami)
+    topology.move(then_m)
+    assert counted.times == (2 if "path_loss" in radio else 0), "once for each set of positions"
+    in_range = reach.in_range(then_m, distances_m(then_m))
+    assert np.array_equal(topology.now.in_range, in_range)
+    assert in_range.any() and not in_range[7].any() and not in_range[:, 7].any()
+
+
+def test_where_vehicles_drive_powers_are_worked_out_once_a_period(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_trips(tmp_path / "trips.csv", {f"c{n}": [(0.0, 3.0, along(60.0 * n, 20.0 * n))] for n in range(4)})
+    scenario = scenario_of_trips(path, 2.0, radio={"path_loss": {"kind": "log_distance"}, "mac": {}})
+    counted = Counted(monkeypatch)
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    assert len(emulation.engine.trace) > 50
+    assert counted.times == 2 * 5, "two seconds, five periods each"
 
 
 # The chain without a medium.
