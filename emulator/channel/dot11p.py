@@ -47,8 +47,8 @@ _EVENTS: dict[tuple[int, int], tuple[int, int, tuple[float, ...]]] = {
 COST_STEPS = 1 << 40
 """Costs are whole numbers of 2⁻⁴⁰ nepers, so that a sum does not depend on how the time was cut."""
 DEAD_PER_NS = 0.04
-"""A microsecond at this cost, in nepers a nanosecond, is the end of any frame; and the longest frame's time at it is
-still less than 2⁶³ steps."""
+"""A microsecond at this cost, in nepers a nanosecond, is the end of any frame; and the longest frame's time at it
+is still less than 2⁶³ steps."""
 
 
 @lru_cache(maxsize=4096)

@@ -27,9 +27,8 @@ Listener = Callable[[int, NDArray[np.int64]], None]
 class Medium:
     """Frames on air between `count` vehicles.
 
-    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, and where somebody sends; or None if
-    nothing is on air;
-    `idle_ns` (N,) is when it last was no longer so.
+    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, and where somebody sends, or None
+    if nothing is on air; `idle_ns` (N,) is when it last was no longer so.
     """
 
     def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
