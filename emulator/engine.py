@@ -112,6 +112,11 @@ class Engine:
         """Move the vehicles: (N, 2) in metres. Frames handed over before keep what they met."""
         self._topology.move(position_m)
 
+    @property
+    def in_range(self) -> NDArray[np.bool_]:
+        """(N, N), rows are senders: who is in range of whom, where the vehicles are now."""
+        return self._topology.now.in_range
+
     def set_up(self, node: int, up: bool) -> None:
         """A node that is down sends nothing, and what arrives at it is `receiver_down`."""
         self._topology.set_up(node, up)
@@ -140,6 +145,7 @@ class Engine:
             if not self._senders.misbehave:
                 self._hand_over(time_ns, node, Outgoing(payload, seq))
                 continue
+            self._settle()  # copies that arrive of frames sent before are numbered before new ones are sent
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
                 self._hand_over(time_ns, node, outgoing)
 

@@ -131,7 +131,7 @@ class Csma:
                 self._leave(frame, Outcome.queue_full, frame.sent_ns)
             else:
                 self._plan(slow_ns, SLOWLY_READY, station, frame)
-        elif station.coming + len(station.queue) >= self._limit:
+        elif self._is_full(station):
             self._leave(frame, Outcome.queue_full, frame.sent_ns)
         else:
             station.ready_ns = max(ready_ns, station.ready_ns)
@@ -140,6 +140,9 @@ class Csma:
             else:
                 station.coming += 1
                 self._plan(station.ready_ns, READY, station, frame)
+
+    def _is_full(self, station: _Station) -> bool:
+        return station.coming + len(station.queue) >= self._limit
 
     def _is_quiet(self, time_ns: int) -> bool:
         """Whether nothing else has to happen before a frame is ready at this instant.
@@ -185,6 +188,9 @@ class Csma:
         elif kind == END:
             assert frame is not None
             self._end(station, frame, now_ns)
+        elif kind == SLOWLY_READY and self._is_full(station):
+            assert frame is not None
+            self._leave(frame, Outcome.queue_full, now_ns)
         else:
             station.coming -= kind == READY and frame is not None
             self._ready(station, frame, now_ns)

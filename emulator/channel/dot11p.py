@@ -46,8 +46,9 @@ _EVENTS: dict[tuple[int, int], tuple[int, int, tuple[float, ...]]] = {
 
 COST_STEPS = 1 << 40
 """Costs are whole numbers of 2⁻⁴⁰ nepers, so that a sum does not depend on how the time was cut."""
-DEAD_PER_NS = 0.05
-"""A microsecond at this cost, in nepers a nanosecond, is the end of any frame."""
+DEAD_PER_NS = 0.04
+"""A microsecond at this cost, in nepers a nanosecond, is the end of any frame; and the longest frame's time at it
+is still less than 2⁶³ steps."""
 
 
 @lru_cache(maxsize=4096)
@@ -108,7 +109,7 @@ def _raw_error_rate(snr: Array, bits: int) -> Array:
     return np.asarray((side - 1) / (side * bits / 2) * erfc(np.sqrt(snr * 3 / (2 * (side**2 - 1)))))
 
 
-def arrival_probability(snr: Array, size_bytes: int, bitrate_mbps: float) -> Array:
-    """The probability that a frame arrives that was detected, without interference."""
-    payload_ns = airtime_ns(size_bytes, bitrate_mbps) - PREAMBLE_NS
+def arrival_probability(snr: Array, on_air_ns: int, bitrate_mbps: float) -> Array:
+    """The probability that a frame arrives that was detected and is on air so long, without interference."""
+    payload_ns = on_air_ns - PREAMBLE_NS
     return np.asarray(np.exp(-cost(snr, bitrate_mbps) * (payload_ns / COST_STEPS)))

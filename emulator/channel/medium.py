@@ -27,8 +27,8 @@ Listener = Callable[[int, NDArray[np.int64]], None]
 class Medium:
     """Frames on air between `count` vehicles.
 
-    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, or None if nothing is on air;
-    `idle_ns` (N,) is when it last was no longer so.
+    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, and where somebody sends, or None
+    if nothing is on air; `idle_ns` (N,) is when it last was no longer so.
     """
 
     def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
@@ -116,6 +116,7 @@ class Medium:
 
     def _sense(self, total_mw: Array, time_ns: int) -> None:
         sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
+        sensed[[frame.sender for frame in self._frames]] = True  # however deaf they are
         if before is None:
             self._busy_since_ns = time_ns
         else:

@@ -43,10 +43,13 @@ class Topology:
     def move(self, position_m: Array) -> None:
         """Take new positions."""
         distance_m = distances_m(position_m)
-        in_range = self._reach.in_range(position_m, distance_m)
         power_mw = fading = None
-        if self._nakagami is not None:
+        if self._nakagami is None:
+            in_range = self._reach.in_range(position_m, distance_m)
+        else:
             power_mw = self._reach.power_mw(position_m, distance_m)
+            in_range = power_mw > 0  # to work the powers out takes longer than all else here: once is enough
+            np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
         self.now = Surroundings(distance_m, in_range, in_range, power_mw, fading)
         self._rank()

@@ -88,8 +88,11 @@ def measure(variant: Variant, size_bytes: int, peers: int, seconds: float, seed:
     time_ns = np.arange(periods)[:, None] * PERIOD_NS + draws.integers(0, PERIOD_NS, (periods, count))
     order = np.argsort(time_ns, axis=None, kind="stable")
     payload = [bytes(size_bytes)]
-    for at_ns, sender in zip(time_ns.ravel()[order].tolist(), (order % count).tolist(), strict=True):
-        engine.transmit(at_ns, sender, payload)
+    by_period = np.split(order, np.arange(1, periods) * count)
+    for period, some in enumerate(by_period):
+        engine.advance(period * PERIOD_NS)  # frames are kept until they have arrived
+        for at_ns, sender in zip(time_ns.ravel()[some].tolist(), (some % count).tolist(), strict=True):
+            engine.transmit(at_ns, sender, payload)
     engine.drain()
     return _point(engine, variant, size_bytes, peers, east_m, periods * PERIOD_NS)
 

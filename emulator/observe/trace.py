@@ -38,7 +38,14 @@ _FRAME = np.dtype(
     ]
 )
 _PAIR = np.dtype(
-    [("frame", "<i4"), ("receiver", "<i4"), ("outcome", "u1"), ("cause", "<i2"), ("arrival_ns", "<i8")]
+    [
+        ("frame", "<i4"),
+        ("receiver", "<i4"),
+        ("outcome", "u1"),
+        ("altered", "?"),
+        ("cause", "<i2"),
+        ("arrival_ns", "<i8"),
+    ]
 )
 ROW = np.dtype(
     [
@@ -135,6 +142,7 @@ class Trace:
 
     def alter(self, row: int, payload_digest: int) -> None:
         """What arrives by this row has other bytes than its frame."""
+        self._pairs.records["altered"][row] = True
         self._altered[row] = payload_digest
 
     def column(self, name: str) -> NDArray[Any]:
@@ -158,10 +166,9 @@ class Trace:
         rows = np.zeros(len(pairs), ROW)
         for name in ROW.fields or ():
             rows[name] = pairs[name] if name in (_PAIR.fields or ()) else frames[name]
-        if self._altered:
-            number = np.arange(self._pairs.count)[which]
-            for place in np.flatnonzero(np.isin(number, list(self._altered))).tolist():
-                rows["payload_digest"][place] = self._altered[int(number[place])]
+        number = range(self._pairs.count)[which] if isinstance(which, slice) else which
+        for place in np.flatnonzero(pairs["altered"]).tolist():
+            rows["payload_digest"][place] = self._altered[int(number[place])]
         return rows
 
     def to_table(self) -> pa.Table:

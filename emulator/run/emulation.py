@@ -67,6 +67,8 @@ class Emulation:
         self.world = world
         self.folder = folder
         self._reach = reach_of(scenario.radio, scenario.run.seed, world.links)
+        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
+        self._placed = 0  # the period in which vehicles are where the engine has them
         self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
         self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
@@ -78,8 +80,6 @@ class Emulation:
         self._acting: set[str] = set()
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
-        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
-        self._placed = 0
         self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
         self.up = dict.fromkeys(world.node_ids, True)
@@ -98,6 +98,8 @@ class Emulation:
         return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
 
     def _in_range(self, period: int) -> NDArray[np.bool_]:
+        if period == self._placed:
+            return self.engine.in_range
         position_m = self.world.position_m(period)
         return self._reach.in_range(position_m, distances_m(position_m))
 

@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from emulator.channel.csma import Csma
 from emulator.observe.checks import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
 from emulator.observe.run_folder import RunFolder, read_events
 from emulator.observe.trace import read_trace
@@ -260,6 +261,16 @@ def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: Evidence) -
     assert found(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
 
 
+def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:
+    """Carrier sense above all that anybody sends with: Aloha."""
+    evidence = run(tmp_path / "run", mac={"carrier_sense_dbm": 40.0})
+    judgement = judge(evidence)
+    assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
+    airtime_ns = np.bincount(evidence.sender, evidence.airtime_ns * (evidence.on_air_ns >= 0), minlength=12)
+    assert airtime_ns.min() > 0
+    assert evidence.busy_ratio.sum(axis=0).min() > 0
+
+
 def test_frames_held_back_too_briefly_are_seen(tmp_path: Path) -> None:
     pauses = {"kind": "etsi", "pause_ms": (250, 250, 250, 250, 250)}
     held = run(tmp_path / "run", mac={}, congestion=pauses)
@@ -324,6 +335,14 @@ def test_a_fault_acts_on_a_shared_medium_as_it_says(tmp_path: Path, fault: dict[
     assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
     bit = next(check for check in judgement.checks if check.name == f"bit:{fault['kind']}-0")
     assert bit.figures["count"] > 0
+
+
+def test_a_throttle_that_does_nothing_did_not_bite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that wait as long for their jitter are none that it slowed."""
+    monkeypatch.setattr(Csma, "throttle", lambda *_: None)
+    throttle = {"kind": "throttle", "at_s": 0.9, "duration_s": 1.2, "nodes": {"ids": ["v01", "v02"]}}
+    evidence = run(tmp_path / "run", [{**throttle, "bitrate_mbps": 3.0}], fading={}, mac={}, access_jitter_ms=60.0)
+    assert verdict(evidence, "bit:throttle-0") is Verdict.UNKNOWN
 
 
 def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> None:

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from emulator.channel.dot11p import AIFSN_AND_CW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.channel.outcomes import Outcome
 from emulator.engine import Engine
+from emulator.faults.plan import PlannedFault
+from vnet.faults import DataReplay, DoS, Duplicate, Fault, StaleMessages, Throttle
 from vnet.scenario import Radio
 
 MS = 1_000_000
@@ -21,6 +23,8 @@ PHYSICAL = {"path_loss": {"kind": "log_distance"}, "fading": {}, "mac": {}}
 seeds = st.integers(0, 2**63 - 1)
 Send = tuple[int, int, int]
 """When, who, how many bytes."""
+Span = tuple[int, int]
+"""From when until when."""
 
 
 def engine(position_m: np.ndarray, seed: int = 1, **radio: Any) -> Engine:
@@ -40,15 +44,20 @@ def rows(of: Engine) -> list[dict[str, Any]]:
     return of.trace.to_table().to_pylist()
 
 
-def run(subject: Engine, sends: list[Send], stops: Sequence[int] | None = None) -> list[tuple[int, int, bytes]]:
+def run(
+    subject: Engine, sends: list[Send], stops: Sequence[int] | None = None, plan: Sequence[PlannedFault] = ()
+) -> list[tuple[int, int, bytes]]:
     """Let all happen, with a look at every one of `stops` and whenever something is sent, or none at all.
 
     Returns what was delivered.
     """
     heard = []
-    for time_ns in sorted({time for time, _, _ in sends} | set(stops or ())):
+    changes_ns = {time_ns for planned in plan for time_ns in (planned.start_ns, planned.end_ns)}
+    for time_ns in sorted({time for time, _, _ in sends} | set(stops or ()) | changes_ns):
         if stops is not None:
             heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(time_ns)]
+        if time_ns in changes_ns:
+            subject.set_faults([planned for planned in plan if planned.acts_at(time_ns)], time_ns)
         for _, node, size in [send for send in sends if send[0] == time_ns]:
             subject.transmit(time_ns, node, [bytes([node]) * size])
     heard += [(d.packet.received_ns, d.receiver, d.packet.payload) for d in subject.advance(10**10)]
@@ -85,6 +94,48 @@ def test_however_time_is_cut_the_same_happens(
     assert run(one, sends) == run(other, sends, stops)
     assert one.trace.sha256() == other.trace.sha256()
     assert one.counts == other.counts
+
+
+def planned(number: int, fault: Fault, span: Span, count: int, *nodes: int) -> PlannedFault:
+    """A fault of these nodes, or of all links if there are none."""
+    of, links = np.isin(np.arange(count), nodes), None if nodes else np.ones((count, count), dtype=bool)
+    return PlannedFault(number, fault, span[0], span[1], of, links)
+
+
+ACT: dict[str, Any] = {"at_s": 0.0, "duration_s": 1.0}
+VILLAIN: dict[str, Any] = {**ACT, "nodes": {"ids": ["v0"]}}
+spans = st.tuples(st.integers(0, 4 * MS), st.integers(1, 4 * MS)).map(lambda span: (span[0], sum(span)))
+villains = st.sampled_from(
+    [
+        DataReplay(kind="DataReplay", age_s=0.001, **VILLAIN),
+        StaleMessages(kind="StaleMessages", age_s=0.001, **VILLAIN),
+        DoS(kind="DoS", factor=3, **VILLAIN),
+    ]
+)
+QUIET: dict[str, Any] = {"access_jitter_ms": 0.0, "loss": 0.0, "queue_frames": 64, "delivery_tick_us": 0}
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=20), villains, spans, spans)
+@example(
+    seed=1,
+    sends=[(0, 0, 300), (2 * MS, 0, 100)],
+    radio=QUIET,
+    stops=[1_500_000],
+    fault=DataReplay(kind="DataReplay", age_s=0.001, **VILLAIN),
+    span=(0, 9 * MS),
+    twice=(0, 300_000),
+).via("duplicates end while a frame is on air, and then it is replayed")
+def test_however_time_is_cut_copies_have_the_same_numbers(
+    seed: int, sends: list[Send], radio: dict[str, Any], stops: list[int], fault: Fault, span: Span, twice: Span
+) -> None:
+    """While a sender misbehaves, and for another time all frames arrive twice."""
+    position_m = scattered(6, seed, side_m=600.0)
+    duplicate = Duplicate(kind="duplicate", probability=0.8, delay_ms=2.0, **ACT)
+    plan = [planned(0, duplicate, twice, 6), planned(1, fault, span, 6, 0, 1)]
+    one, other = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
+    assert run(one, sends, plan=plan) == run(other, sends, stops, plan)
+    assert rows(one) == rows(other)
 
 
 @settings(max_examples=40, deadline=None)
@@ -267,18 +318,37 @@ def test_a_full_queue_and_oversize_are_as_without_a_medium() -> None:
     assert [row["on_air_ns"] is None for row in rows(subject)] == [True, False, False, True, True]
 
 
+def test_a_throttled_sender_has_no_longer_a_queue_than_others() -> None:
+    """Six want more than twice what the medium has room for; v0's frames come to it slowly, but not too slowly."""
+    subject = engine(line(*range(0, 60, 10)), mac={}, path_loss={"kind": "free_space"}, queue_frames=4)
+    slow = Throttle(kind="throttle", bitrate_mbps=5.0, **VILLAIN)  # 2.24 ms a frame
+    subject.set_faults([planned(0, slow, (0, 10**10), 6, 0)], 0)
+    for number in range(200):
+        for node in range(6):
+            subject.transmit(number * 5 * MS + node * 300 * US, node, [bytes(1400)])
+    subject.drain()
+    trace = subject.trace.rows(slice(None))
+    mine = trace[(trace["sender"] == 0) & (trace["receiver"] == 1)]
+    full = mine["outcome"] == Outcome.queue_full
+    assert 80 < full.sum() < 180
+    sent, waits = mine[~full]["sent_ns"], mine[~full]["on_air_ns"]
+    waiting = [np.count_nonzero((sent <= time_ns) & (waits > time_ns)) for time_ns in sent]
+    assert max(waiting) == 4 + 1, "and one that is still on its way to the queue"
+    assert np.all(mine[full]["left_ns"] >= mine[full]["sent_ns"])
+
+
 @settings(max_examples=30, deadline=None)
 @given(seeds, crowds, options)
-def test_every_pair_has_one_outcome_and_the_cause_is_exact(
+def test_every_pair_has_one_outcome_and_what_collided_met_a_frame_in_its_receivers_range(
     seed: int, sends: list[Send], radio: dict[str, Any]
 ) -> None:
-    """What collided had an overlapping frame; and what arrives in the crowd arrives if its sender is alone."""
-    position_m = scattered(6, seed)
+    """Another's that overlapped it, or its receiver's own."""
+    position_m = scattered(6, seed, side_m=3000.0)
     subject = engine(position_m, seed, **PHYSICAL, **radio)
     run(subject, sends)
     table = rows(subject)
-    keys = [(row["sender"], row["seq"], row["receiver"]) for row in table]
-    assert len(set(keys)) == len(keys)
+    keys = {(row["sender"], row["seq"], row["receiver"]) for row in table}
+    assert len(keys) == len(table)
     assert {o.name: n for o, n in subject.counts.items() if n and o is not Outcome.out_of_range} == Counter(
         row["outcome"] for row in table
     )
@@ -290,7 +360,11 @@ def test_every_pair_has_one_outcome_and_the_cause_is_exact(
     for row in table:
         if row["outcome"] == "collided":
             mine = on_air[row["sender"], row["seq"]]
-            others = [times for key, times in on_air.items() if key != (row["sender"], row["seq"])]
+            others = [
+                times
+                for (sender, seq), times in on_air.items()
+                if sender == row["receiver"] or (sender != row["sender"] and (sender, seq, row["receiver"]) in keys)
+            ]
             assert any(mine[0] < end and start < mine[1] for start, end in others)
 
 

@@ -1,5 +1,6 @@
 """The engine and its channel: one outcome for every pair, and luck that depends only on what it decides."""
 
+import tracemalloc
 from collections import Counter
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.stats import binom
 
 from emulator.channel.outcomes import Outcome
 from emulator.engine import Delivery, Engine
+from emulator.observe.trace import Trace
 from vnet.scenario import Radio
 
 PERIOD_NS = 100_000_000
@@ -254,3 +256,43 @@ def test_the_hash_sees_every_change(change: str) -> None:
 
     assert digest() == digest()
     assert digest() != digest(**{change: {"payload": b"y", "time": 1, "loss": 1.0}[change]})
+
+
+def trace_of(count: int) -> Trace:
+    """Frames of one receiver each, whose digests are their numbers."""
+    trace = Trace(["v0", "v1"])
+    trace.append(
+        {"payload_digest": np.arange(count, dtype=np.uint64), "sent_ns": np.arange(count)},
+        np.ones(count, np.intp),
+        np.ones(count, np.intp),
+        np.full(count, Outcome.delivered, np.uint8),
+        np.zeros(count, np.int16),
+        np.zeros(count, np.int64),
+    )
+    return trace
+
+
+@pytest.mark.parametrize(
+    "which",
+    [slice(None), slice(3, 9), slice(8, 2, -2), slice(-4, None), np.array([7, 1, 1, 11]), np.array([], int)],
+)
+def test_what_arrives_with_other_bytes_has_another_digest_whichever_rows_are_asked_for(
+    which: slice | np.ndarray,
+) -> None:
+    trace = trace_of(12)
+    for row, payload_digest in ((1, 501), (7, 507), (8, 500), (8, 508)):
+        trace.alter(row, payload_digest)
+    expected = np.arange(12)
+    expected[[1, 7, 8]] += 500
+    assert trace.rows(which)["payload_digest"].tolist() == expected[which].tolist()
+
+
+def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of_a_short_one() -> None:
+    """By what is allocated for it: deliveries look a few rows up at each of their instants."""
+    trace = trace_of(100_000)
+    trace.alter(5, 1)
+    tracemalloc.start()
+    trace.rows(np.array([3, 5]))
+    _, most_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most_bytes < 20_000

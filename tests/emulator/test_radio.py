@@ -1,6 +1,7 @@
 """The stages of a physical radio one by one, against formulas and figures from elsewhere."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,30 @@ from scipy import stats
 from scipy.integrate import quad
 
 from emulator.channel.congestion import SLICE_NS, WINDOW_NS, Ear, LimericGate, ReactiveGate
-from emulator.channel.dot11p import airtime_ns, arrival_probability, cost
+from emulator.channel.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.channel.outcomes import Outcome
-from emulator.channel.propagation import QUANTILES, Nakagami, ShadowField, loss_db
-from emulator.channel.reach import distances_m
+from emulator.channel.propagation import QUANTILES, MeanPower, Nakagami, ShadowField, loss_db
+from emulator.channel.reach import distances_m, reach_of
+from emulator.channel.signals import reception_draws
+from emulator.channel.topology import Topology
 from emulator.engine import Engine
+from emulator.observe.run_folder import RunFolder
+from emulator.run.emulation import Emulation
+from emulator.run.simulate import simulate
+from emulator.world.world import build_world
+from tests.emulator.motion import along, scenario_of_trips, write_trips
 from vnet.errors import ScenarioError
-from vnet.radio import DualSlope, EtsiReactive, Fading, FreeSpace, Limeric, LogDistance, Shadowing, TwoRay
+from vnet.radio import (
+    RATES_MBPS,
+    DualSlope,
+    EtsiReactive,
+    Fading,
+    FreeSpace,
+    Limeric,
+    LogDistance,
+    Shadowing,
+    TwoRay,
+)
 from vnet.scenario import Radio, Scenario, dump_scenario, load_scenario
 
 MS = 1_000_000
@@ -169,7 +187,7 @@ def nist_qpsk_half(snr: float, bits: int) -> float:
 @pytest.mark.parametrize("snr_db", [2, 4, 5, 5.5, 6, 6.5, 7, 8, 9, 12])
 def test_arrival_is_the_nist_models(snr_db: float) -> None:
     snr = 10 ** (snr_db / 10)
-    found = arrival_probability(np.array([snr]), 300, 6.0)[0]
+    found = arrival_probability(np.array([snr]), airtime_ns(300, 6.0), 6.0)[0]
     assert found == pytest.approx(nist_qpsk_half(snr, 51 * 48), abs=1e-6)
 
 
@@ -189,7 +207,7 @@ def test_arrival_is_the_nist_models(snr_db: float) -> None:
 def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, half_db: float) -> None:
     """The ratios at which half of all frames of 300 bytes arrive, as the error model of ns-3 3.37 gives them."""
     snr = 10 ** (np.arange(-5, 35, 0.01) / 10)
-    arrives = arrival_probability(snr, 300, rate)
+    arrives = arrival_probability(snr, airtime_ns(300, rate), rate)
     assert np.all(np.diff(arrives) >= 0)
     assert arrives[0] == 0
     assert arrives[-1] == 1
@@ -203,6 +221,72 @@ def test_faster_modes_need_more_and_all_improve_with_the_signal(rate: float, hal
 def test_costs_add_up_however_time_is_cut(pieces: list[int], snr: float, rate: float) -> None:
     one = cost(np.array([snr]), rate)
     assert (one * np.array(pieces)[:, None]).sum() == (one * sum(pieces)).sum()
+
+
+@pytest.mark.parametrize("rate", RATES_MBPS)
+def test_even_the_longest_frame_without_any_signal_has_a_cost_that_can_be_told(rate: float) -> None:
+    """Else it would come round and be less than nothing: a frame that is destroyed would arrive."""
+    longest = max(bound.le for bound in Radio.model_fields["max_payload_bytes"].metadata if hasattr(bound, "le"))
+    worst = int(cost(np.zeros(1), rate)[0])
+    assert worst * airtime_ns(longest, rate) < 2**63
+    assert worst * 1000 / COST_STEPS > -math.log(reception_draws(np.zeros(1, np.uint64))[0]), "a microsecond"
+
+
+def test_the_longest_frames_destroy_each_other_between_hidden_terminals() -> None:
+    radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 3.0, "max_payload_bytes": 65_000}
+    subject = engine(line(0, 450, 900), **radio)
+    subject.transmit(0, 0, [bytes(65_000)])
+    subject.transmit(50_000, 2, [bytes(65_000)])
+    subject.drain()
+    outcomes = [row["outcome"] for row in subject.trace.to_table().to_pylist() if row["receiver"] == "v1"]
+    assert outcomes == ["collided", "collided"]
+
+
+class Counted:
+    """How often mean powers have been worked out."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.times = 0
+        dbm = MeanPower.dbm
+
+        def counted(power: MeanPower, position_m: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+            self.times += 1
+            return dbm(power, position_m, distance_m)
+
+        monkeypatch.setattr(MeanPower, "dbm", counted)
+
+
+@pytest.mark.parametrize(
+    "radio",
+    [{"path_loss": {"kind": "log_distance"}, "shadowing": {}}, {"range_m": 900.0, "mac": {}}, {"range_m": 900.0}],
+    ids=["path loss", "disc with a medium", "disc"],
+)
+def test_who_is_in_range_is_told_by_the_powers_where_there_are_any(
+    radio: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = Radio.model_validate(radio)
+    reach, nakagami = reach_of(model, 1, None), Nakagami(None) if model.is_physical else None
+    counted = Counted(monkeypatch)
+    first_m, then_m = np.random.default_rng(2).uniform(0, 4000, (2, 30, 2))
+    then_m[7] = np.nan
+    topology = Topology(first_m, reach, 1000, nakagami)
+    topology.move(then_m)
+    assert counted.times == (2 if "path_loss" in radio else 0), "once for each set of positions"
+    in_range = reach.in_range(then_m, distances_m(then_m))
+    assert np.array_equal(topology.now.in_range, in_range)
+    assert in_range.any() and not in_range[7].any() and not in_range[:, 7].any()
+
+
+def test_where_vehicles_drive_powers_are_worked_out_once_a_period(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_trips(tmp_path / "trips.csv", {f"c{n}": [(0.0, 3.0, along(60.0 * n, 20.0 * n))] for n in range(4)})
+    scenario = scenario_of_trips(path, 2.0, radio={"path_loss": {"kind": "log_distance"}, "mac": {}})
+    counted = Counted(monkeypatch)
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    assert len(emulation.engine.trace) > 50
+    assert counted.times == 2 * 5, "two seconds, five periods each"
 
 
 # The chain without a medium.

@@ -1,11 +1,14 @@
 """How many peers the air has room for: what is measured, and where loss begins."""
 
+import gc
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from emulator.channel.dot11p import airtime_ns
+from emulator.channel.frames import Frame
+from emulator.engine import Engine
 from emulator.experiments import capacity
 from emulator.experiments.capacity import HOPELESS, RATE_HZ, VARIANTS, Point, measure, onset, reach_m, report
 
@@ -31,6 +34,21 @@ def test_few_in_one_place_hear_all_and_find_the_air_as_busy_as_they_make_it() ->
     point = measure(HERE, 300, 4, seconds=0.5, seed=1)
     assert point.delivered == 1.0
     assert point.busy == pytest.approx(5 * RATE_HZ * airtime_ns(300, 6.0) / 1e9, rel=0.02)
+
+
+def test_frames_that_have_been_sent_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else memory would grow with the length of the run: the engine may keep a hundred, of 250 sent."""
+    kept: list[int] = []
+
+    class Watched(Engine):
+        def drain(self) -> None:
+            gc.collect()
+            kept.append(sum(isinstance(thing, Frame) for thing in gc.get_objects()))
+            super().drain()
+
+    monkeypatch.setattr(capacity, "Engine", Watched)
+    measure(HERE, 300, 4, seconds=2.0, seed=1)
+    assert kept[0] <= 100
 
 
 def test_a_road_has_hidden_terminals_and_a_control_that_gives_way() -> None:

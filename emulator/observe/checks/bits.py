@@ -6,11 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from emulator.channel.csma import times_ns
+from emulator.channel.dot11p import SLOT_NS
 from emulator.faults.plan import PlannedFault
 from emulator.observe.checks.channel import changed_bytes
 from emulator.observe.checks.evidence import Evidence
 from emulator.observe.checks.faults import CUTTING, LOSING, SENDING
-from emulator.observe.checks.latency import bounds
+from emulator.observe.checks.latency import NS_PER_MS, bounds
 from emulator.observe.checks.places import Mask
 from emulator.observe.checks.senders import is_noise
 from emulator.observe.checks.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
@@ -87,14 +89,32 @@ def _delayed(evidence: Evidence, planned: PlannedFault) -> int:
 
 
 def _overflowed(evidence: Evidence, planned: PlannedFault) -> int:
-    """Pairs of frames for which a throttled queue was full, or that came to a shared medium at its pace."""
+    """Pairs of frames for which a throttled queue was full, or that came to a shared medium too late."""
     full = evidence.outcome_is("queue_full")
-    if evidence.shares_air:  # nobody knows how long a frame waits for it; what is throttled waits longer
-        assert isinstance(planned.fault, Throttle)
-        least_ns = evidence.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
-        full |= (evidence.on_air_ns >= 0) & (evidence.on_air_ns - evidence.sent_ns >= least_ns)
+    if evidence.shares_air:
+        full |= _slowed(evidence, planned)
     full &= planned.nodes[evidence.sender]
     return int((full & evidence.acting(planned, evidence.sent_ns)).sum())
+
+
+def _slowed(evidence: Evidence, planned: PlannedFault) -> Mask:
+    """Which frames came to a shared medium later than the longest access delay explains.
+
+    Either by all that the throttle takes; or so long after everybody else that without it they would have been on
+    air by then, if no congestion control held them back.
+    """
+    radio, begin_ns = evidence.scenario.radio, evidence.on_air_ns
+    assert isinstance(planned.fault, Throttle) and radio.mac is not None
+    ready_ns = evidence.sent_ns + radio.access_jitter_ms * NS_PER_MS
+    slow = begin_ns >= ready_ns + evidence.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
+    if radio.congestion is None:
+        on_air = np.flatnonzero(begin_ns >= 0)
+        on_air = on_air[np.argsort(begin_ns[on_air])]
+        silent_ns = np.maximum.accumulate(np.append(0, (begin_ns + evidence.airtime_ns)[on_air]))
+        free_ns = np.maximum(ready_ns, silent_ns[np.searchsorted(begin_ns[on_air], begin_ns)])
+        aifs_ns, window = times_ns(radio.mac)
+        slow |= begin_ns > free_ns + aifs_ns + (window + 2) * SLOT_NS + evidence.guard_ns
+    return np.asarray(slow)
 
 
 def _silenced(evidence: Evidence, planned: PlannedFault) -> int:

@@ -13,7 +13,7 @@ from scipy.special import gammainccinv
 from scipy.stats import chi2
 
 from emulator.channel.csma import times_ns
-from emulator.channel.dot11p import COST_STEPS, DETECTION_NS, PREAMBLE_NS, cost
+from emulator.channel.dot11p import DETECTION_NS, arrival_probability
 from emulator.channel.medium import WINDOW_NS
 from emulator.channel.reception import Threshold, milliwatts
 from emulator.observe.checks.channel import nothing_seen, received_twice
@@ -101,8 +101,7 @@ def _arrives(radio: Radio, m: float, airtime_ns: int, power_db: Array) -> Array:
     threshold = Threshold(radio.receiver or Receiver())
 
     def of(power_mw: Array) -> Array:
-        payload_ns = (airtime_ns - PREAMBLE_NS) / COST_STEPS
-        arrives = np.exp(-cost(power_mw / threshold.noise_mw, radio.bitrate_mbps) * payload_ns)
+        arrives = arrival_probability(power_mw / threshold.noise_mw, airtime_ns, radio.bitrate_mbps)
         return np.asarray(np.where(power_mw >= threshold.alone_mw, arrives, 0.0))
 
     if np.isinf(m):
