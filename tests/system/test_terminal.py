@@ -183,7 +183,7 @@ def test_quiet(vnet: Vnet) -> None:
             ["analyze", "scenarios/quikstart.toml"],
             "scenarios/quikstart.toml: cannot be read: No such file or directory (did you mean quickstart.toml?)",
         ),
-        (["analyze", "scenarios"], "scenarios: cannot be read: Is a directory; in it there are 80211p.toml, beacon.toml"),
+        (["analyze", "scenarios"], "scenarios: cannot be read: Is a directory; in it there are 80211p.toml"),
         (["fault", "inject", "partion"], "fault: kind = 'partion' (did you mean partition?): must be one of Const"),
         (["fault", "inject", "dos"], "fault: kind = 'dos' (did you mean DoS?): must be one of Const"),
         (
