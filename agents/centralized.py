@@ -1,8 +1,9 @@
 """The bound that cooperation is held against: one filter that hears every fix directly (MODEL 5).
 
-Run it where everybody hears everybody: all vehicles broadcast their fixes, the first of those who hear each other
-runs one particle filter over all of them and tells the others what it found, within the same period. Where
-`radio.links` keeps components apart, each has a filter of its own, and the result is the limit of any cooperation.
+Run it where everybody hears everybody: all vehicles broadcast their fixes, and of those who hear each other the one
+that has been there longest runs one particle filter over all of them and tells the others what it found, within the
+same period. The next one filters beside it, and goes on when it leaves. Where `radio.links` keeps components apart,
+each has a filter of its own, and the result is the limit of any cooperation.
 """
 
 from __future__ import annotations
@@ -20,11 +21,14 @@ from vnet.cmm.rbpf import Observation, Rbpf
 NS_PER_S = 1_000_000_000
 COMPUTING_SHARE, REPORTING_SHARE = 0.8, 0.95
 """Shares of the period: when the first vehicle filters and tells, and when all report."""
+FILTERING = 2
+"""So many filter, those who have been there longest: should the first one leave, the next one goes on."""
 
 
 class Sighting(msgspec.Struct, array_like=True, tag=True):
-    """A vehicle's own fix."""
+    """A vehicle's own fix, and since when it has had any."""
 
+    since_ns: int
     time_ns: int
     position_m: tuple[float, float]
     heading_rad: float | None
@@ -47,18 +51,22 @@ async def main(node: Node) -> None:
     """Send fixes, or filter everybody's; report what the filter says."""
     options = Options.parse(node.options)
     rbpf = Rbpf(options.filter_config(), node.map, node.rng)
-    last_ns = -node.period_ns
+    since_ns: int | None = None
     async for fix in node.gnss:
-        x, y = fix.position_m.tolist()
-        await node.radio.broadcast(msgspec.msgpack.encode(Sighting(fix.time_ns, (x, y), fix.heading_rad)))
+        if since_ns is None:
+            since_ns, last_ns = fix.time_ns, fix.time_ns - node.period_ns
+        own = Sighting(since_ns, fix.time_ns, (float(fix.position_m[0]), float(fix.position_m[1])), fix.heading_rad)
+        await node.radio.broadcast(msgspec.msgpack.encode(own))
         await _sleep_until(node, fix.time_ns + round(COMPUTING_SHARE * node.period_ns))
         sightings = _read(node, Sighting, fix.time_ns)
         result = None
-        if all(node.id < other for other in sightings):
+        before = sum((seen.since_ns, other) < (since_ns, node.id) for other, seen in sightings.items())
+        if before < FILTERING:
             rbpf.step((fix.time_ns - last_ns) / NS_PER_S, _observations(node.id, fix, sightings))
             last_ns = fix.time_ns
             if options.roads_apart:
                 rbpf.weigh_roads()
+        if before == 0:
             result = _result(rbpf, fix.time_ns)
             await node.radio.broadcast(msgspec.msgpack.encode(result))
         await _sleep_until(node, fix.time_ns + round(REPORTING_SHARE * node.period_ns))

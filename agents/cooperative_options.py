@@ -124,7 +124,7 @@ class Options:
             ("slots", 1, 1000),
             ("alpha", 0, 1),
             ("self_floor", 0, 1),
-            ("off_road", 0, 0.99),
+            ("off_road", 0.001, 0.99),
             ("ridge_m2", 0, 1e6),
             ("common_sigma_m", 0, COMMON_LIMIT_M),
             ("common_walk_m", 0, COMMON_LIMIT_M),

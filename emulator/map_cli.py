@@ -18,7 +18,7 @@ from emulator.world.maps.problems import MapReport, examine
 from emulator.world.maps.roads import Roads
 from emulator.world.projection import Frame
 from emulator.world.trips.files import check_trips_name, write_trips
-from emulator.world.trips.generate import generate_motion
+from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
 from vnet.errors import ScenarioError
 from vnet.roads.lanes import Array
 
@@ -100,7 +100,13 @@ def trips(
         check_trips_name(out)
         periods = round(duration * rate_hz) + 1
         motion = generate_motion(
-            map_file, read_roads(map_file), vehicles, seed, periods, round(1e9 / rate_hz), drive_on.value
+            map_file,
+            read_roads(map_file),
+            vehicles,
+            seed,
+            periods,
+            round(1e9 / rate_hz),
+            LEFT if drive_on is DriveOn.LEFT else RIGHT,
         )
         count = write_trips(motion, out, rate_hz)
         print(f"wrote {out}: {len(motion.node_ids)} vehicles, {count:,} samples")

@@ -110,6 +110,11 @@ def has_result(cell: Cell, folder: Path) -> bool:
     return _result_path(folder / "cells", cell).exists()
 
 
+def has_states(cell: Cell, folder: Path) -> bool:
+    """Whether a cell has been simulated, and its states kept."""
+    return _states_path(folder / "cells", cell).exists()
+
+
 def write_results(results: Sequence[dict[str, Any]], folder: Path, name: str) -> Path:
     """All cells as one Parquet file."""
     path = folder / f"{name}.parquet"

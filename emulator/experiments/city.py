@@ -15,16 +15,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from pydantic import ValidationError
 
-from emulator.experiments.cells import Cell, has_result, read_series, read_states
+from emulator.experiments.cells import Cell, has_result, has_states, read_series, read_states
 from emulator.experiments.figures import against_time, save, styled
 from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table, mean_and_error
 from emulator.world.world import build_world
-from vnet.errors import VnetError
+from vnet.errors import ScenarioError, VnetError
 from vnet.roads.lanes import Array
 from vnet.scenario import Scenario
+from vnet.sections import first_problem
 
 LOSS = 0.1
 CENTRALIZED_PARTICLES = 2000
@@ -85,10 +87,17 @@ def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_
         "program": {"entry": "agents.cooperative:main", "options": MECHANISMS.get(mechanism, {})},
     }
     if mechanism == "centralized":
-        count = len(build_world(Scenario.model_validate(data)).node_ids)
+        count = len(build_world(_checked(data)).node_ids)
         data["radio"] = everybody(np.ones((count, count)))
         data["program"] = {"entry": "agents.centralized:main", "options": {"particles": CENTRALIZED_PARTICLES}}
-    return Scenario.model_validate(data)
+    return _checked(data)
+
+
+def _checked(data: dict[str, Any]) -> Scenario:
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(first_problem(error, Scenario)) from None
 
 
 def report(results: Sequence[Result], duration_s: float) -> str:
@@ -168,7 +177,7 @@ def draw_against_time(cells: Sequence[Cell], folder: Path) -> Path:
 def draw_errors(cells: Sequence[Cell], folder: Path) -> Path | None:
     """Where positions are wrong, on the map, in the run that was kept; returns the PNG, None without that run."""
     kept = next(cell for cell in cells if cell.keeps_states)
-    if not has_result(kept, folder):
+    if not has_states(kept, folder):
         return None
     lanes = build_world(kept.scenario).lane_map
     start_m, ahead = lanes.point_m, np.column_stack([np.cos(lanes.heading_rad), np.sin(lanes.heading_rad)])

@@ -153,10 +153,12 @@ def city(
         place = study.place(trips, roads, map_sigma, map_aside)
         cells = study.city_cells(place, range(1, seeds + 1), duration)
         results = _run(cells, folder, "city", only, live)
-        print(study.draw_against_time(cells, folder))
-        if picture := study.draw_errors(cells, folder):
-            print(picture)
-        _show(study.report(results, duration), folder / "city.md")
+        if not live:
+            print(study.draw_against_time(cells, folder))
+            if picture := study.draw_errors(cells, folder):
+                print(picture)
+        if only is None:
+            _show(study.report(results, duration), folder / "city.md")
 
 
 @app.command("figures")

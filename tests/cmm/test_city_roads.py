@@ -104,7 +104,11 @@ def drive(
     rbpf = Rbpf(config or RbpfConfig(400, 3.0), roads, np.random.default_rng(seed + 1))
     for k in range(len(courses[0][0])):
         fixes = {
-            f"v{number}": Observation(course[k] + common_m + rng.standard_normal(2), np.eye(2), float(heading[k]))
+            f"v{number}": Observation(
+                course[k] + common_m + rng.standard_normal(2),
+                np.eye(2),
+                None if np.isnan(heading[k]) else float(heading[k]),
+            )
             for number, (course, heading) in enumerate(courses)
         }
         rbpf.step(0.1, fixes)
@@ -180,3 +184,39 @@ def test_vehicles_that_brake_and_turn_stay_inside_the_gate() -> None:
     for name, course in (("v0", stop), ("v1", curve)):
         error = rbpf.position_m(name)[0] - course[-1] - (COMMON_M - rbpf.estimate_m)
         assert np.hypot(*error) < 1.5
+
+
+def test_who_stands_between_two_directions_says_the_same_again_and_no_more() -> None:
+    """Without a heading either lane may be the nearer one: which of them is has nothing to do with a turn."""
+    street = road_map([(-500, -1.75, EAST, 1000), (500, 1.75, np.pi, 1000)])
+    course, _ = straight(-200, 0.0, EAST, 0.0, 60)
+    deviations = []
+    for seconds in (4, 60):
+        place = course[: 10 * seconds]
+        config = RbpfConfig(2000, 3.0, common_tau_s=1e9)
+        rbpf = drive(street, [(place, np.full(len(place), np.nan))], COMMON_M, config=config)
+        deviations.append(float(np.sqrt(rbpf.estimate_covariance_m2[1, 1])))
+    assert deviations[1] > 0.7 * deviations[0]
+
+
+def test_lanes_may_have_any_numbers() -> None:
+    """A part of a map keeps the numbers of the whole."""
+    roads = road_map([(-500, 3.5 * k, EAST, 1000) for k in range(4)])
+    roads.lane[:] = [0, 1, 4, 5]
+    row, lane = CityRoads(roads, 0.05).seek(np.full((2, 2), 5.0), np.full(2, EAST), np.full(2, 25.0))
+    assert row.tolist() == [0] * 4 + [1] * 4
+    assert sorted(lane.tolist()) == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+def test_hypotheses_of_others_pay_for_a_road_that_was_left_as_ones_own_do() -> None:
+    """Else, while a vehicle turns and is on no lane, every neighbour's cloud would outweigh one's own."""
+    course, heading = straight(-200, 0.0, EAST, 12.0, 10)
+    rbpf = drive(CROSSING, [(course, heading)], COMMON_M)
+    turning = Observation(course[-1] + [1.2, 0.0] + COMMON_M, np.eye(2), float(np.pi / 4))
+    for _ in range(4):
+        rbpf.step(0.1, {"v0": turning})
+    assert not len(rbpf._lane), "no lane points north-east"
+    own = rbpf.own_log_road[0]
+    assert own @ rbpf.weight < -0.05
+    _, _, log_road = rbpf.supply(rbpf.sample(200))
+    assert log_road[0].mean() == pytest.approx(own @ rbpf.weight, abs=0.3)

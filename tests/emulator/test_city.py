@@ -17,7 +17,7 @@ from emulator.run.simulate import simulate
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.roads import Roads
-from emulator.world.trips.generate import LATERAL_MPS2, generate_motion
+from emulator.world.trips.generate import LATERAL_MPS2, LEFT, Side, generate_motion
 from emulator.world.trips.motion import Motion
 from emulator.world.trips.routes import Network
 from emulator.world.world import build_world
@@ -104,6 +104,27 @@ def test_some_enter_late_and_some_leave_early_and_some_stand(city: Roads) -> Non
     step_m = np.hypot(*np.diff(motion.position_m, axis=0).transpose(2, 0, 1))
     assert np.nanmean(step_m < 0.01) > 0.05
     assert ((there[1:] & ~there[:-1]).sum(axis=0) + there[0] == 1).all(), "each is there once, without a gap"
+
+
+@pytest.mark.parametrize(("side", "right_m"), [(Side(1.0, 1.5), 3.25), (LEFT, -1.75)])
+def test_people_drive_on_their_side_of_the_road_and_park_there(tmp_path: Path, side: Side, right_m: float) -> None:
+    """Also aside, if the map says so: programs are told of lanes that lie there."""
+    roads = write_graph(tmp_path / "r.npz", [(0, 0), (3000, 0)], [(0, 1), (1, 0)])
+    motion = generate_motion("a road", roads, 40, 1, 300, PERIOD_NS, side)
+    step_m = np.diff(motion.position_m, axis=0)
+    drives = np.hypot(step_m[..., 0], step_m[..., 1]) > 0.5
+    right = np.where(step_m[..., 0] > 0, -1, 1) * motion.position_m[:-1, :, 1]
+    assert np.median(right[drives]) == pytest.approx(right_m, abs=0.3)
+    heading = motion.heading_rad
+    beside = -motion.position_m[..., 1] * np.sign(np.cos(heading))
+    parked = np.abs(motion.position_m[..., 1]) > 6
+    assert parked.any(), "some come from a parking lot"
+    assert (np.abs(beside[parked]) > 6).all()
+
+
+def test_where_nobody_drives_it_is_said(city: Roads) -> None:
+    with pytest.raises(ScenarioError, match="the city: nobody drives there within 0 s"):
+        drives(city, vehicles=3, periods=1)
 
 
 def write_graph(path: Path, node_m: list[tuple[float, float]], edges: list[tuple[int, int]]) -> Roads:

@@ -94,6 +94,27 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
     assert lost > 2 * found
 
 
+def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
+    """The next one has been filtering beside it, and goes on; who comes later does not take over."""
+    courses = {
+        "a": [(3.0, 12.0, along(-150, 12, -RIGHT_M))],
+        "b": [(0, 8.0, along(150, -11, RIGHT_M))],
+        "c": [(0, 12.0, north(-150, 12, RIGHT_M))],
+        "d": [(0, 12.0, north(150, -13, -RIGHT_M))],
+    }
+    trips = write_trips(tmp_path / "trips.csv", courses)
+    section = {"path": str(write_cross(tmp_path / "cross.geojson")), "origin_deg": list(ORIGIN_DEG)}
+    scenario = scenario_of_trips(trips, 11.8, "agents.centralized:main", radio={"loss": 0.0})
+    scenario = Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    error = [row.common_error_rmse_m for row in emulation.metrics.rows]
+    left = 41  # the period after the one in which b leaves
+    assert error[left - 3] is not None and error[left - 3] < 1.5
+    after = [value for value in error[left : left + 10] if value is not None]
+    assert len(after) == 10 and max(after) < 1.5, "it does not begin anew from three metres"
+
+
 def test_a_map_of_somewhere_else_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match=r"cross\.geojson: most of what vehicles drive is over 100 m") as error:
         build_world(driving(tmp_path, origin_deg=[42.9, -83.0]))

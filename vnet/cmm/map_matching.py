@@ -191,12 +191,13 @@ class CityRoads:
     def __init__(self, roads: RoadMap, off_road: float) -> None:
         self.heading_rad = roads.heading_rad
         self._roads = roads
+        self._lanes = int(roads.lane.max(initial=0)) + 1
         self._off_road = off_road / (1 - off_road) / OFF_ROAD_WITHIN_M
 
     def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
         """See `Matcher`; of each lane only its nearest segment, as if it went on."""
         row, segment, _ = self._roads.near(position_m, heading_rad, gate_m)
-        number = row * len(self._roads) + self._roads.lane[segment]
+        number = row * self._lanes + self._roads.lane[segment]
         _, first = np.unique(number, return_index=True)  # the nearest: they come by row, and then by distance
         first.sort()
         row, segment = row[first], segment[first]

@@ -102,7 +102,7 @@ class Rbpf:
         self._age_s = np.empty(0)  # how far each vehicle's filter is behind
         self._unseen_s = np.empty(0)
         self._unlooked_s = np.empty(0)  # since a road was looked at for its sake; inf for never
-        self._heading_rad = np.empty(0)  # as each vehicle's latest fix says; NaN if it does not
+        self._heading_rad = np.empty(0)  # as each vehicle's latest fix that bore one says; else NaN
         self._anchor_m = np.empty((0, 2))  # where its lateral offset was new evidence the last time, and on a lane
         self._anchor_rad = np.empty(0)  # of which heading
         self._lane_vehicle = np.empty(0, dtype=np.intp)  # one entry a (vehicle, candidate lane)
@@ -250,8 +250,10 @@ class Rbpf:
         gate_m = 3 * float(np.sqrt(np.trace(self.estimate_covariance_m2) + np.trace(observation.covariance_m2)))
         heading = observation.heading_rad
         heading_rad = np.array([np.nan if heading is None else heading])
-        _, lanes = self._roads.seek(expected_m[None], heading_rad, np.array([gate_m]))
-        if heading is None and len(lanes) and not self._roads.drives:
+        lanes = np.empty(0, dtype=np.intp)  # of those who drive they are sought at each look
+        if not self._roads.drives:
+            _, lanes = self._roads.seek(expected_m[None], heading_rad, np.array([gate_m]))
+        if heading is None and len(lanes):
             heading = float(self._roads.heading_rad[lanes[0]])
         row = len(self.vehicles)
         self.vehicles.append(name)
@@ -326,8 +328,12 @@ class Rbpf:
         rows, middle_m = rows[some], middle_m[some]
         along_rad = self._roads.heading_rad[lane[first]]
         driven_m = np.hypot(*(middle_m - self._anchor_m[rows]).T)
-        # NaN, so true, where it is seen for the first time.
-        turned = ~(np.cos(along_rad - self._anchor_rad[rows]) > np.cos(TURN_RAD))
+        alike = np.cos(along_rad - self._anchor_rad[rows])
+        alike = np.where(np.isnan(self._heading_rad[rows]), np.abs(alike), alike)  # on the same road, either way
+        turned = ~(alike > np.cos(TURN_RAD))  # NaN, so true, where it is seen for the first time
+        sure = ~(turned & (driven_m <= STAND_M))  # who stands has not turned: another lane seems nearer for once
+        rows, some, middle_m, along_rad = rows[sure], some[sure], middle_m[sure], along_rad[sure]
+        driven_m, turned = driven_m[sure], turned[sure]
         new = np.where(driven_m > STAND_M, driven_m / self.config.lateral_m, 0.0)
         new[turned] = 1.0
         anew = rows[new > 0]
@@ -450,10 +456,14 @@ class Rbpf:
         count = len(common_m)
         partner = self._rng.permutation(systematic(self.weight, count, self._rng))
         by_m = common_m.T - self.common_m[:, partner]
-        mean_slope, past_slope, _ = self.slopes()
+        mean_slope, past_slope, road_slope = self.slopes()
         mean = self.mean.take(partner, axis=-1) + mean_slope @ by_m
         past = self._past_m.take(partner, axis=-1) + past_slope @ by_m
-        return mean, past, self.log_road(mean, self.covariance)
+        log_road = self.log_road(mean, self.covariance)
+        bare = np.bincount(self._lane_vehicle, minlength=len(self.vehicles)) == 0
+        if bare.any():  # on no lane just now: what the last one said still counts
+            log_road[bare] = self._log_road[bare][:, partner] + road_slope[bare] @ by_m
+        return mean, past, log_road
 
     def slopes(self) -> tuple[Array, Array, Array]:
         """Regression on c, Cov(·, c) Cov(c)⁻¹: of the means (M, 4, 2), of the past (L, 2, 2), of log_road (M, 2).

@@ -10,7 +10,7 @@ from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.trips.clean import Rules
 from emulator.world.trips.fcd import drive_sumo, read_fcd
-from emulator.world.trips.generate import generate_motion
+from emulator.world.trips.generate import RIGHT, Side, generate_motion
 from emulator.world.trips.matrices import read_npz
 from emulator.world.trips.motion import Frame, Motion, motion_of
 from emulator.world.trips.samples import Samples
@@ -58,11 +58,11 @@ def drive_through_city(
     """
     if section is None:
         source: object = "the generated city"
-        roads, drive_on = city_roads(network.seed, network.size_m), "right"
+        roads, side = city_roads(network.seed, network.size_m), RIGHT
     else:
-        source, drive_on = section.path, section.drive_on
+        source, side = section.path, Side(1.0 if section.drive_on == "right" else -1.0, section.aside_m)
         roads = read_roads(section.path, section.origin_deg)
-    motion = generate_motion(source, roads, network.vehicles, network.seed, periods, period_ns, drive_on)
+    motion = generate_motion(source, roads, network.vehicles, network.seed, periods, period_ns, side)
     lanes = roads.lane_map() if section is None else lanes_around(roads, section, motion.position_m)
     return motion, lanes
 

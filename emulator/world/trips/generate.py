@@ -9,6 +9,7 @@ do not see each other. Some come from a parking lot beside the road, some enter 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,18 +32,31 @@ PARKED, LATE, EARLY = 0.15, 0.2, 0.2
 """Shares of vehicles that come from a parking lot, that enter during the run, and that leave during it."""
 PARKED_ASIDE_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
 STRAY_SIGMA_M, STRAY_TAU_S, NARROWEST_M = 0.3, 20.0, 0.3
+SLOWEST_SHARE, FASTEST_SHARE = 0.85, 1.05
+"""Of what is usual on a road."""
 STEP_M, SMOOTH_STEPS = 1.0, 5
 """A way is followed in steps of this length, over so many of which its last corners are rounded."""
 CORNER_RAD, CORNER_M = 0.35, 8.0
 """What turns by more is a corner, and is cut by an arc from so far before it to so far after it."""
 
 
-def generate_motion(
-    source: object, roads: Roads, vehicles: int, seed: int, periods: int, period_ns: int, drive_on: str = "right"
-) -> Motion:
-    """How `vehicles` (v01, v02, …) drive through `roads` over so many periods.
+@dataclass(frozen=True)
+class Side:
+    """On which side of a road people drive, and how far right of their lane's middle, in the mean."""
 
-    Raises ScenarioError, naming `source`, if nobody can drive there, or the truth does not fit into memory.
+    sign: float
+    aside_m: float = 0.0
+
+
+RIGHT, LEFT = Side(1.0), Side(-1.0)
+
+
+def generate_motion(
+    source: object, roads: Roads, vehicles: int, seed: int, periods: int, period_ns: int, side: Side = RIGHT
+) -> Motion:
+    """How `vehicles` (v01, v02, …) drive through `roads` over so many periods, on which `side` of them.
+
+    Raises ScenarioError, naming `source`, if nobody drives there, or the truth does not fit into memory.
     """
     if vehicles * periods > MOST_STATES:
         raise ScenarioError(f"{vehicles} vehicles for {periods} periods: at most {MOST_STATES:,} states")
@@ -51,8 +65,10 @@ def generate_motion(
     states = np.full((periods, vehicles, 3), np.nan)
     for number in range(vehicles):
         rng = np.random.default_rng((seed, number))
-        states[:, number] = _Trip(network, rng, float(time_s[-1]), drive_on).at(time_s)
+        states[:, number] = _Trip(network, rng, float(time_s[-1]), side).at(time_s)
     there = np.flatnonzero(np.isfinite(states[: periods - 1, :, 0]).any(axis=0))
+    if not len(there):
+        raise ScenarioError(f"{source}: nobody drives there within {time_s[-1]:g} s: more vehicles, or for longer?")
     width = len(str(vehicles))
     ids = tuple(f"v{number + 1:0{max(2, width)}d}" for number in there.tolist())
     return Motion(ids, states[:, there, :2], states[:, there, 2])
@@ -61,20 +77,20 @@ def generate_motion(
 class _Trip:
     """One vehicle's way: `place_m` (S, 2) every metre, and when it is at each of them, `when_s` (S,)."""
 
-    def __init__(self, network: Network, rng: np.random.Generator, duration_s: float, drive_on: str) -> None:
+    def __init__(self, network: Network, rng: np.random.Generator, duration_s: float, side: Side) -> None:
         self._rng = rng
         parked, late, early = rng.random(3) < (PARKED, LATE, EARLY)
         enters_s = duration_s * rng.uniform(0, 0.5) * late
         stays_s = (duration_s - enters_s) * (rng.uniform(0.4, 0.9) if early else 1.0)
         self._leaves_s = max(enters_s + stays_s, enters_s + SHORTEST_STAY_S) if early else math.inf
-        way = network.route(rng, stays_s)
+        way = network.route(rng, FASTEST_SHARE * stays_s)
         edge = network.edge(way[:-1], way[1:])
-        lane = _Lane(network, edge, int(rng.integers(16)), drive_on)
+        lane = _Lane(network, edge, int(rng.integers(16)), side)
         line_m, speed_m_s, crossing = lane.line(way)
         if parked:
-            line_m, speed_m_s, crossing = _from_parking_lot(rng, line_m, speed_m_s, crossing)
+            line_m, speed_m_s, crossing = _from_parking_lot(rng, line_m, speed_m_s, crossing, side.sign)
         self._room_m = lane.room_m
-        self._follow(line_m, speed_m_s * rng.uniform(0.85, 1.05), crossing, parked, enters_s)
+        self._follow(line_m, speed_m_s * rng.uniform(SLOWEST_SHARE, FASTEST_SHARE), crossing, parked, enters_s)
         self._stray = rng.standard_normal
 
     def _follow(self, line_m: Array, speed_m_s: Array, crossing: Array, parked: bool, enters_s: float) -> None:
@@ -127,7 +143,7 @@ class _Trip:
 class _Lane:
     """The lane of a way: on each street the `number`-th from the right of those in its direction, if there is."""
 
-    def __init__(self, network: Network, edge: Ints, number: int, drive_on: str) -> None:
+    def __init__(self, network: Network, edge: Ints, number: int, side: Side) -> None:
         streets = network.streets
         roads = streets.roads
         self._network, self._node_m = network, roads.node_m
@@ -137,8 +153,7 @@ class _Lane:
         width_m = roads.lane_width_m[road]
         # The right-hand edge of the road is half its width off its line; lanes are counted from there.
         from_right = np.minimum(number % np.maximum(count, 1), count - 1) + 0.5
-        side = 1.0 if drive_on == "right" else -1.0
-        self._aside_m = side * (both / 2 - from_right) * width_m
+        self._aside_m = side.sign * (both / 2 - from_right) * width_m + side.aside_m
         self._speed_m_s = streets.speed_m_s[edge]
         self.room_m = max(float(((width_m - VEHICLE_WIDTH_M) / 2).min()), NARROWEST_M)
 
@@ -179,12 +194,12 @@ def _arc(start: Array, ahead: Array, end: Array, then: Array) -> Array:
 
 
 def _from_parking_lot(
-    rng: np.random.Generator, line_m: Array, speed_m_s: Array, crossing: Array
+    rng: np.random.Generator, line_m: Array, speed_m_s: Array, crossing: Array, sign: float
 ) -> tuple[Array, Array, Array]:
-    """The line, with a way to its start from a place to the right of it."""
+    """The line, with a way to its start from a place beside the road: on the right if `sign` is 1, left if -1."""
     ahead = line_m[1] - line_m[0]
     ahead /= max(float(np.hypot(*ahead)), 1e-6)
-    right = np.array([ahead[1], -ahead[0]])
+    right = sign * np.array([ahead[1], -ahead[0]])
     aside_m = rng.uniform(*PARKED_ASIDE_M)
     lot = line_m[0] + aside_m * right - 10.0 * ahead
     arc = _arc(lot, -right, line_m[0], ahead)
