@@ -28,7 +28,7 @@ from emulator.observe.observation import LATENCY_BIN_NS
 
 WINDOW_S = 5.0
 """Shares, histograms and loads are those of so many last seconds."""
-EVERY_S = 1.0
+EVERY_S = 2.0
 DISTANCE_BINS = 20
 STROKES = 8
 """The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
