@@ -1,6 +1,7 @@
 """Faults of processes: what a vehicle's program meets, simulated and with a loop for each process alike."""
 
 import asyncio
+import gc
 import random
 from typing import Any
 
@@ -109,6 +110,7 @@ def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -
 def both(faults: list[dict[str, Any]], program: str, **sections: Any) -> tuple[Emulation, dict[str, list[Entry]]]:
     """Run simulated and apart, and see that both are the same; returns the simulation and what was noted in it."""
     scenario = scenario_of(faults, program if ":" in program else f"{HERE}:{program}", **sections)
+    gc.collect()  # programs of earlier runs that were killed: their `finally` blocks run when they are cleared away
     diary.clear()
     together = run_together(scenario)
     noted = {node: list(entries) for node, entries in diary.items()}
