@@ -16,6 +16,7 @@ import numpy as np
 
 from agents.admission import Admission
 from agents.cooperative_frame import (
+    NAME_BYTES,
     POSITION_LIMIT_M,
     RELAY_LIMIT,
     RELAYED,
@@ -57,9 +58,10 @@ SUMS_GATE_SIGMAS = 5.0
 CLOUD_REPORT_PARTICLES = 50
 CLOCK_FIXES = 10
 """So many fixes a clock is judged by: after it has jumped ahead it is wrong for so long."""
-SENDING_SHARE, LISTENING_SHARE, REPORTING_SHARE = 0.7, 0.7, 0.97
-"""Shares of the period: within the first every vehicle sends, at the end of the second it computes, or
-`GRACE_SHARE` after the last slot. All compute at once: many on one processor must be done by the next fix."""
+SENDING_SHARE, LISTENING_SHARE, TURNS_SHARE, REPORTING_SHARE = 0.7, 0.7, 0.9, 0.97
+"""Shares of the period: within the first every vehicle sends; from the second, or `GRACE_SHARE` after the last
+slot, until the third they compute in turn. Many on one processor must be done by the next fix, and not keep each
+other from hearing until then."""
 GRACE_SHARE = 0.15
 
 
@@ -275,8 +277,7 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
     periods_a_second = max(1, NS_PER_S // node.period_ns)
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
-    last_slot_share = SENDING_SHARE * (options.slots - 1) / options.slots
-    listening_ns = round(max(LISTENING_SHARE, last_slot_share + GRACE_SHARE) * node.period_ns)
+    listening_ns = round(listening_share(estimator.name, options) * node.period_ns)
     clock = _GnssClock(node)
     async for fix in node.gnss:
         # After standing still a vehicle goes on from the newest fix: nobody wants what it saw meanwhile.
@@ -299,6 +300,14 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
         estimator.agree()
         in_full = (fix.time_ns // node.period_ns) % periods_a_second == 0
         _report(node, estimator, fix, len(packets), len(payload), in_full)
+
+
+def listening_share(name: str, options: Options) -> float:
+    """When in the period a vehicle stops listening and computes; at once with all if it is then to send again."""
+    last_slot_share = SENDING_SHARE * (options.slots - 1) / options.slots
+    first_share = max(LISTENING_SHARE, last_slot_share + GRACE_SHARE)
+    turn = 0.0 if options.two_frames else int(name, 16) / 256**NAME_BYTES
+    return first_share + turn * (TURNS_SHARE - first_share)
 
 
 class _GnssClock:

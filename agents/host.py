@@ -26,6 +26,7 @@ from vnet.errors import LinkError, ProgramError, VnetError
 from vnet.link import keys, wire
 from vnet.link.access import Credentials
 from vnet.link.hosting import Host, Programs, load_programs
+from vnet.link.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
 from vnet.link.session import open_client
 from vnet.link.virtual_time import BendableLoop, SpinError, VirtualTimeLoop
 
@@ -60,8 +61,10 @@ def run_agent(
     Raises LinkError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
     with ExitStack() as stack:
+        set_time_slice(PROMPT_SLICE_NS)  # Zenoh's threads keep it
         session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
         attachment = _Attachment(session, run, nodes, stack)
+        set_time_slice(COMPUTING_SLICE_NS)
         welcomes = attachment.join(join_timeout_s)
         try:
             programs = load_programs(welcomes)

@@ -25,10 +25,11 @@ from emulator.observe.sinks import Sinks
 from vnet.errors import WireError
 from vnet.link import keys, wire
 from vnet.link.access import Credentials
+from vnet.link.scheduling import DEFAULT_SLICE, set_time_slice
 from vnet.link.session import open_client
 
 LEASE_MS = 60_000
-NICE = 10
+NICE = 15
 """So that on a full machine the emulator and the agents come first."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
@@ -81,6 +82,7 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
         inbox.put("found" if sample.kind == zenoh.SampleKind.PUT else "lost")
 
     os.nice(NICE)
+    set_time_slice(DEFAULT_SLICE)  # what started it may have a shorter one
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with (
         contextlib.suppress(KeyboardInterrupt),

@@ -1,7 +1,8 @@
 """Starting agent processes, watching them, and ending every one of them.
 
-Each process gets a log, a session of its own (so that Ctrl-C in the terminal reaches only the emulator), a
-fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor.
+Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
+fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. It stays in the emulator's
+session: Linux shares processors out between sessions first (autogroups, sched(7)), whatever their niceness.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class Launcher:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     pass_fds=[read_end],
-                    start_new_session=True,
+                    process_group=0,
                     env={**os.environ, **environment},
                 )
         except OSError as error:

@@ -35,6 +35,7 @@ from vnet.errors import LinkError, ProgramError, VnetError, WireError
 from vnet.faults import EmulatorRestart, Infrastructure
 from vnet.link import keys, wire
 from vnet.link.access import OBSERVER
+from vnet.link.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
 from vnet.scenario import Scenario
 
 LEASE_MS = 60_000
@@ -50,7 +51,7 @@ FAREWELL_S = 1.0
 RECORDER_WAIT_S = 20.0
 RECORDER = "recorder"
 EMULATOR_PROCESS = "emulator"
-REALTIME_AGENT_NICE = 5
+REALTIME_AGENT_NICE = 10
 SCENE_EVERY_PERIODS = 50
 
 
@@ -108,6 +109,9 @@ async def run_live(
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
         stack.callback(launcher.stop)
+        if emulation.scenario.run.pacing == "realtime":
+            set_time_slice(PROMPT_SLICE_NS)
+            stack.callback(set_time_slice, DEFAULT_SLICE)
         async with _interruptible():
             if options.router is not None:
                 options.router.start(launcher)

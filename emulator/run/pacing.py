@@ -7,7 +7,7 @@ by calling; so both give the same trace. Real time runs the same engine on a clo
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
@@ -18,7 +18,7 @@ from vnet.errors import VnetError
 from vnet.link import wire
 from vnet.link.node import INBOX_LIMIT, Packet
 
-WORST_PROCESSES = 8
+WORST_PROCESSES, WORST_SECONDS = 8, 20
 """How many are named of those to which deliveries came late."""
 
 
@@ -274,6 +274,7 @@ class RealTime:
         self._frames_seq = dict.fromkeys(self._nodes, 0)
         self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
+        self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
         self._present = {lead for lead, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)}
         self._awaited = set(self._present)
         self._paused: set[str] = set()
@@ -310,7 +311,10 @@ class RealTime:
         self._frames_seq[lead] = message.seq + 1
         self._acknowledge(lead, message)
         if message.lateness is not None:
-            self._lateness[lead, self._emulation.incarnation[lead]] = message.lateness.counts
+            process = lead, self._emulation.incarnation[lead]
+            before = _late(self._lateness.get(process, ()))
+            self._late_in[now_ns // 10**9] += _late(message.lateness.counts) - before
+            self._lateness[process] = message.lateness.counts
         if message.final:
             self._awaited.discard(lead)
         if now_ns < self._emulation.duration_ns:
@@ -425,6 +429,8 @@ class RealTime:
             figures = lateness_figures(counts)
             worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
             figures["worst"] = {f"{lead}.{start}": _late(self._lateness[lead, start]) for lead, start in worst}
+            worst_s = self._late_in.most_common(WORST_SECONDS)
+            figures["worst_s"] = {str(second): count for second, count in worst_s if count}
             self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
 
 

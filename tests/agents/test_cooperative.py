@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative import Estimator
+from agents.cooperative import Estimator, listening_share
 from agents.cooperative_frame import RELAYED, CooperativeFrame, FrameError, decode, encode, room, short_name
 from agents.cooperative_options import Options
 from agents.sightings import CAPACITY, Sightings
@@ -320,3 +320,17 @@ def test_fusion_brings_estimates_closer_than_none() -> None:
         for f in ("optimized", "none")
     )
     assert fused < alone
+
+
+@pytest.mark.parametrize("slots", [1, 2, 7, 1000])
+def test_vehicles_compute_in_turn_after_the_last_slot_and_long_before_the_next_fix(slots: int) -> None:
+    options = Options.parse({"slots": slots})
+    shares = [listening_share(short_name(f"v{number}"), options) for number in range(200)]
+    last_slot_share = 0.7 * (slots - 1) / slots
+    assert max(0.7, last_slot_share + 0.15) <= min(shares) < max(shares) <= 0.9
+    assert np.std(shares) == pytest.approx((max(shares) - min(shares)) / math.sqrt(12), rel=0.15)
+
+
+def test_vehicles_that_send_what_they_have_computed_compute_at_once() -> None:
+    options = Options.parse({"two_frames": True})
+    assert len({listening_share(short_name(f"v{number}"), options) for number in range(20)}) == 1
