@@ -3,7 +3,7 @@
 One particle filter for each connected component of the network, on the same fixes as the vehicles', with the
 constants of the world itself. No cooperation of vehicles that hear only each other can be expected to do better.
 
-A step of it takes milliseconds, so that there are five a second, on the mean of each vehicle's fixes: as errors and
+A step of it takes milliseconds, so that there are two a second, on the mean of each vehicle's fixes: as errors and
 speeds hardly change it says what all of them say.
 """
 
@@ -21,7 +21,7 @@ from vnet.roads.lanes import LaneMap
 from vnet.scenario import Scenario
 
 PARTICLES = 500
-STEP_NS = 200_000_000
+STEP_NS = 500_000_000
 LEAST_LOG_ROAD = -6.0
 """As the vehicles: one whose fixes are false must not outvote all others."""
 

@@ -27,14 +27,18 @@ from emulator.observe.drawing import (
 from emulator.observe.observation import LATENCY_BIN_NS
 
 WINDOW_S = 5.0
-"""Shares, histograms and loads are those of so many last seconds."""
-EVERY_S = 2.0
+"""Shares, histograms and loads are those of so many last seconds, and drawn anew as often."""
 DISTANCE_BINS = 20
 STROKES = 8
 """The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
 LEAST_LATENCY_BINS = 8
 LARGEST_MATRIX = 400
 """Vehicles of which the matrix of links is drawn."""
+
+
+def next_charts_s(time_s: float) -> float:
+    """When charts that are drawn now are drawn anew: soon in the beginning, then as often as there are new ones."""
+    return time_s + min(max(1.0, time_s), WINDOW_S)
 
 
 class Window:
@@ -124,7 +128,7 @@ class RadioScene:
         self._sent.add(period.numbers("sent_bytes").astype(float))
         self._received.add(period.numbers("received_bytes").astype(float))
         if period.time_s >= self._next_s:
-            self._next_s = period.time_s + EVERY_S
+            self._next_s = next_charts_s(period.time_s)
             self._charts(period)
 
     def _stack(self, period: Period) -> None:

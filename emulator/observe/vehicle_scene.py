@@ -23,7 +23,7 @@ from emulator.observe.drawing import (
     link_states,
     outcome_colours,
 )
-from emulator.observe.radio_scene import EVERY_S, WINDOW_S, Window
+from emulator.observe.radio_scene import WINDOW_S, Window, next_charts_s
 
 SLOW_EVERY_S = 1.0
 """How often ellipses and neighbours are drawn."""
@@ -60,7 +60,7 @@ class VehicleScene:
         if weights is not None:
             self._weights = weights.copy()
         if period.time_s >= self._next_s:
-            self._next_s = period.time_s + EVERY_S
+            self._next_s = next_charts_s(period.time_s)
             self._table(period)
 
     def _set_styles(self) -> None:

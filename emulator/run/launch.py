@@ -1,7 +1,7 @@
 """Starting agent processes, watching them, and ending every one of them.
 
 Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
-fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. It stays in the emulator's
+fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents stay in the emulator's
 session: Linux shares processors out between sessions first (autogroups, sched(7)), whatever their niceness.
 """
 
@@ -69,9 +69,17 @@ class Launcher:
             os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
 
     def start(
-        self, name: str, arguments: Sequence[str], credentials: Credentials | None, environment: Mapping[str, str]
+        self,
+        name: str,
+        arguments: Sequence[str],
+        credentials: Credentials | None,
+        environment: Mapping[str, str],
+        own_session: bool = False,
     ) -> None:
-        """Start `python ARGUMENTS`, with `--credentials` if there are any; its output goes to `logs/{name}.log`."""
+        """Start `python ARGUMENTS`, with `--credentials` if there are any; its output goes to `logs/{name}.log`.
+
+        In a session of its own it gets processor time even where the run alone could use all of it.
+        """
         read_end, write_end = os.pipe()
         command = [sys.executable, *arguments]
         if credentials is not None:
@@ -86,7 +94,8 @@ class Launcher:
                     stdout=log,
                     stderr=subprocess.STDOUT,
                     pass_fds=[read_end],
-                    process_group=0,
+                    process_group=None if own_session else 0,
+                    start_new_session=own_session,
                     env={**os.environ, **environment},
                 )
         except OSError as error:

@@ -390,7 +390,8 @@ class LiveRun:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
         arguments += ["--out", str(sinks.save), *sinks.arguments]
         environment = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        self._launcher.start(RECORDER, arguments, self._options.access.credentials(OBSERVER), environment)
+        credentials = self._options.access.credentials(OBSERVER)
+        self._launcher.start(RECORDER, arguments, credentials, environment, own_session=True)
 
     def _recorder_listens(self) -> bool:
         return self._options.record is None or self._link.is_watched("period")

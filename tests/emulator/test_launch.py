@@ -15,3 +15,12 @@ def test_a_process_has_its_own_group_in_the_session_of_who_starts_it(tmp_path: P
     launcher.wait_for("v1", 60.0)
     launcher.stop()
     assert launcher.log_tail("v1").split() == [str(os.getsid(0)), "True"]
+
+
+def test_what_must_not_starve_has_a_session_of_its_own(tmp_path: Path) -> None:
+    launcher = Launcher(tmp_path)
+    launcher.start("recorder", ["-c", SAY], None, {}, own_session=True)
+    pid = launcher.pids["recorder"]
+    launcher.wait_for("recorder", 60.0)
+    launcher.stop()
+    assert launcher.log_tail("recorder").split() == [str(pid), "True"]
