@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import faulthandler
+import fcntl
+import os
 import signal
 import sys
+import termios
 from pathlib import Path
 from typing import Annotated
 
@@ -43,6 +46,7 @@ def agent(
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     faulthandler.register(signal.SIGUSR1)
     _go_on_without_parent()
+    _leave_terminal()
     sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quiet_zenoh()
@@ -67,6 +71,21 @@ def _go_on_without_parent() -> None:
     """
     with contextlib.suppress(OSError, AttributeError):  # Linux only
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
+
+
+def _leave_terminal() -> None:
+    """Have no terminal where the emulator has started this process, in the background of its own.
+
+    A program that asked something there would be stopped for good; so it fails.
+    """
+    if os.getpid() != os.getpgrp() or os.getpid() == os.getsid(0) or os.isatty(0):
+        return
+    with contextlib.suppress(OSError):
+        terminal = os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY)
+        try:
+            fcntl.ioctl(terminal, termios.TIOCNOTTY)
+        finally:
+            os.close(terminal)
 
 
 def main() -> None:

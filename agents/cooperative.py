@@ -63,6 +63,7 @@ SENDING_SHARE, LISTENING_SHARE, TURNS_SHARE, REPORTING_SHARE = 0.7, 0.7, 0.9, 0.
 slot, until the third they compute in turn. Many on one processor must be done by the next fix, and not keep each
 other from hearing until then."""
 GRACE_SHARE = 0.15
+TURNS = 4
 
 
 class Estimator:
@@ -306,7 +307,8 @@ def listening_share(name: str, options: Options) -> float:
     """When in the period a vehicle stops listening and computes; at once with all if it is then to send again."""
     last_slot_share = SENDING_SHARE * (options.slots - 1) / options.slots
     first_share = max(LISTENING_SHARE, last_slot_share + GRACE_SHARE)
-    turn = 0.0 if options.two_frames else int(name, 16) / 256**NAME_BYTES
+    # A few turns and no more: in lockstep those of one turn compute side by side, one turn after the other.
+    turn = 0.0 if options.two_frames else int(name, 16) * TURNS // 256**NAME_BYTES / TURNS
     return first_share + turn * (TURNS_SHARE - first_share)
 
 

@@ -109,8 +109,9 @@ EVENTS = {
     "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
     "late_deliveries": (
         "",
-        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`",
-        "real time: all deliveries, those over 20 ms late, how late they were, and the processes with most of them",
+        "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`, `worst_s`",
+        "real time: all deliveries, those over 20 ms late, how late they were, the processes with most of them, and "
+        "the seconds in which most were told of",
     ),
 }
 VERDICT = {

@@ -30,7 +30,7 @@ from vnet.link.session import open_client
 
 LEASE_MS = 60_000
 NICE = 10
-"""So that on a full machine the emulator and the agents come first."""
+"""Where it shares a session with the run, or sessions do not count, the emulator and the agents come first."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
 

@@ -2,26 +2,29 @@
 
 Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
 fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents stay in the emulator's
-session: Linux shares processors out between sessions first (autogroups, sched(7)), whatever their niceness.
+session: Linux shares processors out between sessions first (autogroups, sched(7), where no CPU cgroup does),
+whatever their niceness.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from vnet.errors import VnetError
 from vnet.link.access import Access, Credentials, node_user
+from vnet.link.scheduling import default_time_slice
 from vnet.link.session import AGENT_RUNTIME
 
 LOG_TAIL_LINES = 12
+LOWEST_PRIORITY = 19
 
 AGENT_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
@@ -66,6 +69,7 @@ class Launcher:
             arguments += ["--node", node]
         self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
         if nice:
+            nice = min(os.getpriority(os.PRIO_PROCESS, 0) + nice, LOWEST_PRIORITY)
             os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
 
     def start(
@@ -78,7 +82,7 @@ class Launcher:
     ) -> None:
         """Start `python ARGUMENTS`, with `--credentials` if there are any; its output goes to `logs/{name}.log`.
 
-        In a session of its own it gets processor time even where the run alone could use all of it.
+        In a session of its own it gets processor time even where the run could use all of it, if autogroups act.
         """
         read_end, write_end = os.pipe()
         command = [sys.executable, *arguments]
@@ -87,7 +91,8 @@ class Launcher:
             command += ["--credentials", f"/dev/fd/{read_end}"]
         os.close(write_end)
         try:
-            with (self._logs / f"{name}.log").open("ab") as log:
+            inherit = nullcontext() if name in self._services else default_time_slice()
+            with (self._logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -167,7 +172,7 @@ class Launcher:
 
     def wait_for(self, name: str, timeout_s: float) -> None:
         """Wait for one process to end by itself."""
-        with contextlib.suppress(KeyError, subprocess.TimeoutExpired):
+        with suppress(KeyError, subprocess.TimeoutExpired):
             self._processes[name].wait(timeout_s)
 
     def stop(self, patience_s: float = 1.0) -> None:

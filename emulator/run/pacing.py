@@ -430,7 +430,7 @@ class RealTime:
             worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
             figures["worst"] = {f"{lead}.{start}": _late(self._lateness[lead, start]) for lead, start in worst}
             worst_s = self._late_in.most_common(WORST_SECONDS)
-            figures["worst_s"] = {str(second): count for second, count in worst_s if count}
+            figures["worst_s"] = {str(second): count for second, count in worst_s if count > 0}
             self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
 
 

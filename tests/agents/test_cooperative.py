@@ -328,7 +328,8 @@ def test_vehicles_compute_in_turn_after_the_last_slot_and_long_before_the_next_f
     shares = [listening_share(short_name(f"v{number}"), options) for number in range(200)]
     last_slot_share = 0.7 * (slots - 1) / slots
     assert max(0.7, last_slot_share + 0.15) <= min(shares) < max(shares) <= 0.9
-    assert np.std(shares) == pytest.approx((max(shares) - min(shares)) / math.sqrt(12), rel=0.15)
+    assert sorted(shares.count(share) for share in set(shares))[0] > 30
+    assert len(set(shares)) == 4
 
 
 def test_vehicles_that_send_what_they_have_computed_compute_at_once() -> None:

@@ -23,8 +23,23 @@ def test_niceness_and_policy_stay(above: int) -> None:
     thread = threading.Thread(target=in_a_thread, args=(seen, nice))
     thread.start()
     thread.join()
-    ordinary = os.sched_getscheduler(0) == os.SCHED_OTHER
-    assert seen == [ordinary, (os.sched_getscheduler(0), nice), ordinary]
+    assert seen[1] == (os.sched_getscheduler(0), nice)
+    assert seen[0] == seen[2], "refused once, refused always"
+
+
+def test_what_is_started_meanwhile_has_the_default() -> None:
+    seen: list[object] = []
+
+    def start() -> None:
+        set_time_slice(PROMPT_SLICE_NS)
+        with scheduling.default_time_slice():
+            seen.append(getattr(scheduling._this_thread, "slice_ns", scheduling.DEFAULT_SLICE))
+        seen.append(getattr(scheduling._this_thread, "slice_ns", PROMPT_SLICE_NS))
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert seen == [scheduling.DEFAULT_SLICE, PROMPT_SLICE_NS]
 
 
 def test_elsewhere_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
