@@ -110,8 +110,8 @@ EVENTS = {
     "late_deliveries": (
         "",
         "`total`, `count`, `p50_ms`, `p99_ms`, `max_ms`, `worst`, `worst_s`",
-        "real time: all deliveries, those over 20 ms late, how late they were, the processes with most of them, and "
-        "the seconds in which most were told of",
+        "real time: all deliveries, those over 20 ms late, how late they were, the processes with most of them, "
+        "and the seconds in which most were told of",
     ),
 }
 VERDICT = {
