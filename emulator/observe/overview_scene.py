@@ -146,7 +146,8 @@ class OverviewScene:
             canvas.strips("common/ellipses", outlines)
         if self._clouds and period.time_s >= self._next_clouds_s:
             self._next_clouds_s = period.time_s + CLOUDS_EVERY_S
-            canvas.points("common/particles", np.concatenate(list(self._clouds.values())))
+            clouds = [self._clouds[node] for node in self._node_ids if node in self._clouds]
+            canvas.points("common/particles", np.concatenate(clouds))
 
     def _figures(self, period: Period) -> None:
         plot, figure = self._canvas.plot, period.figure

@@ -77,7 +77,7 @@ def wait_until_all_are_gone(folder: Path) -> None:
         except ProcessLookupError:
             continue
         try:
-            ready, _, _ = select.select([descriptor], [], [], 20)
+            ready, _, _ = select.select([descriptor], [], [], 120)  # a recorder draws what still waits
         finally:
             os.close(descriptor)
         if not ready:
