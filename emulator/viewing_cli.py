@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from emulator.observe.run_folder import check_is_run
 from emulator.observe.sinks import (
     RECORDING,
     has_display,
@@ -47,8 +48,9 @@ def view(
         if _is_on(run):
             _tell_where(run)
             return
+        check_is_run(run)
         recording = run / RECORDING
-        if not recording.exists():
+        if not recording.exists() or not recording.stat().st_size:
             raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
         if not is_closed(recording):
             recording = mend(recording)

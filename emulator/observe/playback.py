@@ -15,7 +15,7 @@ from emulator.observe.busy import busy_windows, mean_busy, read_busy
 from emulator.observe.checks.evidence import Evidence
 from emulator.observe.metrics import PeriodFigures
 from emulator.observe.observation import event_message, period_message, scene_message
-from emulator.observe.run_folder import Event, read_events
+from emulator.observe.run_folder import Event, check_is_run, read_events
 from emulator.observe.run_tables import StatesReader, TableFile, TraceReader
 from emulator.world.world import World, build_world
 from vnet.errors import VnetError
@@ -30,8 +30,7 @@ def messages(folder: Path) -> Iterator[Message]:
 
     Raises VnetError if the folder is not a finished run's; while its tables are read, if they do not fit together.
     """
-    if not (folder / "scenario.toml").is_file():
-        raise VnetError(f"{folder}: not a run's folder: there is no scenario.toml in it")
+    check_is_run(folder)
     events = read_events(folder)
     scenario = load_scenario(folder / "scenario.toml")
     world = build_world(scenario)

@@ -81,6 +81,12 @@ class RunFolder:
         self.put(name, lambda path: write_text(path, json.dumps(data, indent=2) + "\n"))
 
 
+def check_is_run(folder: Path) -> None:
+    """Raises VnetError if the folder is not a run's."""
+    if not (folder / "scenario.toml").is_file():
+        raise VnetError(f"{folder}: not a run's folder: there is no scenario.toml in it")
+
+
 def read_events(folder: Path) -> list[Event]:
     """The events of a run. Raises VnetError if they cannot be read."""
     events = []

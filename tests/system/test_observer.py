@@ -165,9 +165,19 @@ def test_a_finished_run_is_served_until_it_is_enough(tmp_path: Path, ending: sig
 
 
 def test_there_is_nothing_to_view(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    command = [sys.executable, "-P", "-m", "emulator.cli", "view", str(tmp_path / "run")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "has no recording.rrd" in done.stderr
-    assert done.stderr.count("\n") == 1
+    folder = tmp_path / "run"
+
+    def view() -> str:
+        command = [sys.executable, "-P", "-m", "emulator.cli", "view", str(folder)]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        return done.stderr
+
+    assert "not a run's folder" in view()
+    folder.mkdir()
+    assert "not a run's folder" in view()
+    (folder / "scenario.toml").write_text("")
+    assert "has no recording.rrd" in view()
+    (folder / "recording.rrd").write_bytes(b"")
+    assert "has no recording.rrd" in view()

@@ -16,6 +16,7 @@ from emulator.observe.checks.replay import compare_folders
 from emulator.observe.checks.verdicts import CheckResult, Finding, Verdict
 from emulator.observe.report.record import Record
 from emulator.observe.report.source import Source
+from emulator.observe.run_folder import check_is_run
 from emulator.observe.summary import FIGURES, cell
 from vnet.toml_text import parse_toml
 
@@ -35,6 +36,8 @@ class Comparison:
     @classmethod
     def of(cls, first: Path, second: Path) -> Comparison:
         """Read two runs' folders. Raises VnetError if one is not that of a finished run of this vnet."""
+        for folder in (first, second):
+            check_is_run(folder)
         sources = Source(first), Source(second)
         for source in sources:
             _ = source.record, source.scenario, source.evidence
