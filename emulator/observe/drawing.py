@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -137,13 +137,13 @@ class Period:
         """What became of frames, (k, 4): sender, receiver, outcome, how many."""
         return unpack_pairs(self.message)
 
-    def counts(self, *outcomes: Outcome) -> NDArray[np.int32]:
-        """How many frames had one of these outcomes (all if none are named), (n, n): row receives, column sends."""
-        pairs = self.pairs
-        if outcomes:
-            pairs = pairs[np.isin(pairs[:, 2], outcomes)]
+    def counts(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """How many frames there were, and how many were delivered, each (n, n): row receives, column sends."""
+        sender, receiver, outcome, number = self.pairs.T
         n = len(self.node_ids)
-        return np.bincount(pairs[:, 1] * n + pairs[:, 0], pairs[:, 3], n * n).astype(np.int32).reshape(n, n)
+        place = receiver * n + sender + n * n * (outcome == Outcome.delivered)
+        others, delivered = np.bincount(place, number, 2 * n * n).astype(np.int32).reshape(2, n, n)
+        return others + delivered, delivered
 
     def received(self) -> tuple[NDArray[np.int32], Floats]:
         """Links that delivered, (k, 3): sender, receiver, how many; and (k,) the age of each newest frame in ms."""
@@ -216,9 +216,9 @@ class _Rows:
             self.colours.append(colours)
 
     @property
-    def lengths(self) -> list[int]:
+    def lengths(self) -> NDArray[np.int32]:
         """How many there are at each instant."""
-        return [len(array) for array in self.arrays]
+        return np.array([len(array) for array in self.arrays], dtype=np.int32)
 
 
 class Canvas:
@@ -238,10 +238,11 @@ class Canvas:
     def at(self, time_ns: int) -> None:
         """What is drawn from now on belongs to this emulated time."""
         self._time_ns = time_ns
-        self._recording.set_time(TIMELINE, duration=np.timedelta64(time_ns, "ns"))
 
     def log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
         """Anything that Rerun knows."""
+        if not static:
+            self._recording.set_time(TIMELINE, duration=np.timedelta64(self._time_ns, "ns"))
         self._recording.log(entity, what[0], *what[1:], static=static)
 
     def point_style(
@@ -347,22 +348,23 @@ class Canvas:
 
     def send(self) -> None:
         """Send what has been kept."""
+        index = cache(_index)  # most entities have the same times
         for entity, rows in self._points.items():
             columns = rr.Points2D.columns(positions=np.concatenate(rows.arrays))
-            self._recording.send_columns(entity, _index(rows.times_ns), columns.partition(rows.lengths))
+            self._recording.send_columns(entity, index(tuple(rows.times_ns)), columns.partition(rows.lengths))
         for entity, rows in self._strips.items():
             colours = np.concatenate(rows.colours) if rows.colours else None
             columns = rr.LineStrips2D.columns(strips=_strip_array(rows.arrays), colors=colours)
-            self._recording.send_columns(entity, _index(rows.times_ns), columns.partition(rows.lengths))
+            self._recording.send_columns(entity, index(tuple(rows.times_ns)), columns.partition(rows.lengths))
         for entity, (times_ns, numbers) in self._plots.items():
             columns = rr.Scalars.columns(scalars=np.array(numbers))
             lines = np.full(len(times_ns), len(numbers) // len(times_ns))
-            self._recording.send_columns(entity, _index(times_ns), columns.partition(lines))
+            self._recording.send_columns(entity, index(tuple(times_ns)), columns.partition(lines))
         for kept in (self._points, self._strips, self._plots):
             kept.clear()
 
 
-def _index(times_ns: Sequence[int]) -> list[rr.TimeColumn]:
+def _index(times_ns: tuple[int, ...]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, duration=np.array(times_ns, dtype="timedelta64[ns]"))]
 
 

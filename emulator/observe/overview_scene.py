@@ -35,6 +35,7 @@ from emulator.observe.drawing import (
 from emulator.observe.limit import Limit
 from emulator.observe.observation import unpack
 from emulator.observe.paper_values import paper_rmse
+from emulator.observe.radio_scene import next_charts_s
 
 LANE_HALF_LENGTH_M = 250.0
 ELLIPSES_EVERY_S = 1.0
@@ -168,7 +169,7 @@ class OverviewScene:
         self._weights[~period.up] = np.nan
         if not self._trusted or period.time_s < self._next_weights_s or len(self._node_ids) > LARGEST_MATRIX:
             return
-        self._next_weights_s = period.time_s + CLOUDS_EVERY_S
+        self._next_weights_s = next_charts_s(period.time_s)
         axes = ("fuses", "is weighed")
         self._canvas.log("weights", rr.Tensor(self._weights, dim_names=axes, value_range=(0, 1)))
 

@@ -11,7 +11,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from emulator.channel.outcomes import Outcome
 from emulator.observe.drawing import (
     BLUE,
     GREEN,
@@ -121,8 +120,8 @@ class RadioScene:
         self._load(period)
         self._busy(period)
         if self._count <= LARGEST_MATRIX:
-            self._tried.add(period.counts())
-            self._delivered.add(period.counts(Outcome.delivered))
+            for window, counts in zip((self._tried, self._delivered), period.counts(), strict=True):
+                window.add(counts)
             self._ages.period(period, self._end_ms(period))
         self._latency.add(np.frombuffer(period.message["latency_counts"], dtype="<i4"))
         self._sent.add(period.numbers("sent_bytes").astype(float))

@@ -22,7 +22,7 @@ from emulator.observe.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.observe.vehicle_scene import VehicleScene
 from vnet.errors import VnetError
 
-DRAWN_EVERY_S = 1.0
+DRAWN_TOGETHER_S = 1.0
 """Periods are drawn some at a time: ten take hardly longer than three that come apart."""
 NAMED = 8
 
@@ -42,7 +42,6 @@ class Recorder:
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._node_ids: list[str] = []
-        self._next_s = 0.0
         self._waiting: list[Period] = []
         self._last: int | None = None
         self.missed = 0
@@ -53,7 +52,7 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._draw()
+        self.draw()
         self._stack.close()
 
     def take(self, stream: str, message: Mapping[str, Any]) -> None:
@@ -62,11 +61,10 @@ class Recorder:
             self._begin(message)
         elif stream == "period" and self._parts:
             self._waiting.append(Period(message, self._node_ids))
-            if self._waiting[-1].time_s >= self._next_s:
-                self._next_s = self._waiting[-1].time_s + DRAWN_EVERY_S
-                self._draw()
+            if self._waiting[-1].time_s - self._waiting[0].time_s > DRAWN_TOGETHER_S:
+                self.draw()
         elif stream == "end" and self._overview is not None:
-            self._draw()
+            self.draw()
             self._overview.events(message.get("events", []))
 
     def _begin(self, scene: Mapping[str, Any]) -> None:
@@ -84,8 +82,8 @@ class Recorder:
         self._recording.send_blueprint(blueprint(vehicle))
         self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
 
-    def _draw(self) -> None:
-        """Draw the periods that wait."""
+    def draw(self) -> None:
+        """Draw the periods that wait, which `take` does only once there are some."""
         for period in self._waiting:
             self._canvas.at(period.time_ns)
             if self._last is not None and period.number > self._last + 1:

@@ -274,8 +274,8 @@ def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str
 def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/links"].at["Tensor:data"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
-    tried = sum(period.counts() for period in before)
-    delivered = sum(period.counts(Outcome.delivered) for period in before)
+    tried = sum(period.counts()[0] for period in before)
+    delivered = sum(period.counts()[1] for period in before)
     tensor = entities["/radio/links"].at["Tensor:data"][times[-1]][0]
     assert tensor["names"] == ["receiver", "sender"]
     share = np.divide(delivered, tried, out=np.full((6, 6), np.nan), where=tried > 0)

@@ -5,9 +5,11 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 import rerun as rr
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 
 from emulator.cli import app
 from emulator.observe import sinks as sinks_module
+from emulator.observe.recorder import Recorder
 from emulator.observe.sinks import (
     ServeAt,
     Sinks,
@@ -25,9 +28,10 @@ from emulator.observe.sinks import (
     place_to_serve,
     viewer_command,
 )
-from emulator.observe.watch import Inbox
+from emulator.observe.watch import Inbox, _record_all
 from tests.emulator.recordings import descendants, listening_addresses, read_back, rrd
 from vnet.errors import VnetError
+from vnet.link import wire
 
 TIMEOUT_S = 60
 
@@ -217,6 +221,7 @@ def test_the_viewers_own_port_is_bound_to_the_loopback_interface() -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
+from typing import Any
 import rerun as rr
 from emulator.observe.sinks import Sinks, open_recording
 with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
@@ -252,10 +257,50 @@ def test_an_inbox_is_bounded_and_counts_what_it_drops() -> None:
         inbox.put("period", bytes([number]) * 30)
     inbox.put("end")
     assert inbox.dropped == 7
-    assert [inbox.get(0) for _ in range(5)] == [
-        *(("period", bytes([number]) * 30) for number in range(3)),
-        ("end", b""),
-        None,
-    ]
+    assert inbox.get_all(0) == [*(("period", bytes([number]) * 30) for number in range(3)), ("end", b"")]
+    assert inbox.get_all(0) == []
     inbox.put("period", b"x" * 100)
-    assert inbox.get(0) == ("period", b"x" * 100)
+    assert inbox.get_all(0) == [("period", b"x" * 100)]
+
+
+@pytest.mark.parametrize("urgent", [("end", b""), ("scene", b"s"), ("lost", b""), ("period", b"x" * 60)])
+def test_an_inbox_gathers_periods_until_something_comes_that_must_not_wait(urgent: tuple[str, bytes]) -> None:
+    inbox = Inbox(limit_bytes=100)
+    for_ever_s = 1000.0
+    with ThreadPoolExecutor() as pool:
+        taken = pool.submit(inbox.get_all, None, for_ever_s)
+        for _ in range(3):
+            inbox.put("period", b"a")
+        inbox.put(*urgent)
+        items = taken.result(TIMEOUT_S)
+    assert items[-1] == urgent
+    assert items[:-1] == [("period", b"a")] * 3
+    inbox.put("period", b"b")
+    assert inbox.get_all(0, 0.0) == [("period", b"b")], "what was urgent is no longer"
+
+
+def test_what_was_being_gathered_is_recorded_by_an_observer_that_is_ended() -> None:
+    class Interrupted(Inbox):
+        def get_all(self, timeout_s: float | None = None, gather_s: float = 0.0) -> list[tuple[str, bytes]]:
+            if gather_s:
+                raise KeyboardInterrupt
+            return super().get_all(timeout_s, gather_s)
+
+    class Drawn(Recorder):
+        def __init__(self) -> None:
+            self.missed = 0
+            self.taken: list[str] = []
+            self.drawn: list[str] = []
+
+        def take(self, stream: str, message: Mapping[str, Any]) -> None:
+            self.taken.append(stream)
+
+        def draw(self) -> None:
+            self.drawn = self.taken.copy()
+
+    inbox, recorder = Interrupted(), Drawn()
+    for number in range(3):
+        inbox.put("period", wire.encode_observation({"period": number}))
+    with pytest.raises(KeyboardInterrupt):
+        _record_all(inbox, recorder)
+    assert recorder.drawn == ["period"] * 3
