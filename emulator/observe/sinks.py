@@ -37,6 +37,8 @@ SERVER_MEMORY = "256MiB"
 VIEWER_MEMORY = "2GiB"
 CLOSE_TIMEOUT_S = 10.0
 _END_OF_A_CLOSED_FILE = b"RRF2FOOT"
+_EMPTY_BYTES = 100
+"""A recording of nothing, closed, has 60 bytes; the name of a run and a time take more than a hundred."""
 
 
 @dataclass(frozen=True)
@@ -313,12 +315,21 @@ def mending_command(path: Path) -> str:
 
 
 def mend(path: Path) -> Path:
-    """Make a whole recording of one that was not closed, and return where it is. Raises VnetError."""
+    """Make a whole recording of one that was not closed, and return where it is.
+
+    Raises VnetError if it cannot be mended, or there is nothing in it.
+    """
     done = subprocess.run([_program(), *_mending(path)], capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip() or "nothing was said").splitlines()[-1]
         raise VnetError(f"{path}: was not closed, and cannot be mended: {last}")
-    return mended_path(path)
+    mended = mended_path(path)
+    if mended.stat().st_size <= _EMPTY_BYTES:
+        mended.unlink()
+        raise VnetError(
+            f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} makes it anew"
+        )
+    return mended
 
 
 def _mending(path: Path) -> list[str]:

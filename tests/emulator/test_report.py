@@ -158,6 +158,20 @@ def test_a_run_that_lost_a_file_has_a_report_that_says_so(beacon: Path, lost: st
         assert "no verdict" in page.text and "Nothing was judged" in page.text
 
 
+def test_figures_that_need_no_metrics_are_drawn_without_them(beacon: Path) -> None:
+    (beacon / "metrics.parquet").write_bytes(b"no table")
+    page = page_of(beacon)
+    assert {"outcomes", "totals", "links", "latency", "ages", "degrees"} <= set(page.ids)
+    assert "metrics.parquet cannot be read" in page.text
+
+
+def test_a_verdict_that_cannot_be_read_is_not_taken_for_a_run_that_goes_on(beacon: Path) -> None:
+    (beacon / "verdict.json").write_text("{")
+    page = page_of(beacon)
+    assert "The verdict of this run cannot be read." in page.text and "still going on" not in page.text
+    assert "verdict.json: not JSON" in page.text
+
+
 def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
     done = vnet(["report", str(tmp_path)])
     assert done.exit_code == 2 and "not a run's folder" in done.output and done.output.count("\n") == 1

@@ -119,7 +119,8 @@ class Source:
         on_air = {} if self.scenario.radio.mac is None else ON_AIR
         trace, states = self._table("trace", TRACE | on_air), self._table("states", STATES)
         busy = maybe(lambda: read_busy(self.folder)) if on_air else None
-        return Evidence(self.scenario, trace, states, self.metrics, self.events, busy=busy)
+        not_needed = pa.table({})  # the metrics: what can be drawn without them is drawn
+        return Evidence(self.scenario, trace, states, not_needed, self.events, busy=busy)
 
     @cached_property
     def radio(self) -> RadioMetrics:

@@ -98,8 +98,7 @@ def _header(source: Source, name: str, record: Record | None) -> Iterator[str]:
     yield f"<h1>{escape(name)} {badge(record.verdict if record else None)}</h1>"
     yield f'<ul class="facts">{"".join(f"<li>{escape(fact)}</li>" for fact in _facts(source, record))}</ul>'
     if record is None:
-        yield "<p>This run has no verdict: it is still going on, or it was ended from outside. "
-        yield "What it has left so far:</p>"
+        yield f"<p>{_why_no_verdict(source)} What it has left:</p>"
     elif source.cut is not None:
         yield f"<p>The run was {escape(source.cut.kind)} at {source.cut.time_ns / 1e9:.1f} s.</p>"
     sections = {
@@ -113,6 +112,12 @@ def _header(source: Source, name: str, record: Record | None) -> Iterator[str]:
     }
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title in sections.items() if record or key != "key")
     yield f"<nav>{links}</nav></header>"
+
+
+def _why_no_verdict(source: Source) -> str:
+    if (source.folder / "verdict.json").exists():
+        return "The verdict of this run cannot be read."  # why is told among the checks
+    return "This run has no verdict: it is still going on, or it was ended from outside."
 
 
 def _facts(source: Source, record: Record | None) -> Iterator[str]:
