@@ -21,7 +21,7 @@ from emulator.experiments.cells import Cell, has_result, has_states, read_series
 from emulator.experiments.figures import against_time, save, styled
 from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.tables import MISSING, markdown_table, mean_and_error
+from emulator.experiments.tables import MISSING, in_seeds, markdown_table, mean_and_error
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError, VnetError
 from vnet.roads.lanes import Array
@@ -126,7 +126,7 @@ def report(results: Sequence[Result], duration_s: float) -> str:
         "# Driving through a city\n\n"
         f"{markdown_table(header, rows)}\n\n"
         f"RMSE from {min(SETTLED_S, duration_s / 2):g} s on, of {duration_s:g} s; "
-        f"{len(unique(results, 'seed'))} seeds, ± standard error; {100 * LOSS:g} % loss. `centralized` is one "
+        f"{in_seeds(len(unique(results, 'seed')))}; {100 * LOSS:g} % loss. `centralized` is one "
         "filter that hears every fix.\n"
     )
 

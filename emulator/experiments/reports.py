@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 
 from emulator.experiments.paper import ALPHAS
-from emulator.experiments.tables import markdown_table, mean_and_error, paired_difference, paired_ratio
+from emulator.experiments.tables import (
+    in_seeds,
+    markdown_table,
+    mean_and_error,
+    paired_difference,
+    paired_ratio,
+    with_error,
+)
 from emulator.observe.metrics import anees_band
 
 Result = Mapping[str, Any]
@@ -79,8 +86,8 @@ def _table1_summary(results: Sequence[Result]) -> str:
     )
     return (
         f"√variance is smallest at α = {best:g} and largest at α = {worst:g}; optimized weights have "
-        f"{ratio:.2f} ± {error:.2f} times that of the best constant. {len(unique(results, 'seed'))} seeds, "
-        "± standard error; estimates right after stacking, before the road weighs them."
+        f"{with_error(ratio, error, '.2f')} times that of the best constant. "
+        f"{in_seeds(len(unique(results, 'seed')))}; estimates right after stacking, before the road weighs them."
     )
 
 
@@ -95,7 +102,7 @@ def table2(results: Sequence[Result]) -> str:
         found = [row for row in results if row["sides"] == sides]
         if found:
             parts += [f"## {title}", _table2_section(found, name)]
-    parts.append(f"{len(unique(results, 'seed'))} seeds, ± standard error; 10 s.")
+    parts.append(f"{in_seeds(len(unique(results, 'seed')))}; 10 s.")
     return "\n\n".join(parts) + "\n"
 
 
@@ -115,7 +122,7 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
         )
         ratio, error = paired_ratio(random, optimized)
         paper = PAPER_TABLE2["random"][network] / PAPER_TABLE2["optimized"][network]
-        row += [f"{ratio:.2f} ± {error:.2f}", f"{paper:.2f}"]
+        row += [with_error(ratio, error, ".2f"), f"{paper:.2f}"]
     header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
     return markdown_table(header, [*rows, row])
 
@@ -160,7 +167,7 @@ def _same_seeds(rows: list[Result], limit: list[Result]) -> tuple[list[Result], 
 
 def _ratio_to_limit(rows: list[Result], limit: list[Result]) -> str:
     ratio, error = paired_ratio(column(rows, "rmse_m"), column(limit, "rmse_m"))
-    return f"{ratio:.2f} ± {error:.2f}"
+    return with_error(ratio, error, ".2f")
 
 
 def _component_ratios(rows: list[Result], limit: list[Result]) -> str:
@@ -197,7 +204,7 @@ def _wanted(results: Sequence[Result], networks: Sequence[str]) -> str:
         diverged = sum(column(rows, "divergent"))
         columns.append(
             [
-                f"{_yes(ratio <= LIMIT_RATIO)}: {ratio:.2f} ± {error:.2f}",
+                f"{_yes(ratio <= LIMIT_RATIO)}: {with_error(ratio, error, '.2f')}",
                 f"{_yes(largest <= LIMIT_RATIO)}: {largest:.2f}",
                 f"{_yes(diverged == 0)}: {diverged} in {len(rows)} runs",
                 *(_not_worse(*_difference(results, network, a, b)) for a, b in COMPARED),
@@ -238,7 +245,11 @@ def _paired(results: Sequence[Result], networks: Sequence[str]) -> str:
         row = [f"{a} − {b}"]
         for network in networks:
             difference, error, seeds = _difference(results, network, a, b)
-            row.append(f"{difference:+.3f} ± {error:.3f} ({seeds} seeds)" if seeds else "–")
+            row.append(
+                f"{with_error(difference, error, '+.3f')} ({seeds} seed{'s' if seeds > 1 else ''})"
+                if seeds
+                else "–"
+            )
         rows.append(row)
     return "## Paired differences [m]\n\n" + markdown_table(["", *(n.upper() for n in networks)], rows)
 
@@ -247,7 +258,7 @@ def _notes(results: Sequence[Result]) -> str:
     runs = len(unique(results, "seed"))
     low, high = anees_band(runs)
     return (
-        f"100 s, counted from 20 s on; up to {runs} seeds, ± standard error. `limit` is one centralized filter "
+        f"100 s, counted from 20 s on; up to {in_seeds(runs)}. `limit` is one centralized filter "
         "a connected component, `centralized` one over all. `one hop` mixes particles as the paper does and passes "
         "no fixes on. Not worse: not by more than two standard errors of the paired difference. ANEES is 1 for a "
         f"consistent filter; the 95 % band of {runs} independent samples of two degrees of freedom is {low:.2f} to "

@@ -41,10 +41,19 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def mean_and_error(values: Values, digits: int = 3) -> str:
     """ "0.234 ± 0.012": mean ± standard error over seeds; one seed: no error; none: a dash."""
-    mean, error = mean_and_standard_error(values)
-    if math.isnan(mean):
+    return with_error(*mean_and_standard_error(values), f".{digits}f")
+
+
+def with_error(value: float, error: float, form: str) -> str:
+    """ "1.35 ± 0.02" for the form ".2f"; an error of NaN is left out, and a value of NaN is a dash."""
+    if math.isnan(value):
         return MISSING
-    return f"{mean:.{digits}f}" + ("" if math.isnan(error) else f" ± {error:.{digits}f}")
+    return f"{value:{form}}" + ("" if math.isnan(error) else f" ± {error:{form.lstrip('+')}}")
+
+
+def in_seeds(count: int) -> str:
+    """How many seeds, and what stands beside a mean of them: "10 seeds, ± standard error"."""
+    return "1 seed" if count == 1 else f"{count} seeds, ± standard error"
 
 
 def mean_and_standard_error(values: Values) -> tuple[float, float]:

@@ -21,7 +21,7 @@ from emulator.experiments.cells import Cell
 from emulator.experiments.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
 from emulator.experiments.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
-from emulator.experiments.tables import markdown_table, mean_and_error, mean_and_standard_error
+from emulator.experiments.tables import in_seeds, markdown_table, mean_and_error, mean_and_standard_error
 from emulator.observe.metrics import anees_band
 
 TAUS_S = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
@@ -84,7 +84,7 @@ def report(results: Sequence[Result]) -> str:
     for mechanism, network, rows in _groups(results):
         parts += [f"## {mechanism} on {network.upper()}", _table(rows)]
     parts.append(
-        f"{runs} seeds, ± standard error. τ is `lateral_tau_s` of the filter; the world's offsets change over "
+        f"{in_seeds(runs)}. τ is `lateral_tau_s` of the filter; the world's offsets change over "
         f"{WORLD_TAU_S:g} s. ANEES is 1 for a consistent filter, more for one that is too sure; the 95 % band of "
         f"{runs} independent samples of two degrees of freedom is {low:.2f} to {high:.2f} (*: out of it). The "
         "samples within a run are not independent, but there are more than one: the standard error says how well "

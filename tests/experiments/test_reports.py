@@ -8,6 +8,7 @@ import pytest
 
 from emulator.experiments import figures, reports
 from emulator.experiments.paper import ALPHAS, NETWORKS, load_positions
+from emulator.experiments.tables import with_error
 
 NETWORK = {"N3": load_positions({"kind": "generated", "vehicles": 24})}
 LONELY = {"one": (np.zeros((1, 2)), np.zeros(1)), "apart": (np.array([[0.0, 0.0], [9e4, 0.0]]), np.zeros(2))}
@@ -61,6 +62,13 @@ def test_table_one_says_where_the_minimum_is_and_how_far_below_optimized_weights
     assert "smallest at α = 0.5 and largest at α = 0.95" in text
     assert "0.50 ± 0.00 times that of the best constant" in text
     assert is_picture(figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
+
+
+def test_one_seed_has_no_standard_error(tmp_path: Path) -> None:
+    text = reports.table1([row for row in table1_results() if row["seed"] == 1])
+    assert "nan" not in text
+    assert "0.50 times that of the best constant. 1 seed; " in text
+    assert with_error(1.25, 0.125, "+.2f") == "+1.25 ± 0.12"
 
 
 def test_table_two_puts_the_papers_figures_beside() -> None:
