@@ -282,6 +282,9 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
 def main() -> None:
     """Run the benchmarks that the command line names, or all."""
     names = sys.argv[1:] or list(BENCHMARKS)
+    for name in names:
+        if name not in BENCHMARKS:
+            sys.exit(f"{name}: no benchmark is called so; there are {', '.join(BENCHMARKS)}")
     table = Table("benchmark", "figure", "value")
     results = {}
     for name in names:
