@@ -88,7 +88,13 @@ def play(
         with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
             recorder.take(stream, scene)
             print(f"playing {run} at {speed:g}× real time\n{place.told()}", flush=True)
-            if play_scheduled(scheduled, lambda message: recorder.take(*message)) == 0:
+
+            def show(message: Message) -> None:
+                recorder.take(*message)
+                if speed < 1:  # a second of the run is too long to wait for
+                    recorder.draw()
+
+            if play_scheduled(scheduled, show) == 0:
                 raise VnetError(f"{run}: there is nothing to play from {start:g} s on")
             print("played; it can be looked at until Ctrl-C", flush=True)
             signal.pause()
