@@ -3,7 +3,7 @@
 The messages are those of a simulated run, published over Zenoh at the pace of the wall clock; the observer saves
 and serves them. What it does in the beginning is not counted. Others compute at the lowest priority meanwhile, as a
 run's processes do: the processor of an idle virtual machine goes to sleep, and the same work then takes half as
-much again.
+much again to nearly twice as much.
 """
 
 from __future__ import annotations

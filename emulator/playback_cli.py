@@ -22,6 +22,9 @@ from emulator.viewing_cli import LATEST, RerunBindOption, RerunPortOption, Rerun
 from vnet.errors import VnetError
 from vnet.scenario import NS_PER_S
 
+SEEN_APART_S = 0.2
+"""Periods that are so far apart are shown each when it is due; closer ones some at a time, which costs less."""
+
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who draw need it
     from emulator.observe.recorder import Recorder
 
@@ -88,10 +91,11 @@ def play(
         with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
             recorder.take(stream, scene)
             print(f"playing {run} at {speed:g}× real time\n{place.told()}", flush=True)
+            apart_s = scene["period_ns"] / NS_PER_S / speed
 
             def show(message: Message) -> None:
                 recorder.take(*message)
-                if speed < 1:  # a second of the run is too long to wait for
+                if apart_s >= SEEN_APART_S:
                     recorder.draw()
 
             if play_scheduled(scheduled, show) == 0:

@@ -1,12 +1,13 @@
 """A Rerun recording of a run, from what the emulator tells observers.
 
-Few batched entities: one for all vehicles, one for all links, one for all particles. What is drawn is sent once a
-second. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
+Few batched entities: one for all vehicles, one for all links, one for all particles. Periods are drawn several at
+a time. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
 north is up.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from contextlib import ExitStack
 from types import TracebackType
@@ -42,7 +43,7 @@ class Recorder:
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
         self._node_ids: list[str] = []
-        self._waiting: list[Period] = []
+        self._waiting: deque[Period] = deque()
         self._last: int | None = None
         self.missed = 0
 
@@ -52,8 +53,10 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.draw()
-        self._stack.close()
+        try:
+            self.draw()
+        finally:
+            self._stack.close()
 
     def take(self, stream: str, message: Mapping[str, Any]) -> None:
         """Draw a message of `scene`, `period` or `end`; others, and periods before the first scene, are ignored."""
@@ -61,7 +64,8 @@ class Recorder:
             self._begin(message)
         elif stream == "period" and self._parts:
             self._waiting.append(Period(message, self._node_ids))
-            if self._waiting[-1].time_s - self._waiting[0].time_s > DRAWN_TOGETHER_S:
+            first_s = self._waiting[0].time_s
+            if self._last is None or self._waiting[-1].time_s - first_s > DRAWN_TOGETHER_S:
                 self.draw()
         elif stream == "end" and self._overview is not None:
             self.draw()
@@ -84,14 +88,14 @@ class Recorder:
 
     def draw(self) -> None:
         """Draw the periods that wait, which `take` does only once there are some."""
-        for period in self._waiting:
+        while self._waiting:
+            period = self._waiting.popleft()
             self._canvas.at(period.time_ns)
             if self._last is not None and period.number > self._last + 1:
                 self._tell_gap(period.number - self._last - 1)
             self._last = period.number
             for part in self._parts:
                 part.period(period)
-        self._waiting.clear()
         self._canvas.send()
 
     def _tell_gap(self, count: int) -> None:

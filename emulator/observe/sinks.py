@@ -37,8 +37,7 @@ SERVER_MEMORY = "256MiB"
 VIEWER_MEMORY = "2GiB"
 CLOSE_TIMEOUT_S = 10.0
 _END_OF_A_CLOSED_FILE = b"RRF2FOOT"
-_EMPTY_BYTES = 100
-"""A recording of nothing, closed, has 60 bytes; the name of a run and a time take more than a hundred."""
+_ITS_NAME = "/__properties"
 
 
 @dataclass(frozen=True)
@@ -324,12 +323,22 @@ def mend(path: Path) -> Path:
         last = (done.stderr.strip() or "nothing was said").splitlines()[-1]
         raise VnetError(f"{path}: was not closed, and cannot be mended: {last}")
     mended = mended_path(path)
-    if mended.stat().st_size <= _EMPTY_BYTES:
+    if _is_empty(mended):
         mended.unlink()
         raise VnetError(
             f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} makes it anew"
         )
     return mended
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether a closed recording has nothing in it but its name."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(str(path))
+    if not reader.recordings():
+        return True
+    return all(str(chunk.entity_path).startswith(_ITS_NAME) for chunk in reader.stream())
 
 
 def _mending(path: Path) -> list[str]:

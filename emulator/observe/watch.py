@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Iterable
+from collections import deque
 from typing import Any
 
 import zenoh
@@ -33,6 +33,8 @@ NICE = 10
 """Where it shares a session with the run, or sessions do not count, the emulator and the agents come first."""
 GATHER_S = 1.0
 """Messages are taken together, once so often: ten at a time cost a fifth less than each by itself."""
+CLOSING_S = 0.2
+"""Who ends it waits no longer than for half a second, and the file must be closed by then."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
 
@@ -45,11 +47,12 @@ class Inbox:
 
     def __init__(self, limit_bytes: int = INBOX_BYTES) -> None:
         self._limit_bytes = limit_bytes
-        self._waiting: list[tuple[str, bytes]] = []
+        self._waiting: deque[tuple[str, bytes]] = deque()
         self._bytes = 0
         self._urgent = False
         self._changed = threading.Condition()
         self.dropped = 0
+        self.is_closed = False
 
     def put(self, stream: str, data: bytes = b"") -> None:
         """Add a message, if there is room."""
@@ -63,18 +66,30 @@ class Inbox:
             if self._urgent or len(self._waiting) == 1:
                 self._changed.notify()
 
-    def get_all(self, timeout_s: float | None = None, gather_s: float = 0.0) -> list[tuple[str, bytes]]:
-        """All that waits, the oldest first; nothing if nothing comes within `timeout_s`.
+    def close(self) -> None:
+        """Nothing is waited for any more. May be called by a signal's handler."""
+        with self._changed:
+            self.is_closed = True
+            self._changed.notify()
+
+    def gather(self, timeout_s: float | None = None, gather_s: float = 0.0) -> int:
+        """Wait for messages; returns how many there are: none if none comes within `timeout_s`, or it is closed.
 
         Periods are given `gather_s` to become more; whatever else comes, and a half-full inbox, are not waited on.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting, timeout_s)
+            self._changed.wait_for(lambda: self._waiting or self.is_closed, timeout_s)
             if self._waiting:
-                self._changed.wait_for(lambda: self._urgent, gather_s)
-            items, self._waiting = self._waiting, []
-            self._bytes, self._urgent = 0, False
-            return items
+                self._changed.wait_for(lambda: self._urgent or self.is_closed, gather_s)
+            return len(self._waiting)
+
+    def take(self) -> tuple[str, bytes]:
+        """The oldest message; there must be one."""
+        with self._changed:
+            stream, data = self._waiting.popleft()
+            self._bytes -= len(data)
+            self._urgent &= bool(self._waiting)
+            return stream, data
 
 
 def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: Sinks) -> None:
@@ -90,6 +105,9 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
     def on_alive(sample: zenoh.Sample) -> None:
         inbox.put("found" if sample.kind == zenoh.SampleKind.PUT else "lost")
 
+    def on_signal(*_: object) -> None:
+        inbox.close()
+
     os.nice(NICE)
     set_time_slice(DEFAULT_SLICE)  # what started it may have a shorter one
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -98,6 +116,8 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
         open_client(endpoint, credentials, LEASE_MS) as session,
         Recorder(sinks, run) as recorder,
     ):
+        for number in (signal.SIGTERM, signal.SIGINT):  # from here on nothing is left half drawn
+            signal.signal(number, on_signal)
         liveliness = session.liveliness()
         alive = liveliness.declare_subscriber(keys.emulator_alive(run), on_alive, history=True)
         with alive, session.declare_subscriber(keys.observe(run, "*"), on_sample):
@@ -105,24 +125,23 @@ def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: 
 
 
 def _record_all(inbox: Inbox, recorder: Recorder) -> None:
-    """Record messages until the end of the run, or until the emulator has been gone for too long."""
-    taker = _Taker(recorder)
+    """Record messages until the end of the run, the inbox is closed, or the emulator has been gone for too long."""
+    taker = _Taker(inbox, recorder)
     while not taker.ended:
-        try:
-            items = inbox.get_all(taker.left_s, GATHER_S)
-        except KeyboardInterrupt:  # what has come is recorded
-            taker.take_all(inbox.get_all(0))
-            raise
-        if not items:
+        count = inbox.gather(taker.left_s, GATHER_S)
+        taker.take(count)
+        if inbox.is_closed:
+            return
+        if not count:
             _say(f"the emulator has been gone for {taker.patience_s:g} s; the recording ends")
             return
-        taker.take_all(items)
 
 
 class _Taker:
     """Hands messages on to the recorder, and knows how long the emulator may still be gone."""
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, inbox: Inbox, recorder: Recorder) -> None:
+        self._inbox = inbox
         self._recorder = recorder
         self._deadline: float | None = None
         self._said = 0
@@ -134,20 +153,27 @@ class _Taker:
         """How long the emulator may still be gone; None if it is there."""
         return None if self._deadline is None else max(0.0, self._deadline - time.monotonic())
 
-    def take_all(self, items: Iterable[tuple[str, bytes]]) -> None:
-        """Take messages, and draw them."""
-        for stream, data in items:
-            if stream in ("lost", "found"):
-                self._deadline = time.monotonic() + self.patience_s if stream == "lost" else None
-                continue
-            self._deadline = None  # whoever says something is there
-            self._take(stream, data)
+    def take(self, count: int) -> None:
+        """Take so many messages, and draw them; of many that wait when the inbox is closed, the first."""
+        closing: float | None = None
+        for _ in range(count):
+            if self._inbox.is_closed:
+                closing = closing or time.monotonic() + CLOSING_S
+                if time.monotonic() > closing:
+                    break
+            stream, data = self._inbox.take()
+            if stream == "found":
+                self._deadline = None
+            elif stream == "lost" or self._deadline is not None:  # its last words may come after it is lost
+                self._deadline = time.monotonic() + self.patience_s
+            if stream not in ("lost", "found"):
+                self._record(stream, data)
         self._recorder.draw()
         if (missed := self._recorder.missed) > self._said:
             _say(f"{missed - self._said} periods were left out: the recording could not keep up")
             self._said = missed
 
-    def _take(self, stream: str, data: bytes) -> None:
+    def _record(self, stream: str, data: bytes) -> None:
         if (message := _decode(data)) is not None:
             self._recorder.take(stream, message)
             if stream == "scene":

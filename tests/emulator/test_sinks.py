@@ -1,6 +1,7 @@
 """Where recordings go: what may be chosen, what is listened at, and that all sinks get everything."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from typer.testing import CliRunner
 
 from emulator.cli import app
 from emulator.observe import sinks as sinks_module
+from emulator.observe import watch
 from emulator.observe.recorder import Recorder
 from emulator.observe.sinks import (
     ServeAt,
@@ -29,7 +31,7 @@ from emulator.observe.sinks import (
     place_to_serve,
     viewer_command,
 )
-from emulator.observe.watch import Inbox, _record_all
+from emulator.observe.watch import Inbox, _record_all, _Taker
 from tests.emulator.recordings import descendants, listening_addresses, read_back, rrd
 from vnet.errors import VnetError
 from vnet.link import wire
@@ -222,7 +224,6 @@ def test_the_viewers_own_port_is_bound_to_the_loopback_interface() -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from typing import Any
 import rerun as rr
 from emulator.observe.sinks import Sinks, open_recording
 with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
@@ -252,17 +253,21 @@ def test_a_recording_whose_writer_was_killed_can_be_read_and_mended(tmp_path: Pa
     assert len(_numbers(mended)) >= 180
 
 
-@pytest.mark.parametrize("left", [20, 100])
-def test_a_recording_of_a_header_alone_is_not_shown_as_one_of_nothing(tmp_path: Path, left: int) -> None:
+@pytest.mark.parametrize("left", [20, 100, 150, 600, 1400])
+def test_a_recording_of_nothing_but_its_name_is_not_shown(tmp_path: Path, left: int) -> None:
     path = tmp_path / "recording.rrd"
     with open_recording(Sinks(path), "cut") as recording:
         draw(recording, 5)
-    assert path.stat().st_size > 1000
+    assert path.stat().st_size > 3000
     with path.open("r+b") as file:
         file.truncate(left)
     with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} makes it anew"):
         mend(path)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def all_of(inbox: Inbox) -> list[tuple[str, bytes]]:
+    return [inbox.take() for _ in range(inbox.gather(0))]
 
 
 def test_an_inbox_is_bounded_and_counts_what_it_drops() -> None:
@@ -271,50 +276,89 @@ def test_an_inbox_is_bounded_and_counts_what_it_drops() -> None:
         inbox.put("period", bytes([number]) * 30)
     inbox.put("end")
     assert inbox.dropped == 7
-    assert inbox.get_all(0) == [*(("period", bytes([number]) * 30) for number in range(3)), ("end", b"")]
-    assert inbox.get_all(0) == []
+    assert all_of(inbox) == [*(("period", bytes([number]) * 30) for number in range(3)), ("end", b"")]
+    assert all_of(inbox) == []
     inbox.put("period", b"x" * 100)
-    assert inbox.get_all(0) == [("period", b"x" * 100)]
+    assert all_of(inbox) == [("period", b"x" * 100)]
+
+
+FOR_EVER_S = 2 * TIMEOUT_S
 
 
 @pytest.mark.parametrize("urgent", [("end", b""), ("scene", b"s"), ("lost", b""), ("period", b"x" * 60)])
 def test_an_inbox_gathers_periods_until_something_comes_that_must_not_wait(urgent: tuple[str, bytes]) -> None:
     inbox = Inbox(limit_bytes=100)
-    for_ever_s = 1000.0
     with ThreadPoolExecutor() as pool:
-        taken = pool.submit(inbox.get_all, None, for_ever_s)
+        gathered = pool.submit(inbox.gather, None, FOR_EVER_S)
         for _ in range(3):
             inbox.put("period", b"a")
         inbox.put(*urgent)
-        items = taken.result(TIMEOUT_S)
-    assert items[-1] == urgent
-    assert items[:-1] == [("period", b"a")] * 3
+        assert gathered.result(TIMEOUT_S) == 4
+    assert all_of(inbox) == [*[("period", b"a")] * 3, urgent]
     inbox.put("period", b"b")
-    assert inbox.get_all(0, 0.0) == [("period", b"b")], "what was urgent is no longer"
+    assert inbox.gather(0, 0.0) == 1, "what was urgent is no longer"
 
 
-def test_what_was_being_gathered_is_recorded_by_an_observer_that_is_ended() -> None:
-    class Interrupted(Inbox):
-        def get_all(self, timeout_s: float | None = None, gather_s: float = 0.0) -> list[tuple[str, bytes]]:
-            if gather_s:
-                raise KeyboardInterrupt
-            return super().get_all(timeout_s, gather_s)
+@pytest.mark.parametrize("waiting", [0, 3])
+def test_an_inbox_that_is_closed_waits_for_nothing(waiting: int) -> None:
+    inbox = Inbox()
+    for _ in range(waiting):
+        inbox.put("period", b"a")
+    with ThreadPoolExecutor() as pool:
+        gathered = pool.submit(inbox.gather, None, FOR_EVER_S)
+        inbox.close()
+        assert gathered.result(TIMEOUT_S) == waiting
 
-    class Drawn(Recorder):
-        def __init__(self) -> None:
-            self.missed = 0
-            self.taken: list[str] = []
-            self.drawn: list[str] = []
 
-        def take(self, stream: str, message: Mapping[str, Any]) -> None:
-            self.taken.append(stream)
+class Drawn(Recorder):
+    """Notes what it has drawn, and is ended by a signal when it takes a period for the third time."""
 
-        def draw(self) -> None:
-            self.drawn = self.taken.copy()
+    def __init__(self, inbox: Inbox) -> None:
+        self.missed = 0
+        self.taken: list[int] = []
+        self.drawn: list[int] = []
+        self._inbox = inbox
 
-    inbox, recorder = Interrupted(), Drawn()
-    for number in range(3):
+    def take(self, stream: str, message: Mapping[str, Any]) -> None:
+        self.taken.append(message["period"])
+        if len(self.taken) == 3:
+            signal.raise_signal(signal.SIGTERM)
+
+    def draw(self) -> None:
+        self.drawn = self.taken.copy()
+
+
+def test_what_waits_is_drawn_by_an_observer_that_a_signal_ends() -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    for number in range(5):
         inbox.put("period", wire.encode_observation({"period": number}))
-    with pytest.raises(KeyboardInterrupt):
+    before = signal.signal(signal.SIGTERM, lambda *_: inbox.close())
+    try:
         _record_all(inbox, recorder)
-    assert recorder.drawn == ["period"] * 3
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert recorder.drawn == [0, 1, 2, 3, 4]
+
+
+def test_an_observer_that_is_ended_with_much_to_draw_draws_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    for number in range(5):
+        inbox.put("period", wire.encode_observation({"period": number}))
+    inbox.close()
+    monkeypatch.setattr(watch, "CLOSING_S", -1.0)
+    _record_all(inbox, recorder)
+    assert recorder.drawn == []
+
+
+def test_what_a_lost_emulator_said_last_does_not_make_it_be_waited_for() -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    taker = _Taker(inbox, recorder)
+    period = ("period", wire.encode_observation({"period": 1}))
+    for stream, data, is_there in (("lost", b"", False), (*period, False), ("found", b"", True), (*period, True)):
+        inbox.put(stream, data)
+        taker.take(inbox.gather(0))
+        assert (taker.left_s is None) == is_there, stream
+    assert recorder.drawn == [1, 1]
