@@ -14,13 +14,13 @@ from typing import Any
 
 import msgspec
 
-from agents.cooperative_frame import short_name
+from agents.cooperative.frame import short_name
 from vnet import Node, Packet
 from vnet.cmm.consensus import AVERAGING_RULES, AveragingConsensus, Consensus, RatioConsensus, Share
 from vnet.errors import ProgramError
-from vnet.roads.lanes import Array
+from vnet.types import Array
+from vnet.units import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 RULES = ("ratio", *AVERAGING_RULES)
 
 

@@ -14,11 +14,11 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from agents.cooperative_options import Options
+from agents.cooperative.options import Options
 from vnet import Fix, Node
 from vnet.cmm.rbpf import Observation, Rbpf
+from vnet.units import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 COMPUTING_SHARE, REPORTING_SHARE = 0.8, 0.95
 """Shares of the period: when the first vehicle filters and tells, and when all report."""
 FILTERING = 2

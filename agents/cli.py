@@ -17,10 +17,10 @@ import typer
 
 from agents.host import run_agent
 from vnet.errors import ProgramError, VnetError
-from vnet.link.access import Credentials
-from vnet.link.hosting import fix_hash_seed
-from vnet.link.keys import is_segment
-from vnet.link.session import quiet_zenoh
+from vnet.runtime.host import fix_hash_seed
+from vnet.transport.access import Credentials
+from vnet.transport.keys import is_segment
+from vnet.transport.session import quiet_zenoh
 
 _PR_SET_PDEATHSIG = 1
 

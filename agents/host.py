@@ -23,12 +23,12 @@ from contextlib import ExitStack
 import zenoh
 
 from vnet.errors import LinkError, ProgramError, VnetError
-from vnet.link import keys, wire
-from vnet.link.access import Credentials
-from vnet.link.hosting import Host, Programs, load_programs
-from vnet.link.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
-from vnet.link.session import open_client
-from vnet.link.virtual_time import BendableLoop, SpinError, VirtualTimeLoop
+from vnet.runtime.host import Host, Programs, load_programs
+from vnet.runtime.virtual_time import BendableLoop, SpinError, VirtualTimeLoop
+from vnet.transport import keys, wire
+from vnet.transport.access import Credentials
+from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.session import open_client
 
 HELLO_PERIOD_S = 0.5
 LEASE_MS = 60_000

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from emulator.observe.run_folder import RunFolder
-from emulator.run.course import Course, Snapshot
-from emulator.run.dashboard import Dashboard
-from emulator.run.emulation import Emulation
-from emulator.run.painter import EVERY_S, Painter
-from emulator.run.simulate import simulate
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.drivers.status import Course, Snapshot
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import load_scenario
+from emulator.terminal.dashboard import Dashboard
+from emulator.terminal.painter import EVERY_S, Painter
 from emulator.world.world import build_world
-from vnet.scenario import load_scenario
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "faults.toml"
 OVERRIDES = ["network.vehicles=50", "program.entry=agents.beacon:main"]

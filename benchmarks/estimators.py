@@ -33,7 +33,8 @@ from stonesoup.updater.particle import ParticleUpdater
 
 from vnet.cmm.map_matching import candidate_lanes, log_on_lane
 from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
-from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.lanes import LaneMap
+from vnet.types import Array
 
 PARTICLES, VEHICLES, STEPS, WARM_UP = 500, 10, 400, 20
 DT_S = 0.1

@@ -19,17 +19,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from emulator.observe.limit import Limit
-from emulator.observe.run_folder import RunFolder
-from emulator.observe.sinks import RECORDING
-from emulator.run.emulation import Emulation
-from emulator.run.messages import Messages
-from emulator.run.simulate import simulate
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.observers import Messages
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.viewer.bound import Limit
+from emulator.viewer.sinks import RECORDING
 from emulator.world.world import build_world
-from vnet.link import keys, wire
-from vnet.link.access import OBSERVER, Access
-from vnet.link.session import open_router, router_endpoint
-from vnet.scenario import Scenario
+from vnet.transport import keys, wire
+from vnet.transport.access import OBSERVER, Access
+from vnet.transport.session import open_router, router_endpoint
 
 ROOT = Path(__file__).parents[1]
 RUN = "observed"

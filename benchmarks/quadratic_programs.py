@@ -17,7 +17,7 @@ import piqp
 import scipy.sparse as sp
 
 from vnet.cmm.weights import RIDGE_FLOOR_M2, OptimizedWeights, check_covariances
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 NEIGHBOURS = (10, 20, 30)
 PROBLEMS, WARM_UP = 300, 20

@@ -6,10 +6,10 @@ import time
 import numpy as np
 import pyarrow as pa
 
-from emulator.observe.checks import Evidence
-from emulator.observe.metrics import STATES
-from emulator.observe.radio_metrics import radio_metrics
-from vnet.scenario import Scenario
+from emulator.checks.judge import Evidence
+from emulator.records.metrics import STATES
+from emulator.records.radio_metrics import radio_metrics
+from emulator.scenario.scenario import Scenario
 
 PERIOD_NS = 100_000_000
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from emulator.observe.run_folder import Event, read_events
-from vnet.faults import parse_fault
-from vnet.scenario import Scenario, dump_scenario
+from emulator.records.run_folder import Event, read_events
+from emulator.scenario.faults import parse_fault
+from emulator.scenario.scenario import Scenario, dump_scenario
 
 VEHICLES, SETTLE_S = 20, 20.0
 EVERY_S, SHORTEST_S, LONGEST_S = 12.0, 3.0, 10.0

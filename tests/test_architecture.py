@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.support.paths import ROOT
+
 FORBIDDEN = {"vnet": {"agents", "emulator"}, "agents": {"emulator"}, "emulator": {"agents"}}
 
 
@@ -43,7 +44,7 @@ def imported(code: str) -> set[str]:
 @pytest.mark.parametrize(
     "code",
     [
-        "import json, emulator.engine as e",
+        "import json, emulator.radio.engine as e",
         "def f():\n    from emulator.world import world",
         "if TYPE_CHECKING:\n    from emulator import engine",
         "import_module('emulator.cli')",

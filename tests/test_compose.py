@@ -1,21 +1,20 @@
 """compose.yaml: its structure, and that every command in it parses. No Docker engine is needed."""
 
 import shlex
-from pathlib import Path
 
 import pytest
 import typer.main
 import yaml
 
 import agents.cli
-import emulator.cli
+import emulator.cli.commands
+from emulator.scenario.scenario import load_scenario
 from emulator.world.world import build_world
-from vnet.scenario import load_scenario
+from tests.support.paths import ROOT
 
-ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES = COMPOSE["services"]
-PROGRAMS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
+PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 SCENARIO = load_scenario(ROOT / "scenarios" / "beacon.toml")
 
 

@@ -1,5 +1,5 @@
 """vnet: what vehicle programs and the emulator agree on. A program needs only `from vnet import Node`."""
 
-from vnet.link.node import Fix, Node, Packet
+from vnet.node import Fix, Node, Packet
 
 __all__ = ["Fix", "Node", "Packet"]

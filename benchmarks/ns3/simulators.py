@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.ns3.ground import SIZE_BYTES, Ground, Outcome
-from emulator.channel.outcomes import Outcome as Fate
-from emulator.engine import Engine
-from vnet.scenario import Radio
+from emulator.radio.engine import Engine
+from emulator.radio.outcomes import Outcome as Fate
+from emulator.scenario.scenario import Radio
 
 PROGRAM = Path(__file__).with_name("broadcast.cc")
 MODULES = ("core", "network", "mobility", "propagation", "wifi", "wave")

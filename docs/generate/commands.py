@@ -9,10 +9,10 @@ import typer
 import typer.main
 
 import agents.cli
-import emulator.cli
+import emulator.cli.commands
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
-from emulator.observe.checks import Verdict
+from emulator.checks.judge import Verdict
 
 INTRODUCTION = """
 `vnet` runs and judges; `vnet-agent` is one process with vehicles in it, which `vnet run` starts by itself. Each
@@ -27,7 +27,7 @@ AGENT = """
 `vnet-agent` ends with 0 when the run is over, 2 if the program cannot be loaded, 3 if the emulator was not found,
 has refused, or is gone.
 """
-PROGRAMS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
+PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 Command = Any
 """A command of typer's; typer brings a click of its own, whose classes it does not export."""
 

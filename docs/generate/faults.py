@@ -8,7 +8,7 @@ from typing import Any, get_args
 from docs.generate.keys import key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
-from vnet import faults
+from emulator.scenario import faults
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a
@@ -35,7 +35,7 @@ A selector is a table with one of these keys; without it, all vehicles are meant
 """
 MISBEHAVIOUR = """
 Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what
-payloads mean: lies in them are a program, `agents.liar:main`, for some vehicles
+payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, for some vehicles
 ([`[[program.exceptions]]`](scenario.md#programexceptions)).
 """
 INFRASTRUCTURE = """

@@ -11,10 +11,10 @@ import pyarrow as pa
 from docs.generate.keys import unit
 from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
-from emulator.channel.outcomes import Outcome
-from emulator.observe.busy import busy_table
-from emulator.observe.metrics import STATES, Metrics, PeriodFigures
-from emulator.observe.trace import Trace
+from emulator.radio.outcomes import Outcome
+from emulator.radio.trace import Trace
+from emulator.records.busy import busy_table
+from emulator.records.metrics import STATES, Metrics, PeriodFigures
 
 INTRODUCTION = """
 A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`

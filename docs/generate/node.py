@@ -12,7 +12,7 @@ from docs.generate.keys import unit
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
 from vnet.errors import PayloadTooLargeError
-from vnet.link.node import INBOX_LIMIT, GnssReceiver, Radio
+from vnet.node import INBOX_LIMIT, GnssReceiver, Radio
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 

@@ -9,11 +9,11 @@ from typing import get_args
 
 from pydantic import BaseModel
 
-from agents import cooperative_options
+from agents.cooperative import options as cooperative_options
 from docs.generate.keys import HEADER, key_table, number, subsections, unit
 from docs.generate.markdown import attribute_docstrings, docstring, sentence, table
 from docs.generate.markdown import page as whole_page
-from vnet.scenario import ProgramException, Scenario
+from emulator.scenario.scenario import ProgramException, Scenario
 
 INTRODUCTION = """
 A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is

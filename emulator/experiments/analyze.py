@@ -21,14 +21,14 @@ from rich.table import Table
 from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from emulator.channel.reach import reach_of
-from emulator.channel.topology import Topology
+from emulator.radio.connectivity import reach_of
+from emulator.radio.topology import Topology
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
 from vnet.errors import ScenarioError, VnetError
-from vnet.roads.lanes import Array
-from vnet.scenario import Scenario
+from vnet.types import Array
 
 Links = NDArray[np.bool_]
 FASTEST = "fastest-mixing"

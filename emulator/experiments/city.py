@@ -17,16 +17,16 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from pydantic import ValidationError
 
-from emulator.experiments.cells import Cell, has_result, has_states, read_series, read_states
+from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
 from emulator.experiments.figures import against_time, save, styled
 from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, in_seeds, markdown_table, mean_and_error
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError, VnetError
-from vnet.roads.lanes import Array
-from vnet.scenario import Scenario
-from vnet.sections import first_problem
+from vnet.types import Array
 
 LOSS = 0.1
 CENTRALIZED_PARTICLES = 2000

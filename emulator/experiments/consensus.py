@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.experiments.analyze import (
     FASTEST,
     NO_CVXPY,
@@ -27,13 +28,12 @@ from emulator.experiments.analyze import (
     mutual,
     ratio_matrix,
 )
-from emulator.experiments.cells import Cell, read_series, run_cells, write_results
 from emulator.experiments.paper import RANGE_M, network_sections
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
-from vnet.roads.lanes import Array
-from vnet.scenario import Scenario
+from vnet.types import Array
 
 RULES = ("ratio", "metropolis", "max-degree")
 LOSSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)

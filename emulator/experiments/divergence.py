@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.experiments.cells import DIVERGENT_M, DIVERGENT_S, Cell
+from emulator.cells.cells import DIVERGENT_M, DIVERGENT_S, Cell
 from emulator.experiments.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from emulator.experiments.tables import mean_and_standard_error, paired_ratio
 from emulator.world.networks import REFERENCE_RANGE_M
 from emulator.world.world import components
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 Networks = Mapping[str, tuple[Array, Array]]
 """Name → positions (N, 2) in metres, east and north, and headings (N,) in radians from east to north."""

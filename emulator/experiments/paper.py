@@ -2,7 +2,7 @@
 
 Table I: four vehicles at a crossing, each hearing the next on a directed ring. Table II: the published networks, or
 generated ones of the same character. In the paper's profile the filters start at the true common error, the
-network's mean is exact and lanes are bounded on one side; the constants are in `agents/cooperative_options.py`.
+network's mean is exact and lanes are bounded on one side; the constants are in `agents/cooperative/options.py`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from emulator.experiments.cells import Cell
+from emulator.cells.cells import Cell
+from emulator.scenario.scenario import Scenario
 from emulator.world.networks import generate_network, load_network
 from emulator.world.world import build_world, components
 from vnet.errors import VnetError
-from vnet.scenario import Scenario
 
 Labels = dict[str, str | int | float]
 NETWORKS = {"n1": 50, "n2": 38, "n3": 24}

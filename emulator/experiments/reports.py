@@ -16,7 +16,7 @@ from emulator.experiments.tables import (
     paired_ratio,
     with_error,
 )
-from emulator.observe.metrics import anees_band
+from emulator.records.metrics import anees_band
 
 Result = Mapping[str, Any]
 LIMIT_RATIO = 1.35

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 MISSING = "–"
 _NUMBER = re.compile(r"[-−+]?\d")

@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emulator.faults.selectors import Mask, Nodes, links_of, select, severed_by
-from vnet.errors import ScenarioError
-from vnet.faults import (
+from emulator.faults.selectors import Nodes, links_of, select, severed_by
+from emulator.scenario.faults import (
     ConstPosOffset,
     Fault,
     GnssJump,
@@ -28,7 +27,10 @@ from vnet.faults import (
     Range,
     Swizzle,
 )
-from vnet.scenario import NS_PER_S, Scenario
+from emulator.scenario.scenario import Scenario
+from vnet.errors import ScenarioError
+from vnet.types import Mask
+from vnet.units import NS_PER_S
 
 NEVER_NS = 0.1
 """Less than an instant: a fault that lasts so long does not act."""

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.faults import LinkFault, Partition, Selector
 from vnet.errors import ScenarioError
-from vnet.faults import LinkFault, Partition, Selector
-from vnet.roads.lanes import Array
-
-Mask = NDArray[np.bool_]
+from vnet.types import Array, Mask
 
 
 @dataclass(frozen=True)

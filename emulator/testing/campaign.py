@@ -26,15 +26,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from emulator.observe.run_folder import RUNS
+from emulator.records.run_folder import RUNS
+from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.schedules import WEIGHTS, Ground, draw_fault, known_kinds
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.trial import Trial, Workshop
 from vnet.errors import ScenarioError, VnetError
-from vnet.link.hosting import load_program
-from vnet.scenario import Scenario, dump_scenario
+from vnet.runtime.host import load_program
 
 FORMAT = 1
 LONGEST_S = 20.0

@@ -19,21 +19,22 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.checks.judge import CheckResult, Judgement, Verdict
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
-from emulator.observe.checks import CheckResult, Judgement, Verdict
-from emulator.observe.metrics import PeriodFigures
-from emulator.observe.run_folder import Event, RunFolder
-from emulator.run.attachment import LiveOptions
-from emulator.run.conclude import conclude
-from emulator.run.emulation import Emulation
-from emulator.run.join import split_into_processes
+from emulator.records.metrics import PeriodFigures
+from emulator.records.run_folder import Event, RunFolder
+from emulator.scenario.faults import LONGEST_S, Selector, parse_fault
+from emulator.scenario.scenario import Scenario
 from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError, VnetError
-from vnet.faults import LONGEST_S, Selector, parse_fault
-from vnet.link.access import Access
-from vnet.link.session import quiet_zenoh
-from vnet.scenario import NS_PER_S, Scenario
+from vnet.transport.access import Access
+from vnet.transport.session import quiet_zenoh
+from vnet.units import NS_PER_S
 
 SELECTORS = ("nodes", "senders", "receivers")
 

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from emulator.observe.checks import Verdict
+from emulator.checks.judge import Verdict
 
 SIGNS = {Verdict.VALID: "✓", Verdict.INVALID: "✗", Verdict.UNKNOWN: "?"}
 # Colours of Okabe and Ito (2008), which those who are colour-blind tell apart; the signs say the same.

@@ -8,9 +8,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.sections import first_problem
 from vnet.errors import ScenarioError
-from vnet.scenario import Scenario, load_scenario
-from vnet.sections import first_problem
 
 Source = str | Path | Mapping[str, Any] | Scenario
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from emulator.run.join import split_into_processes
+from emulator.drivers.join import split_into_processes
+from emulator.scenario.faults import KINDS, Fault, parse_fault
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError, did_you_mean
-from vnet.faults import KINDS, Fault, parse_fault
-from vnet.scenario import Scenario
 
 T = TypeVar("T")
 

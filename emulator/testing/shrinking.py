@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from vnet.faults import Fault, Selector
+from emulator.scenario.faults import Fault, Selector
 
 Schedule = tuple[Fault, ...]
 SHORTEST_S = 0.1

@@ -11,11 +11,11 @@ from abc import ABC, abstractmethod
 from concurrent.futures import Future
 from queue import SimpleQueue
 
-from emulator.run.attachment import LiveOptions
-from emulator.run.emulation import Emulation
-from emulator.run.live import run_live
-from emulator.run.pacing import Lockstep
-from emulator.run.simulate import simulate
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.live import run_live
+from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.simulate import simulate
 
 
 class SteppedRun(ABC):

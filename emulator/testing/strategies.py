@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 from hypothesis import strategies as st
 
+from emulator.scenario.faults import Fault
 from emulator.testing.scenarios import Source, make_scenario
 from emulator.testing.schedules import Ground, draw_fault, known_kinds
-from vnet.faults import Fault
 
 T = TypeVar("T")
 

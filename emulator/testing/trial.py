@@ -15,18 +15,23 @@ from pathlib import Path
 import numpy as np
 import pyarrow.compute as pc
 
-from emulator.observe.checks import Verdict
-from emulator.observe.run_folder import RunFolder
-from emulator.run.conclude import conclude
-from emulator.run.emulation import Emulation
-from emulator.run.simulate import simulate
+from emulator.checks.judge import Verdict
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.scenario import Scenario
 
 GREATEST = 1e6
 """No number that a vehicle reports grows beyond it: metres, and their squares, of vehicles in one town."""
 HUNG, EMULATOR, GROWTH = "hung", "emulator", "growth"
-PRELOADED = ("emulator.testing.campaign", "emulator.experiments.cli", "emulator.run.live", "emulator.run.progress")
+PRELOADED = (
+    "emulator.testing.campaign",
+    "emulator.cli.experiment",
+    "emulator.drivers.live",
+    "emulator.terminal.progress",
+)
 POLL_S = 0.1
 STACKS_AT = 0.9
 """At this share of its time limit a trial writes down where it stands."""

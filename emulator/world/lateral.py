@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 
 def stray(normal: Array, sigma_m: float, keep: float, half_width_m: float) -> Array:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.scenario import Radio
 from emulator.world.csv_file import MOST_ROWS, check_row_count, open_csv
 from vnet.errors import ScenarioError, shown
-from vnet.scenario import Radio
 
 _LONGEST_LINE = 10 * MOST_ROWS
 """An entry may be written as `1.000000,`."""

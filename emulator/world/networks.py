@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from emulator.world.csv_file import check_row_count, open_csv
 from vnet.errors import ScenarioError, shown
-from vnet.link.keys import is_segment
-from vnet.roads.lanes import Array
+from vnet.transport.keys import is_segment
+from vnet.types import Array
 
 COLUMNS = ("id", "x_m", "y_m", "heading_rad")
 REFERENCE_RANGE_M = 3000.0

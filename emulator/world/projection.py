@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vnet.errors import ScenarioError, printable
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 if TYPE_CHECKING:
     from pyproj import Transformer

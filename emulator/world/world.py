@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from emulator.scenario.scenario import Gnss, Scenario
 from emulator.world.lateral import stray
 from emulator.world.links import load_links
 from emulator.world.maps.around import read_lanes
@@ -23,10 +24,11 @@ from emulator.world.networks import Network, generate_network, load_network
 from emulator.world.trips.drive import drive, drive_through_city
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
-from vnet.link.node import Fix
-from vnet.roads.lanes import Array, LaneMap
+from vnet.node import Fix
+from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
-from vnet.scenario import NS_PER_S, Gnss, Scenario
+from vnet.types import Array
+from vnet.units import NS_PER_S
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agents.averaging import Averager, Options, decode, encode
-from agents.cooperative_frame import short_name
-from emulator.observe.run_folder import RunFolder
-from emulator.run.emulation import Emulation
-from emulator.run.simulate import simulate
+from agents.cooperative.frame import short_name
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet import Packet
 from vnet.cmm.consensus import Share
 from vnet.errors import ProgramError
-from vnet.scenario import Scenario
 
 PERIOD_NS = 100_000_000
 names = st.frozensets(st.integers(0, 10_000).map(lambda number: short_name(f"v{number}")), max_size=40)

@@ -15,10 +15,10 @@ from typing import Any
 import typer.main
 
 import agents.cli
-import emulator.cli
+import emulator.cli.commands
 from tests.docs.markdown import ROOT
 
-APPS = {"vnet": emulator.cli.app, "vnet-agent": agents.cli.app}
+APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
 APART = ("campaign",)

@@ -21,10 +21,10 @@ from typing import Any
 
 import yaml
 
+from emulator.scenario.scenario import load_scenario
 from tests.docs import commands
 from tests.docs.commands import DocsError
 from tests.docs.markdown import ROOT, Block, blocks
-from vnet.scenario import load_scenario
 
 NOT_INSTALLED = re.compile(r"^(import|from) pandas\b", re.MULTILINE)
 """What examples use and vnet does not need: such blocks are only compiled."""

@@ -11,18 +11,18 @@ import pytest
 from docs.generate import PAGES, REFERENCE, faults, files
 from docs.generate.keys import key_table
 from docs.generate.markdown import attribute_docstrings
-from emulator.channel.outcomes import Outcome
-from emulator.observe.checks import OF_BELIEFS, OF_FRAMES, OF_THE_RADIO, OF_THE_RUN
-from emulator.observe.metrics import STATES
-from emulator.observe.run_folder import RunFolder
-from emulator.run.conclude import conclude
-from emulator.run.emulation import Emulation
-from emulator.run.simulate import simulate
+from emulator.checks.judge import OF_BELIEFS, OF_FRAMES, OF_THE_RADIO, OF_THE_RUN
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.radio.outcomes import Outcome
+from emulator.records.metrics import STATES
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.faults import KINDS
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.sections import Section
 from emulator.world.world import build_world
 from tests.docs.markdown import ROOT
-from vnet.faults import KINDS
-from vnet.scenario import Scenario
-from vnet.sections import Section
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -81,7 +81,7 @@ def test_a_column_without_a_text_is_refused() -> None:
 def event_kinds() -> set[str]:
     """The kinds of events that the emulator's code names; f-strings aside."""
     found = set()
-    for path in (ROOT / "emulator" / "run").glob("*.py"):
+    for path in (ROOT / "emulator" / "drivers").glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             match node:
                 case ast.Call(func=ast.Attribute(attr="event"), args=[_, ast.Constant(value=str(kind)), *_]):

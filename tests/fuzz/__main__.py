@@ -34,7 +34,7 @@ def fuzz(name: str, runs: int, seconds: int, folder: Path) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["vnet", "agents", "emulator", "tomllib", "csv"]):
-        from tests.fuzz.nasties import NASTIES
+        from tests.fuzz.adversarial_inputs import NASTIES
         from tests.fuzz.targets import TARGETS
     target = next(target for target in TARGETS if target.name == name)
     corpus = folder / "corpus"

@@ -17,25 +17,25 @@ from typing import Any
 
 import numpy as np
 
-from agents import cooperative_frame
-from emulator.observe.run_folder import RunFolder
-from emulator.run.control import answer
-from emulator.run.course import Course
-from emulator.run.emulation import Emulation
+from agents.cooperative import frame as cooperative_frame
+from emulator.drivers.control import answer
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.status import Course
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.scenario import Network, Radio, Scenario, dump_scenario, load_scenario
+from emulator.scenario.sumo import input_files, read_begin_s
 from emulator.world.links import load_links
 from emulator.world.maps.files import read_roads
 from emulator.world.networks import load_network
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
-from tests.emulator import maps
+from tests.support import maps
 from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, VnetError, WireError
-from vnet.faults import KINDS, parse_fault
-from vnet.link import wire
-from vnet.link.access import Access, Credentials
-from vnet.link.node import Report
+from vnet.node import Report
 from vnet.roads.road_map import RoadMap
-from vnet.scenario import Network, Radio, Scenario, dump_scenario, load_scenario
-from vnet.sumo import input_files, read_begin_s
+from vnet.transport import wire
+from vnet.transport.access import Access, Credentials
 
 OVERRIDE = b"\n--set "
 """Stands between a scenario file and each override in one input of the scenario target."""

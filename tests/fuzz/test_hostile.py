@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.nasties import NASTIES
+from tests.fuzz.adversarial_inputs import NASTIES
 from tests.fuzz.targets import TARGETS, Target
 
 LONGEST_CPU_S = 10

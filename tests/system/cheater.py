@@ -11,9 +11,9 @@ import threading
 import zenoh
 
 from vnet.errors import LinkError
-from vnet.link import keys, wire
-from vnet.link.access import Credentials
-from vnet.link.session import open_client, quiet_zenoh
+from vnet.transport import keys, wire
+from vnet.transport.access import Credentials
+from vnet.transport.session import open_client, quiet_zenoh
 
 VICTIM = "v01"
 

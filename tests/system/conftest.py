@@ -11,7 +11,8 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-ROOT = Path(__file__).parents[2]
+from tests.support.paths import ROOT
+
 VNET = [sys.executable, "-P", "-m", "emulator.cli"]
 AGENT = [sys.executable, "-P", "-m", "agents.cli"]
 TIMEOUT_S = 300

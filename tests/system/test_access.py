@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from emulator.observe.run_folder import RunFolder
-from emulator.run.attachment import LiveOptions
-from emulator.run.conclude import conclude
-from emulator.run.emulation import Emulation
-from emulator.run.live import run_live
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.live import run_live
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import load_scenario
 from emulator.world.world import build_world
 from tests.system.conftest import ROOT, TIMEOUT_S
 from vnet.errors import VnetError
-from vnet.link.access import Access, node_user
-from vnet.scenario import load_scenario
+from vnet.transport.access import Access, node_user
 
 NODES = [["v01"], ["v02"], ["v03"], ["v04"]]
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from emulator.run.control import CONTROL_FILE, OPERATOR_FILE, ask
+from emulator.drivers.control import CONTROL_FILE, OPERATOR_FILE, ask
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
-from vnet.link import keys
-from vnet.link.access import Credentials
-from vnet.link.session import open_client
+from vnet.transport import keys
+from vnet.transport.access import Credentials
+from vnet.transport.session import open_client
 
 LOSS = {"kind": "loss", "duration_s": 3000.0, "probability": 1.0}
 

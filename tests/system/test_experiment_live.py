@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from emulator.cells.cells import run_cells
 from emulator.experiments import paper
-from emulator.experiments.cells import run_cells
 
 
 def test_a_cell_run_over_zenoh_has_the_numbers_of_its_simulation(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """What a user meets when things go wrong: one clear line, no process left, files readable."""
 
-import os
 import resource
-import select
 import signal
 import socket
 import subprocess
@@ -12,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from emulator.observe.checks import check_run
+from emulator.checks.judge import check_run
+from tests.support.processes import has_ended
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
 
 LONG = ["--program", "tests.system.programs:runs_long", "--duration", "3600", "--set", "network.vehicles=3"]
@@ -35,13 +34,7 @@ def long_run(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
 def wait_for_exit(pids: list[int]) -> None:
     """Wait until processes that are not our children have ended."""
     for pid in pids:
-        try:
-            descriptor = os.pidfd_open(pid)
-        except ProcessLookupError:
-            continue
-        ready, _, _ = select.select([descriptor], [], [], TIMEOUT_S)
-        os.close(descriptor)
-        assert ready, f"process {pid} is still there"
+        assert has_ended(pid, TIMEOUT_S), f"process {pid} is still there"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import signal
 import subprocess
 import time
@@ -14,9 +13,10 @@ from typing import Any
 import pytest
 import tomli_w
 
+from tests.support.processes import has_ended
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
 
-PROGRAM = "tests.emulator.fault_programs:minds_the_order"
+PROGRAM = "tests.support.fault_programs:minds_the_order"
 
 EVERY_SORT = [
     {"kind": "kill", "at_s": 0.53, "duration_s": 0.6, "nodes": {"ids": ["v01"]}},
@@ -72,15 +72,7 @@ def processes_of(folder: Path) -> dict[int, str]:
 def wait_until_all_are_gone(folder: Path) -> None:
     """Wait until the processes of a run, which are not our children, have ended."""
     for pid in processes_of(folder):
-        try:
-            descriptor = os.pidfd_open(pid)
-        except ProcessLookupError:
-            continue
-        try:
-            ready, _, _ = select.select([descriptor], [], [], 120)  # a recorder draws what still waits
-        finally:
-            os.close(descriptor)
-        if not ready:
+        if not has_ended(pid, 120):  # a recorder draws what still waits
             os.kill(pid, signal.SIGKILL)
             pytest.fail(f"process {pid} is left behind")
     assert processes_of(folder) == {}

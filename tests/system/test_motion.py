@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import tomli_w
 
-from tests.emulator.motion import along, still, write_trips
-from tests.emulator.test_city_map import driving
+from emulator.scenario.scenario import dump_scenario
+from tests.emulator.world.maps.test_city_map import driving
+from tests.support.motion import along, still, write_trips
 from tests.system.conftest import AGENT, ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
-from vnet.scenario import dump_scenario
 
-PROGRAM = "tests.emulator.fault_programs:minds_the_order"
+PROGRAM = "tests.support.fault_programs:minds_the_order"
 VEHICLES = {
     "v1": [(0, 4, along(0, 10))],
     "v2": [(0, 4, still(0, 50))],

@@ -2,7 +2,6 @@
 
 import json
 import os
-import select
 import shlex
 import signal
 import subprocess
@@ -12,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from emulator.observe.sinks import is_closed
-from tests.emulator.recordings import descendants, listening_addresses, read_back, rrd
+from emulator.viewer.sinks import is_closed
+from tests.support.processes import has_ended
+from tests.support.recordings import descendants, listening_addresses, read_back, rrd
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
@@ -44,11 +44,7 @@ def wait_for_recording(folder: Path, process: subprocess.Popen[str], least_bytes
 
 
 def wait_for_end(pid: int) -> None:
-    descriptor = os.pidfd_open(pid)
-    try:
-        assert select.select([descriptor], [], [], TIMEOUT_S)[0]
-    finally:
-        os.close(descriptor)
+    assert has_ended(pid, TIMEOUT_S)
 
 
 def verdict_of(folder: Path) -> str:

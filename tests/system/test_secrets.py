@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from emulator.observe.run_folder import RunFolder
-from emulator.observe.sinks import Sinks
-from emulator.run.conclude import conclude
-from emulator.run.emulation import Emulation
-from emulator.run.live import LiveOptions, run_live
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.live import LiveOptions, run_live
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import load_scenario
+from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world
 from tests.system.conftest import ROOT, running_agents
-from vnet.link.access import Access, KeyPair
-from vnet.link.session import open_router
-from vnet.scenario import load_scenario
+from vnet.transport.access import Access, KeyPair
+from vnet.transport.session import open_router
 
 NODES = [["v01"], ["v02"], ["v03"]]
 LISTEN = {"passwords": "tcp/127.0.0.1:0", "certificates": "tls/127.0.0.1:0"}

@@ -17,16 +17,16 @@ from pathlib import Path
 
 import pytest
 
-from emulator.cli import app
-from emulator.run.control import ask, way_in
-from emulator.run.course import Snapshot
-from emulator.terminal import run_app
-from tests.emulator.screen import Screen
+from emulator.cli.commands import app
+from emulator.drivers.control import ask, way_in
+from emulator.drivers.status import Snapshot
+from emulator.terminal.console import run_app
+from tests.support.screen import Screen
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import LinkError
-from vnet.link import session
-from vnet.link.access import Access
+from vnet.transport import session
+from vnet.transport.access import Access
 
 DOCS = (ROOT / "docs" / "terminal.md").read_text()
 SHORT = ["scenarios/beacon.toml", "--duration", "3", "--set", "network.vehicles=4"]

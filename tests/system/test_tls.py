@@ -14,10 +14,10 @@ import zenoh
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
 from tests.system.test_by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents, start_emulator
 from vnet.errors import LinkError
-from vnet.link import keys, session
-from vnet.link.access import Access, Certificates, Credentials, Identity, node_user
-from vnet.link.certificates import issue_certificates
-from vnet.link.session import open_client, open_router, router_endpoint
+from vnet.transport import keys, session
+from vnet.transport.access import Access, Certificates, Credentials, Identity, node_user
+from vnet.transport.certificates import issue_certificates
+from vnet.transport.session import open_client, open_router, router_endpoint
 
 LISTEN = "tls/127.0.0.1:0"
 LEASE_MS = 10_000

@@ -24,7 +24,7 @@ from typing import Protocol
 import numpy as np
 
 from vnet.errors import VnetError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 
 @dataclass(frozen=True)

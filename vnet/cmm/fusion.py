@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from vnet.cmm.rbpf import Rbpf, systematic
 from vnet.cmm.weights import largest_remainder
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 
 @dataclass(frozen=True)

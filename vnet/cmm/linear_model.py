@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
 from vnet.errors import VnetError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 
 def steady_state_covariance(transition: Array, noise: Array) -> Array:

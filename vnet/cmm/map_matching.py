@@ -27,8 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
-from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
+from vnet.types import Array
 
 FAR_SIGMAS = 5.0
 """Beyond this many deviations outside the lane, the difference of two Φ would lose its digits."""

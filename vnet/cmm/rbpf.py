@@ -25,8 +25,9 @@ from numpy.typing import NDArray
 
 from vnet.cmm.map_matching import matcher
 from vnet.errors import VnetError
-from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
+from vnet.types import Array
 
 
 @dataclass(frozen=True)

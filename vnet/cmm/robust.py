@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 GATE_SIGMAS = 5.0
 GATE_FLOOR_M = 0.25

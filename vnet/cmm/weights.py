@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from vnet.errors import VnetError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 RIDGE_FLOOR_M2 = 0.01
 MOST_SOLVERS = 64

@@ -1,0 +1,1 @@
+"""Roads as vehicles know them: straight lanes, and the map of a city with its index."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 Ints = NDArray[np.intp]
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vnet.roads.grid import Grid
-from vnet.roads.lanes import Array, LaneMap
+from vnet.roads.lanes import LaneMap
+from vnet.types import Array
 
 INDEX_STEP_M = 40.0
 """The index holds a point for at least every so many metres of a segment."""

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from emulator.scenario.scenario import Map
 from emulator.world.maps.files import read_roads
 from emulator.world.maps.roads import Roads
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
 from vnet.roads.road_map import RoadMap
-from vnet.scenario import Map
+from vnet.types import Array
 
 FAR_M = 100.0
 """Who is further from all roads is off the map."""

@@ -19,7 +19,7 @@ from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.streets import Street, add_streets, divided
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 SIZE_M = 3000.0
 SMALLEST_M, LARGEST_M = 1000.0, 10_000.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 
 @dataclass(frozen=True)

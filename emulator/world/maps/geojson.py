@@ -26,7 +26,7 @@ from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.tags import Street, street
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, printable, shown
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 LARGEST_BYTES = 512 * 2**20
 _WGS84_NAMES = ("CRS84", "EPSG::4326", "EPSG:4326")

@@ -29,7 +29,7 @@ from emulator.world.maps.roads import MOST_POINTS, Ints, Roads, check_extent
 from emulator.world.networks import FARTHEST_M
 from emulator.world.projection import Frame, project
 from vnet.errors import ScenarioError, shown
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 LARGEST_ARRAY_BYTES = 16 * MOST_POINTS
 _NODES = ("node_lon_deg", "node_lat_deg", "node_x_m", "node_y_m")

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from emulator.world.maps.classes import NAMES
 from emulator.world.maps.roads import Roads
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 CLOSE_M = 800.0
 """Pictures of no more than this show lanes."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
 from emulator.world.projection import WIDEST_M, Frame, most_off, project
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
 from vnet.roads.road_map import RoadMap, touch_box
+from vnet.types import Array
 
 MOST_POINTS = 5_000_000
 """A map has no more points: a large city has a tenth of that."""

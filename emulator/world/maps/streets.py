@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from emulator.world.maps.classes import LANE_WIDTH_M, LANES, NUMBER
 from emulator.world.maps.roads import Ints, RoadsBuilder
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 STEP_M = 30.0
 """No two points of a street are further apart."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 HARDEST_MPS2 = 10.0
 """No vehicle starts harder."""

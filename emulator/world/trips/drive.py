@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from emulator.scenario.scenario import Map, Network
+from emulator.scenario.sumo import read_begin_s
 from emulator.world.maps.around import lanes_around
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
@@ -17,8 +19,7 @@ from emulator.world.trips.samples import Samples
 from emulator.world.trips.tables import read_csv, read_parquet
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
-from vnet.scenario import NS_PER_S, Map, Network
-from vnet.sumo import read_begin_s
+from vnet.units import NS_PER_S
 
 READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
 """By the ending of the file's name."""

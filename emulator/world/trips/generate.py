@@ -19,8 +19,8 @@ from emulator.world.maps.roads import Ints, Roads
 from emulator.world.trips.motion import MOST_STATES, SHORTEST_STAY_S, Motion
 from emulator.world.trips.routes import Network
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
-from vnet.scenario import NS_PER_S
+from vnet.types import Array
+from vnet.units import NS_PER_S
 
 LATERAL_MPS2, STARTING_MPS2, BRAKING_MPS2 = 2.5, 2.0, 2.5
 SLOWEST_MPS = 1.5

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from emulator.world.arrays import read_arrays
 from emulator.world.trips.samples import DEGREES, METRES, MOST_SAMPLES, OPTIONAL, Samples
 from vnet.errors import ScenarioError, printable
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 _LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
 """Of one array."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from emulator.world.trips.clean import Rules, clean
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
-from vnet.scenario import NS_PER_S
+from vnet.types import Array
+from vnet.units import NS_PER_S
 
 STANDING_MPS = 0.5
 """A vehicle that is slower stands, and keeps its heading."""

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from emulator.world.maps.classes import NAMES
 from emulator.world.maps.roads import Ints, Roads
 from vnet.errors import ScenarioError
-from vnet.roads.lanes import Array
+from vnet.types import Array
 
 SPEED_M_S = {
     "motorway": 29.0,

@@ -14,12 +14,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.scenario.scenario import FAR_S
 from emulator.world.networks import FARTHEST_M
 from emulator.world.projection import middle_deg, project
 from vnet.errors import ScenarioError, shown
-from vnet.link.keys import is_segment
-from vnet.roads.lanes import Array
-from vnet.scenario import FAR_S
+from vnet.transport.keys import is_segment
+from vnet.types import Array
 
 MOST_SAMPLES = 10_000_000
 """How many samples are kept in memory."""

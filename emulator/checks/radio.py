@@ -1,0 +1,279 @@
+"""Checks of a physical radio: frames fade as often as they should, and the medium is shared by its rules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import log, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammainccinv
+from scipy.stats import chi2
+
+from emulator.checks.channel import nothing_seen, received_twice
+from emulator.radio.csma import times_ns
+from emulator.radio.dot11p import DETECTION_NS, arrival_probability
+from emulator.radio.medium import WINDOW_NS
+from emulator.radio.reception import Threshold, milliwatts
+from emulator.records.recorded_run import ON_AIR, Evidence
+from emulator.records.verdicts import Finding, NotExercised, result
+from emulator.scenario.faults import Throttle
+from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
+from emulator.scenario.scenario import Radio
+from vnet.types import Array, IntArray, Mask
+
+SIGMAS = 4.9
+"""One sum in a million is further off."""
+CERTAIN = 1e-6
+TELLING_VARIANCE = 5.0
+"""Of how many faded on a link: with less, a sum is not yet normal."""
+GRID_DB = 0.25
+FACTORS = 1024
+NEVER_SENT = ("queue_full", "oversize", "held_back")
+LEAST_PAUSE_NS = 25_000_000
+ROUNDING = 1e-6
+
+
+def check_fading(evidence: Evidence) -> Finding:
+    """Of the pairs that came as far as the receiver, so many faded as path loss, fading and noise make expect."""
+    name = "fading"
+    radio = evidence.scenario.radio
+    if not radio.is_physical:
+        return NotExercised(name, "signals have no power: a frame fades nowhere within the range")
+    drawing = np.flatnonzero(evidence.outcome_is(*ON_AIR) & ~received_twice(evidence) & evidence.placed)
+    if not len(drawing):
+        return nothing_seen(name, evidence, "no pair came as far as the receiver")
+    survives = _survival(evidence, radio, drawing)
+    faded = evidence.outcome_is("faded")[drawing]
+    expected, seen = float((1 - survives).sum()), int(faded.sum())
+    away = SIGMAS * sqrt(float((survives * (1 - survives)).sum())) + (log(1e6) / 3 if expected > 0 else 0)
+    broken = not expected - away <= seen <= expected + away
+    share, law = seen / len(drawing), expected / len(drawing)
+    text = f"{seen:,} of {len(drawing):,} pairs faded, {share:.2%}; {law:.2%} expected"
+    figures: dict[str, Any] = {"faded": seen, "pairs": len(drawing), "rate": share, "expected": law}
+    unlike, figures["links"] = _unlike_their_law(evidence, drawing, survives, faded)
+    broken_text = f"{text}: outside its band" if broken else f"{text}, but not on the links on which they should"
+    rows = drawing[faded == (seen > expected)]
+    if radio.fading is None and (impossible := np.where(faded, survives >= 1, survives <= 0)).any():
+        rows, unlike = drawing[impossible], True
+        broken_text = f"{len(rows)} pairs did what cannot be"
+        figures["impossible"] = len(rows)
+    return result(name, broken + unlike, text, broken_text, evidence.rows(rows), **figures)
+
+
+def _unlike_their_law(evidence: Evidence, rows: NDArray[np.intp], survives: Array, faded: Mask) -> tuple[bool, int]:
+    """Whether the links all in all differ from what is expected of each, by χ²; and how many say anything."""
+    link = evidence.sender[rows] * len(evidence.node_ids) + evidence.receiver[rows]
+    variance, differs = np.bincount(link, survives * (1 - survives)), np.bincount(link, faded - (1 - survives))
+    telling = variance >= TELLING_VARIANCE
+    squares = float((differs[telling] ** 2 / variance[telling]).sum())
+    return bool(chi2.sf(squares, max(1, int(telling.sum()))) < CERTAIN), int(telling.sum())
+
+
+def _survival(evidence: Evidence, radio: Radio, rows: NDArray[np.intp]) -> Array:
+    """(n,) the probabilities with which pairs arrive if nobody else sends."""
+    sender, receiver, sent_ns = evidence.sender[rows], evidence.receiver[rows], evidence.sent_ns[rows]
+    power_mw = evidence.places.pair_powers_mw(sender, receiver, sent_ns)
+    shape = np.zeros(len(rows), np.intp)
+    shapes: tuple[float, ...] = (np.inf,)
+    if radio.fading is not None:
+        shapes = radio.fading.m
+        shape = np.searchsorted(radio.fading.until_m, evidence.places.pair_distances_m(sender, receiver, sent_ns))
+    power_db = np.full(len(rows), -np.inf)
+    np.log10(power_mw, out=power_db, where=power_mw > 0)
+    power_db *= 10
+    survives = np.zeros(len(rows))
+    heard = power_mw > 0
+    airtime_ns = evidence.airtime_ns[rows]
+    for number, m in enumerate(shapes):
+        for length_ns in np.unique(airtime_ns).tolist():
+            some = heard & (shape == number) & (airtime_ns == length_ns)
+            if some.any():
+                survives[some] = _arrives(radio, m, length_ns, power_db[some])
+    return survives
+
+
+def _arrives(radio: Radio, m: float, airtime_ns: int, power_db: Array) -> Array:
+    """The probability that frames of this length arrive alone, by mean power; without fading m is infinite."""
+    threshold = Threshold(radio.receiver or Receiver())
+
+    def of(power_mw: Array) -> Array:
+        arrives = arrival_probability(power_mw / threshold.noise_mw, airtime_ns, radio.bitrate_mbps)
+        return np.asarray(np.where(power_mw >= threshold.alone_mw, arrives, 0.0))
+
+    if np.isinf(m):
+        return of(10 ** (power_db / 10))
+    grid_db = np.arange(power_db.min() - GRID_DB, power_db.max() + GRID_DB, GRID_DB)
+    # Steps of the factor's distribution that are finest where it is greatest, which is what weak signals live on.
+    step = (np.arange(FACTORS) + 0.5) / FACTORS
+    factors = gammainccinv(m, step**2) / m
+    arrives = of(10 ** (grid_db[:, None] / 10) * factors) @ (2 * step / FACTORS)
+    return np.asarray(np.interp(power_db, grid_db, arrives))
+
+
+@dataclass(frozen=True)
+class _Air:
+    """The transmissions of a run, in order of their beginning, each by its first row of the trace."""
+
+    evidence: Evidence
+    rows: NDArray[np.intp]
+    sender: NDArray[np.intp]
+    begin_ns: IntArray
+    end_ns: IntArray
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> _Air:
+        """All that were on air."""
+        own = np.flatnonzero(~received_twice(evidence) & (evidence.on_air_ns >= 0))
+        rows = own[np.unique(evidence.emission[own], return_index=True)[1]]
+        rows = rows[np.argsort(evidence.on_air_ns[rows], kind="stable")]
+        begin_ns = evidence.on_air_ns[rows]
+        return cls(evidence, rows, evidence.sender[rows], begin_ns, begin_ns + evidence.airtime_ns[rows])
+
+    def near(self, within_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs of transmissions (earlier, later): the later begins before so long after the other's end."""
+        earlier, later = [np.zeros(0, np.intp)], [np.zeros(0, np.intp)]
+        latest_ns = int((self.end_ns - self.begin_ns).max(initial=0)) + within_ns
+        step = 1
+        while step < len(self.rows) and (self.begin_ns[step:] - self.begin_ns[:-step] < latest_ns).any():
+            close = np.flatnonzero(self.begin_ns[step:] < self.end_ns[:-step] + within_ns)
+            earlier.append(close)
+            later.append(close + step)
+            step += 1
+        return np.concatenate(earlier), np.concatenate(later)
+
+    @cached_property
+    def _overlaps(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """For each transmission those that overlap it, one after the other, and where each one's begin."""
+        earlier, later = self.near(0)
+        one, other = np.concatenate([earlier, later]), np.concatenate([later, earlier])
+        order = np.argsort(one, kind="stable")
+        return other[order], np.searchsorted(one[order], np.arange(len(self.rows) + 1))
+
+    def met(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs of a place in `rows` of the trace and a transmission that overlapped that row's."""
+        other, starts = self._overlaps
+        emission = self.evidence.emission
+        by_emission = np.argsort(emission[self.rows])
+        mine = by_emission[np.searchsorted(emission[self.rows], emission[rows], sorter=by_emission)]
+        count = starts[mine + 1] - starts[mine]
+        place = np.repeat(np.arange(len(rows)), count)
+        nth = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
+        return place, other[np.repeat(starts[mine], count) + nth]
+
+
+def check_medium(evidence: Evidence) -> Finding:
+    """Senders share the air by the rules: nobody sends twice at once, without a pause, or into what it senses.
+
+    What collided met another transmission that its receiver could hear, and nobody hears while it sends.
+    """
+    name = "medium"
+    if not evidence.shares_air:
+        return NotExercised(name, "senders share no medium")
+    if not len(evidence.trace):
+        return nothing_seen(name, evidence, "no frame was sent")
+    air = _Air.of(evidence)
+    broken: dict[str, NDArray[np.intp]] = {
+        "mistimed": _mistimed(evidence),
+        "without_pause": _without_pause(air),
+        "into_others": _into_others(air),
+        "collided_alone": _collided_alone(air),
+        "heard_while_sending": _heard_while_sending(air),
+    }
+    counts: dict[str, Any] = {what: len(rows) for what, rows in broken.items()}
+    counts["too_idle"] = _too_idle(air)
+    total = sum(counts.values())
+    collided = int(evidence.outcome_is("collided").sum())
+    text = f"{len(air.rows):,} transmissions by the rules of access, {collided:,} pairs collided"
+    broken_text = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
+    rows = evidence.rows(np.concatenate(list(broken.values())))
+    return result(name, total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)
+
+
+def _mistimed(evidence: Evidence) -> NDArray[np.intp]:
+    """Rows that were on air before they were sent, or faster than a throttle lets them, or though given up."""
+    began = evidence.on_air_ns >= 0
+    end_ns = np.where(began, evidence.on_air_ns + evidence.airtime_ns, evidence.sent_ns)
+    left_ns = evidence.column("left_ns")
+    wrong = (began == evidence.outcome_is(*NEVER_SENT)) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
+    wrong |= began & (evidence.on_air_ns < evidence.sent_ns)
+    for planned in evidence.plan:
+        if isinstance(planned.fault, Throttle):
+            slow = planned.nodes[evidence.sender] & evidence.acting(planned, evidence.sent_ns, -evidence.guard_ns)
+            least_ns = evidence.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
+            wrong |= began & slow & (evidence.on_air_ns - evidence.sent_ns < least_ns)
+    return np.flatnonzero(wrong)
+
+
+def _without_pause(air: _Air) -> NDArray[np.intp]:
+    """Transmissions that begin too early after the same sender's last."""
+    radio = air.evidence.scenario.radio
+    assert radio.mac is not None
+    match radio.congestion:
+        case EtsiReactive(pause_ms=pause_ms):
+            least_ns = round(min(pause_ms) * 1_000_000)
+        case Limeric():
+            least_ns = LEAST_PAUSE_NS
+        case None:
+            least_ns = 0
+    order = np.argsort(air.sender, kind="stable")
+    same = air.sender[order[1:]] == air.sender[order[:-1]]
+    begin_ns, end_ns = air.begin_ns[order], air.end_ns[order]
+    early = (begin_ns[1:] < end_ns[:-1] + times_ns(radio.mac).aifs) | (begin_ns[1:] < begin_ns[:-1] + least_ns)
+    return np.asarray(air.rows[order[1:][same & early]])
+
+
+def _into_others(air: _Air) -> NDArray[np.intp]:
+    """Transmissions that begin while their sender senses another one, or before it has waited long enough.
+
+    Fading differs from frame to frame: with it nobody can say what a sender sensed.
+    """
+    evidence, radio = air.evidence, air.evidence.scenario.radio
+    if radio.fading is not None:
+        return np.zeros(0, np.intp)
+    assert radio.mac is not None
+    earlier, later = air.near(times_ns(radio.mac).aifs)
+    noticed = air.begin_ns[later] >= air.begin_ns[earlier] + DETECTION_NS
+    earlier, later = earlier[noticed], later[noticed]
+    sent_ns = evidence.sent_ns[air.rows[earlier]]
+    power_mw = evidence.places.pair_powers_mw(air.sender[earlier], air.sender[later], sent_ns)
+    sensed = power_mw >= milliwatts(radio.mac.carrier_sense_dbm) * (1 + ROUNDING)
+    return np.unique(air.rows[later[sensed & (air.sender[earlier] != air.sender[later])]])
+
+
+def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
+    """Which of these rows of the trace met a transmission that their receiver could hear, or its own."""
+    evidence = air.evidence
+    place, other = air.met(rows)
+    receiver = evidence.receiver[rows][place]
+    heard = evidence.places.pairs_in_range(air.sender[other], receiver, evidence.sent_ns[air.rows[other]])
+    heard |= air.sender[other] == receiver
+    return np.asarray(np.bincount(place, weights=heard, minlength=len(rows)) > 0)
+
+
+def _collided_alone(air: _Air) -> NDArray[np.intp]:
+    rows = np.flatnonzero(air.evidence.outcome_is("collided") & air.evidence.placed)
+    return np.asarray(rows[~_audible(air, rows)])
+
+
+def _heard_while_sending(air: _Air) -> NDArray[np.intp]:
+    evidence = air.evidence
+    rows = np.flatnonzero(evidence.arrived & ~received_twice(evidence))
+    place, other = air.met(rows)
+    itself = air.sender[other] == evidence.receiver[rows][place]
+    return np.asarray(rows[np.unique(place[itself])])
+
+
+def _too_idle(air: _Air) -> int:
+    """How many busy ratios are less than what their own vehicle sent."""
+    ratio = air.evidence.busy_ratio
+    sent_ns = np.zeros(ratio.shape)
+    for shift in range(int((air.end_ns - air.begin_ns).max(initial=0)) // WINDOW_NS + 2):
+        window = air.begin_ns // WINDOW_NS + shift
+        from_ns = np.maximum(air.begin_ns, window * WINDOW_NS)
+        part_ns = np.minimum(air.end_ns, (window + 1) * WINDOW_NS) - from_ns
+        there = (window < len(ratio)) & (part_ns > 0)
+        np.add.at(sent_ns, (window[there], air.sender[there]), part_ns[there])
+    return int((sent_ns > (ratio + ROUNDING) * WINDOW_NS).sum())

@@ -1,0 +1,96 @@
+"""The check that a run replays: two runs of one scenario, compared row by row."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from emulator.records.verdicts import Finding, NotExercised, result
+from vnet.errors import VnetError
+
+AGAIN = "again"
+"""The folder, in a run's own, of the second run."""
+ONCE = NotExercised("replay", "it ran once; --check-determinism runs it twice")
+TABLES = ("trace", "states", "metrics")
+ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outcome", "arrival_ns")
+"""The columns that are shown of a differing row, beside those that differ."""
+
+
+def check_replay(folder: Path) -> Finding:
+    """Compare a run with the second one in its folder. Raises VnetError if a table cannot be read."""
+    again = folder / AGAIN
+    return compare_folders(folder, again) if (again / "verdict.json").exists() else ONCE
+
+
+def compare_folders(first: Path, second: Path) -> Finding:
+    """Compare two finished runs. Raises VnetError if a table cannot be read, or has other columns in one."""
+    tables = []
+    for name in TABLES:
+        ours, theirs = _read(first, name), _read(second, name)
+        if set(ours.column_names) != set(theirs.column_names):
+            raise VnetError(f"{second / name}.parquet: has other columns than the one of {first}")
+        tables.append((name, ours, theirs))
+    return compare(tables)
+
+
+def _read(folder: Path, name: str) -> pa.Table:
+    try:
+        return pq.read_table(folder / f"{name}.parquet")
+    except (OSError, pa.ArrowInvalid) as error:
+        raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
+
+
+def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
+    """Compare tables (name, first, second) of two runs; the first difference is shown."""
+    for name, first, second in tables:
+        place = first_difference(first, second)
+        if place is not None:
+            return _difference(name, first, second, place)
+    text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
+    return result("replay", 0, text, "", rows_each=len(tables[0][1]))
+
+
+def _difference(name: str, first: pa.Table, second: pa.Table, place: int) -> Finding:
+    ours, theirs = _row(first, place), _row(second, place)
+    differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
+    how = ", ".join(differing) if ours and theirs else "one has no such row"
+    shown = [
+        {"run": run, "row": place, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
+        for run, row in (("first", ours), ("again", theirs))
+    ]
+    text = f"two runs differ, first in row {place} of the {name}: {how}"
+    return result("replay", 1, "", text, shown, table=name, row=place, differing=differing)
+
+
+def first_difference(first: pa.Table, second: pa.Table) -> int | None:
+    """The number of the first row in which two tables differ, or None."""
+    shared = min(len(first), len(second))
+    place = None if len(first) == len(second) else shared
+    for name in first.column_names:
+        ours, theirs = first[name].slice(0, shared), second[name].slice(0, shared)
+        if not ours.equals(theirs):
+            differing = _first(ours, theirs)
+            place = differing if place is None or (differing is not None and differing < place) else place
+    return place
+
+
+def _first(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
+    """The first place where two columns differ; NaN is like NaN."""
+    if pa.types.is_integer(ours.type) and not ours.null_count and not theirs.null_count:
+        differing = np.flatnonzero(ours.to_numpy() != theirs.to_numpy())
+        return int(differing[0]) if len(differing) else None
+    pairs = zip_longest(ours.to_pylist(), theirs.to_pylist())
+    return next((number for number, (a, b) in enumerate(pairs) if a != b and str(a) != str(b)), None)
+
+
+def _row(table: pa.Table, place: int) -> dict[str, Any]:
+    return dict(table.slice(place, 1).to_pylist()[0]) if place < len(table) else {}
+
+
+def _shown(value: Any) -> Any:
+    return value if isinstance(value, (str, int)) else str(value)

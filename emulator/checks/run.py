@@ -1,0 +1,266 @@
+"""Checks of the course of a run: everybody lived and reported, and the machine kept up."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from emulator.records.recorded_run import NEVER_NS, Evidence
+from emulator.records.run_folder import Event
+from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
+from vnet.types import Mask
+from vnet.units import NS_PER_S
+
+LATE_SHARE_LIMIT = 0.001
+LIVENESS_NS = NS_PER_S
+START_UP_NS = 5 * NS_PER_S
+"""In real time, how long a process that is started anew may take until its program reports."""
+MEMORY_SPAN_S, MEMORY_SAMPLES = 15.0, 9
+MEMORY_FACTOR = 1.05
+
+
+def check_transport(evidence: Evidence) -> Finding:
+    """No message between agents and emulator went missing."""
+    name = "transport"
+    gaps = sum(int(event.details.get("count", 1)) for event in evidence.event("transport_gap"))
+    lost = evidence.outcome_is("transport")
+    if gaps or lost.any():
+        count = int(lost.sum())
+        text = f"{gaps} gaps in sequence numbers, {count} deliveries that never arrived: the machine, not the radio"
+        return unknown(name, text, gaps=gaps, lost=count)
+    return CheckResult(name, Verdict.VALID, "no message between agents and emulator went missing", {"gaps": 0})
+
+
+def check_agents_alive(evidence: Evidence) -> Finding:
+    """No process died and no program crashed, but for those that a fault ended."""
+    name = "agents_alive"
+    gone = [event for event in evidence.event("died", "crashed") if not _was_killed(evidence, event)]
+    if not gone and not evidence.event("started"):
+        return unknown(name, "no event says that the run started")
+    if not gone:
+        who = f"all {len(evidence.node_ids)} nodes" if evidence.node_ids else "all nodes"
+        return CheckResult(name, Verdict.VALID, f"{who} to the end")
+    first = gone[0]
+    why = first.details.get("error") or first.details.get("how", "")
+    when = f"{first.node} {first.kind} at {first.time_ns / 1e9:.3f} s"
+    text = f"{len(gone)} of {len(evidence.node_ids) or 'the'} nodes: {when}: {why}"
+    listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
+    return CheckResult(name, Verdict.INVALID, text, {"gone": listed})
+
+
+def _was_killed(evidence: Evidence, event: Event) -> bool:
+    """Whether a process that died was meant to."""
+    if event.kind != "died" or event.node not in evidence.number:
+        return False
+    node = evidence.number_of(event.node)
+    ended = [p for p in evidence.plan if p.fault.kind in ("kill", "restart") and p.nodes[node]]
+    return any(p.start_ns <= event.time_ns <= p.end_ns + evidence.guard_ns for p in ended)
+
+
+def check_progress(evidence: Evidence) -> Finding:
+    """The run came to its end: nobody span, nobody hung, nobody interrupted it."""
+    name = "progress"
+    if spun := evidence.event("spun"):
+        event = spun[0]
+        text = f"{event.node} goes on for ever at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
+        return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
+    if stalled := evidence.event("stalled"):
+        event = stalled[0]
+        text = f"{event.node} hangs at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
+        return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
+    if interrupted := evidence.event("interrupted"):
+        return unknown(name, f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
+    if not evidence.event("ended"):
+        return unknown(name, "no event says that the run ended")
+    due = evidence.scenario.duration_ns // evidence.scenario.period_ns
+    if len(evidence.metrics) != due or len(evidence.states) != due * len(evidence.node_ids):
+        text = f"{len(evidence.metrics)} periods kept, {due} due"
+        return unknown(name, text, periods=len(evidence.metrics), due=due)
+    return CheckResult(name, Verdict.VALID, f"{evidence.scenario.run.duration_s:g} s emulated to the end")
+
+
+def check_finite(evidence: Evidence) -> Finding:
+    """No report holds a number that is none."""
+    name = "finite"
+    if not len(evidence.metrics):
+        return NotExercised(name, "no period was completed")
+    reporting = int(np.sum(evidence.metrics["reporting"].to_numpy()))
+    if reporting == 0:
+        return NotExercised(name, "the program reports nothing")
+    not_finite = evidence.metrics["not_finite"].to_numpy()
+    broken = int(np.sum(not_finite))
+    text = f"{reporting:,} reports, all numbers finite"
+    rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
+    broken_text = f"{broken} reports with NaN or infinity"
+    return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
+
+
+def check_kept_up(evidence: Evidence) -> Finding:
+    """Real time: the machine delivered on time."""
+    name = "kept_up"
+    if evidence.scenario.run.pacing != "realtime":
+        return NotExercised(name, "in lockstep nothing can be late")
+    late = evidence.event("late_deliveries")
+    if not late or not late[-1].details["total"]:
+        return unknown(name, "no delivery was timed")
+    figures = late[-1].details
+    share = figures["count"] / figures["total"]
+    text = f"{share:.3%} of {figures['total']:,} deliveries over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
+    return CheckResult(name, Verdict.VALID if share <= LATE_SHARE_LIMIT else Verdict.UNKNOWN, text, figures)
+
+
+def check_liveness(evidence: Evidence) -> Finding:
+    """Once no fault acts any more, every node that is up reports at least once a second."""
+    name = "liveness"
+    if not evidence.reported.any():
+        return NotExercised(name, "the program reports nothing")
+    window = max(2, -(-LIVENESS_NS // evidence.scenario.period_ns))
+    judged = _expected_to_report(evidence, window)
+    if not judged.any():
+        return NotExercised(name, "no program reports once a second")
+    start_ns = evidence.period_starts_ns()
+    rested = np.flatnonzero(start_ns >= evidence.last_heal_ns)
+    if len(rested) < window:
+        return NotExercised(name, "less than a second is left after the last fault")
+    silent: list[dict[str, Any]] = []
+    for node in np.flatnonzero(judged).tolist():
+        for from_ns, until_ns in _times_up(evidence, node):
+            mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
+            reports = mine[evidence.reported[mine, node]]
+            if not evidence.plan and (len(reports) or len(mine) < START_UP_NS // evidence.scenario.period_ns):
+                mine = mine[mine >= reports.min(initial=evidence.periods)]  # it may take its time at the start
+            edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
+            gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
+            if gaps:
+                before, after = gaps[0]
+                silent.append({"node": evidence.node_ids[node], "last_period": before, "next_period": after})
+                break
+    count = int(judged.sum())
+    text = f"{count} nodes reported at least once a second after the last fault"
+    if not evidence.plan:
+        text = f"{count} nodes reported at least once a second"
+    broken_text = f"{len(silent)} of {count} nodes were silent for over a second, {_where(silent)}"
+    return result(name, len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
+
+
+def _where(silent: list[dict[str, Any]]) -> str:
+    return f"{silent[0]['node']} from period {silent[0]['last_period'] + 1}" if silent else ""
+
+
+def _expected_to_report(evidence: Evidence, window: int) -> Mask:
+    """Nodes that show that they report once a second, and those that a fault took whose program does elsewhere."""
+    able = np.zeros(len(evidence.node_ids), dtype=bool)
+    for node in range(len(able)):
+        periods = np.flatnonzero(evidence.reported[:, node])
+        able[node] = len(periods) > 1 and bool((np.diff(periods) <= window).any())
+    programs = [evidence.scenario.program.of(node).entry for node in evidence.node_ids]
+    reporting = {programs[node] for node in np.flatnonzero(able)}
+    taken = np.zeros(len(able), dtype=bool)
+    for planned in evidence.plan:
+        taken |= planned.nodes
+    elsewhere = np.array([program in reporting for program in programs], dtype=bool)
+    return np.asarray(able | (taken & elsewhere))
+
+
+def _times_up(evidence: Evidence, node: int) -> list[tuple[int, int]]:
+    """From when until when a node is up, each time; in real time not before its process has had time to start."""
+    start_up_ns = START_UP_NS if evidence.scenario.run.pacing == "realtime" else 0
+    times, from_ns = [], 0
+    for span in sorted((span for span in evidence.down if span.node == node), key=lambda span: span.start_ns):
+        if span.start_ns > from_ns:
+            times.append((from_ns, span.start_ns))
+        from_ns = max(from_ns, NEVER_NS if span.end_ns == NEVER_NS else span.end_ns + start_up_ns)
+    return [*times, (from_ns, NEVER_NS)] if from_ns < NEVER_NS else times
+
+
+def check_presence(evidence: Evidence) -> Finding:
+    """Vehicles enter and leave when their trips say so."""
+    name = "presence"
+    if not evidence.moves:
+        return NotExercised(name, "vehicles stand where they are")
+    there = evidence.places.present()
+    changes = _changes(evidence, there)
+    if not changes and not evidence.event("entered", "left"):
+        return NotExercised(name, "all vehicles are there from the beginning to the end")
+    known_ns = len(there) * evidence.scenario.period_ns  # of what came later no states are kept
+    events = [event for event in evidence.event("entered", "left") if event.time_ns < known_ns]
+    told = {(event.kind, str(event.node), event.time_ns) for event in events}
+    missing = [change for change in changes if not _is_told(evidence, change, told)]
+    due = set(changes)
+    odd = [one for one in told if one not in due and not _may_come_late(evidence, one, there)]
+    rows = [{"what": what, "node": node, "time_ns": t, "event": "missing"} for what, node, t in missing]
+    rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
+    entered = sum(kind == "entered" for kind, _, _ in changes)
+    text = f"vehicles entered {entered} times and left {len(changes) - entered} times, as their trips say"
+    return result(name, len(rows), text, f"{len(rows)} events do not fit the trips", rows, changes=len(changes))
+
+
+Change = tuple[str, str, int]
+"""What happened (entered, left), to whom, and when in ns."""
+
+
+def _changes(evidence: Evidence, there: Mask) -> list[Change]:
+    """Who enters and leaves when, as the true positions have it."""
+    period, node = np.nonzero(there[1:] != there[:-1])
+    kinds = np.where(there[1:][period, node], "entered", "left").tolist()
+    times_ns = ((period + 1) * evidence.scenario.period_ns).tolist()
+    names = [evidence.node_ids[number] for number in node.tolist()]
+    return list(zip(kinds, names, times_ns, strict=True))
+
+
+def _is_told(evidence: Evidence, change: Change, told: set[Change]) -> bool:
+    """Whether an event tells of a change, or need not: of whom an event has not told that it is there."""
+    kind, node, time_ns = change
+    if change in told:
+        return True
+    if kind == "left":
+        before = [one for one in told if one[1] == node and one[2] < time_ns]
+        last = max(before, key=lambda one: one[2], default=None)
+        absent_at_first = not evidence.places.present()[0][evidence.number[node]]
+        return last[0] == "left" if last else absent_at_first
+    number = evidence.number[node]
+    if evidence.deaths_ns.get(number, NEVER_NS) <= time_ns or evidence.scenario.run.pacing == "realtime":
+        return True
+    ended = [p for p in evidence.plan if p.fault.kind in ("kill", "restart") and p.nodes[number]]
+    return any(planned.acts_at(time_ns) for planned in ended)
+
+
+def _may_come_late(evidence: Evidence, one: Change, there: Mask) -> bool:
+    """Whether a vehicle may enter at an instant at which it has been there for some time.
+
+    In real time its process has to start first, and one that a fault has taken waits until it ends.
+    """
+    kind, node, time_ns = one
+    if kind == "left" or not there[time_ns // evidence.scenario.period_ns, evidence.number_of(node)]:
+        return False
+    return evidence.scenario.run.pacing == "realtime" or any(planned.end_ns == time_ns for planned in evidence.plan)
+
+
+def check_memory(evidence: Evidence) -> Finding:
+    """No agent's process holds hardly more in the last third of its life than in the second.
+
+    Judged by the events `memory` {node, time_s, rss_kb}, a series each from the start of a process to its end; the
+    emulator's own grows with the trace that it keeps, and is not judged.
+    """
+    name = "memory"
+    series = [event for event in evidence.event("memory") if event.node in evidence.number]
+    if not series:
+        return NotExercised(name, "nobody measured the processes' memory")
+    growing, judged, most = [], 0, 0.0
+    for event in series:
+        time_s, rss_kb = np.array(event.details["time_s"]), np.array(event.details["rss_kb"])
+        if len(time_s) < MEMORY_SAMPLES or time_s[-1] - time_s[0] < MEMORY_SPAN_S:
+            continue
+        judged += 1
+        third = len(rss_kb) // 3
+        before_kb, after_kb = float(np.median(rss_kb[third:-third])), float(np.median(rss_kb[-third:]))
+        most = max(most, (after_kb - before_kb) / (time_s[-1] - time_s[0]) * 3)
+        if after_kb > MEMORY_FACTOR * before_kb:
+            growing.append({"node": event.node, "before_kb": before_kb, "after_kb": after_kb})
+    if not judged:
+        return NotExercised(name, f"no process was measured for {MEMORY_SPAN_S:g} s")
+    text = f"{judged} processes, growing by {most:.1f} kB a second at most"
+    broken_text = f"{len(growing)} of {judged} processes grow: {growing[0]['node'] if growing else ''}"
+    return result(name, len(growing), text, broken_text, growing, processes=judged, most_kb_per_s=most)

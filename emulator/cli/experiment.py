@@ -1,0 +1,270 @@
+"""`vnet experiment`: the paper's tables and figures, and vnet's own, with one command each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import pyarrow as pa
+import typer
+from rich.console import Console
+from rich.markdown import Markdown
+
+from emulator.cells.cells import Cell, read_series, run_cells, write_results
+from emulator.experiments import paper
+from emulator.terminal.console import one_line_errors
+from vnet.errors import VnetError
+from vnet.runtime.host import fix_hash_seed
+
+app = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, and vnet's own.")
+FOLDER = Path("runs/experiments")
+
+NetworksOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="With network_n1.csv, _n2, _n3; generated ones otherwise."),
+]
+OutOption = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="For the results; an interrupted run goes on there.")
+]
+LiveOption = Annotated[
+    bool, typer.Option("--live", metavar="", help="Run over Zenoh, a process a vehicle, and not simulated.")
+]
+OnlyOption = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="LABEL=VALUE", help="Only such cells, for example --only network=n2."),
+]
+SeedsOption = Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N.")]
+
+
+@app.command()
+def table1(
+    seeds: SeedsOption = 20, out: OutOption = None, only: OnlyOption = None, live: LiveOption = False
+) -> None:
+    """Table I: four vehicles on a directed ring, constant α against optimized weights."""
+    from emulator.experiments import figures, reports
+
+    with one_line_errors():
+        folder = _folder(out, "table1")
+        paper.write_crossing(folder / "crossing.csv")
+        cells = paper.table1_cells(range(1, seeds + 1), folder / "crossing.csv")
+        results = _run(cells, folder, "table1", only, live)
+        if only is None:
+            figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
+            _show(reports.table1(results), folder / "table1.md")
+
+
+@app.command()
+def table2(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 10,
+    out: OutOption = None,
+    only: OnlyOption = None,
+    live: LiveOption = False,
+) -> None:
+    """Table II: the paper's profile on N1, N2 and N3, lanes bounded on one side and on two."""
+    from emulator.experiments import reports
+
+    with one_line_errors():
+        folder = _folder(out, "table2")
+        cells = paper.table2_cells(paper.network_sections(networks), range(1, seeds + 1))
+        results = _run(cells, folder, "table2", only, live)
+        if only is None:
+            _draw_against_time(cells, folder, folder)
+            _show(reports.table2(results), folder / "table2.md")
+
+
+@app.command()
+def default(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 10,
+    out: OutOption = None,
+    only: OnlyOption = None,
+    live: LiveOption = False,
+) -> None:
+    """vnet's own profile on the same networks, against the limit of any cooperation. Takes hours for all."""
+    from emulator.experiments import figures, reports
+
+    with one_line_errors():
+        folder = _folder(out, "default")
+        cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
+        results = _run(cells, folder, "default", only, live)
+        if any(row["mechanism"] == "limit" for row in results):
+            figures.ratio_bars(results, folder / "default")
+            _show(reports.default_profile(results), folder / "default.md")
+
+
+@app.command()
+def tempering(
+    networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
+) -> None:
+    """How often roads count anew: ANEES and error of the limit, on N3 of the default too, against lateral_tau_s."""
+    from emulator.experiments import tempering as study
+
+    with one_line_errors():
+        folder = _folder(out, "tempering")
+        cells = study.tempering_cells(paper.network_sections(networks), range(1, seeds + 1))
+        results = _run(cells, folder, "tempering", only)
+        print(study.tempering_curve(results, folder / "tempering"))
+        _show(study.report(results), folder / "tempering.md")
+
+
+@app.command()
+def divergence(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 100,
+    duration: Annotated[float, typer.Option(min=1, metavar="SECONDS", help="Emulated length of each run.")] = 30.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """Does the default profile ever diverge? Many seeds on each network, and the worst of them."""
+    from emulator.experiments import divergence as study
+
+    with one_line_errors():
+        folder = _folder(out, "divergence")
+        cells = study.divergence_cells(paper.network_sections(networks), range(1, seeds + 1), duration)
+        results = _run(cells, folder, "divergence", only)
+        _show(study.report(results), folder / "divergence.md")
+
+
+@app.command()
+def city(
+    trips: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="How vehicles drive; through a generated city otherwise.")
+    ] = None,
+    roads: Annotated[Path | None, typer.Option("--map", metavar="FILE", help="The roads they drive on.")] = None,
+    map_sigma: Annotated[
+        float, typer.Option(min=0, metavar="METRES", help="How far true lanes stray from the map's.")
+    ] = 0.0,
+    map_aside: Annotated[
+        float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
+    ] = 0.0,
+    seeds: SeedsOption = 3,
+    duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 300.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+    live: LiveOption = False,
+) -> None:
+    """Vehicles that drive: every mechanism on the same trips and roads, raw fixes beside. Takes hours for all."""
+    from emulator.experiments import city as study
+
+    with one_line_errors():
+        folder = _folder(out, "city")
+        place = study.place(trips, roads, map_sigma, map_aside)
+        cells = study.city_cells(place, range(1, seeds + 1), duration)
+        results = _run(cells, folder, "city", only, live)
+        if not live:
+            print(study.draw_against_time(cells, folder))
+            if picture := study.draw_errors(cells, folder):
+                print(picture)
+        if only is None:
+            _show(study.report(results, duration), folder / "city.md")
+
+
+@app.command("figures")
+def draw_figures(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 3,
+    out: OutOption = None,
+    cells_from: Annotated[Path, typer.Option(metavar="FOLDER", help="Where Table II keeps its cells.")] = FOLDER
+    / "table2",
+) -> None:
+    """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
+    from emulator.experiments import figures
+
+    with one_line_errors():
+        folder = _folder(out, "figures")
+        sections = paper.network_sections(networks)
+        found = {name.upper(): paper.load_positions(section) for name, section in sections.items()}
+        for draw in (figures.degree_histogram, figures.road_angle_histogram, figures.graphs):
+            print(draw(found, folder / draw.__name__))
+        cells = paper.table2_cells({n: sections[n] for n in ("n2", "n3")}, range(1, seeds + 1), sides=(1,))
+        run_cells(cells, cells_from, title="figures")
+        _draw_against_time(cells, cells_from, folder)
+
+
+@app.command()
+def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutOption = None) -> None:
+    """Consensus alone: against rounds, loss, delay, one-way links and churn, beside the linear model."""
+    from emulator.experiments.consensus import run_consensus
+
+    with one_line_errors():
+        path = run_consensus(networks, range(1, seeds + 1), _folder(out, "consensus"))
+        Console().print(Markdown(path.read_text()))
+        print(path)
+
+
+@app.command()
+def capacity(
+    seconds: Annotated[float, typer.Option(min=1, help="Emulated seconds of each network.")] = 5.0,
+    seeds: SeedsOption = 2,
+    out: OutOption = None,
+) -> None:
+    """How many peers an 802.11p channel has room for: delivery against the number of senders in reach."""
+    from emulator.experiments.capacity import run_capacity
+
+    with one_line_errors():
+        path = run_capacity(seconds, range(1, seeds + 1), _folder(out, "capacity"))
+        Console().print(Markdown(path.read_text()))
+        print(path)
+
+
+def _folder(out: Path | None, name: str) -> Path:
+    folder = out or FOLDER / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise VnetError(f"--out {folder}: {error.strerror}") from None
+    return folder
+
+
+def _run(
+    cells: Sequence[Cell], folder: Path, name: str, only: list[str] | None, live: bool = False
+) -> list[dict[str, Any]]:
+    """Run the cells that are asked for; print the figures of single ones, keep all as Parquet."""
+    fix_hash_seed("emulator.cli")  # as in every process that runs programs
+    wanted = _select(cells, only or [])
+    results = run_cells(wanted, folder, live, name)
+    if only is not None:
+        for row in results:
+            print({key: value for key, value in row.items() if value is not None})
+    write_results(results, folder, f"{name}-live" if live else name)
+    return results
+
+
+def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
+    wanted = list(cells)
+    for condition in only:
+        key, equals, value = condition.partition("=")
+        labels = sorted({label for cell in cells for label in cell.labels})
+        if not equals or key not in labels:
+            raise VnetError(f"--only {condition}: write it as label=value with one of {', '.join(labels)}")
+        wanted = [cell for cell in wanted if str(cell.labels[key]) == value]
+        if not wanted:
+            values = sorted({str(cell.labels[key]) for cell in cells})
+            raise VnetError(f"--only {condition}: no such cell; {key} is one of {', '.join(values)}")
+    return wanted
+
+
+def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
+    from emulator.experiments import figures, reports
+
+    for network in ("n2", "n3"):
+        title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
+        references = {f"the paper's {m}": rmse[network] for m, rmse in reports.PAPER_TABLE2.items()}
+        series = _series(cells, cells_from, network)
+        print(figures.against_time(series, folder / f"{network}_against_time", title, references))
+
+
+def _series(cells: Sequence[Cell], folder: Path, network: str) -> dict[str, list[pa.Table]]:
+    series: dict[str, list[pa.Table]] = {}
+    for cell in cells:
+        if cell.labels["network"] == network and cell.labels.get("sides", 1) == 1:
+            series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
+    return series
+
+
+def _show(markdown: str, path: Path) -> None:
+    path.write_text(markdown)
+    Console().print(Markdown(markdown))
+    print(path)

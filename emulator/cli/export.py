@@ -1,0 +1,169 @@
+"""`vnet radio` and `vnet export`: a run's radio in figures, and a run in formats that other tools read."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from emulator.checks.judge import Evidence, read_evidence
+from emulator.cli.viewing import LATEST, RunArgument
+from emulator.export.mcap_file import write_mcap
+from emulator.export.pcapng import write_pcapng
+from emulator.export.tables import write_csv
+from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
+from emulator.terminal.console import one_line_errors
+from vnet.errors import VnetError
+
+WORST_LINKS = 10
+FIGURES = {
+    "latency": "latency_mean_ms",
+    "between two receptions": "inter_reception_mean_ms",
+    "age of information": "age_mean_ms",
+}
+DISTANCE_COLUMNS = {"from": "from_m", "to": "to_m", "pairs": "pairs", "delivered": "delivery_ratio"}
+LINK_COLUMNS = {
+    "sender": "sender",
+    "receiver": "receiver",
+    "pairs": "pairs",
+    "delivered": "delivery_ratio",
+    "apart": "distance_mean_m",
+    "latency": "latency_mean_ms",
+    "gap p95": "inter_reception_p95_ms",
+    "age": "age_mean_ms",
+    "oldest": "age_peak_ms",
+}
+
+
+class Format(StrEnum):
+    """What a run can be exported to."""
+
+    PCAPNG = "pcapng"
+    MCAP = "mcap"
+    CSV = "csv"
+
+
+def radio(
+    run: RunArgument = LATEST,
+    bin_m: Annotated[float, typer.Option("--bin", min=0.1, help="Width of the bins of distance in m.")] = BIN_M,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for links.parquet, vehicles.parquet and distances.parquet.")
+    ] = None,
+) -> None:
+    """A run's radio in figures: delivery by distance, latency, time between receptions, age of information."""
+    with one_line_errors():
+        metrics = radio_metrics(read_evidence(run), bin_m)
+        if out is not None:
+            tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
+            with _disk(out):
+                out.mkdir(parents=True, exist_ok=True)
+                for name, table in tables.items():
+                    pq.write_table(table, out / f"{name}.parquet", compression="zstd")
+        _print(metrics, Console())
+
+
+def _print(metrics: RadioMetrics, console: Console) -> None:
+    totals = metrics.totals
+    if not totals["pairs"]:
+        console.print("nobody sent anything to anybody in range")
+        return
+    counts = f"{totals['pairs']:,} pairs on {totals['links']:,} links, {totals['delivered']:,} delivered"
+    console.print(f"{counts}: {totals['delivery_ratio']:.2%}", highlight=False)
+    for text, name in FIGURES.items():
+        console.print(f"{text:24}{_cell(totals[name])} ms", highlight=False)
+    if totals["busy_ratio_mean"] is not None:
+        console.print(f"{'busy ratio':24}{totals['busy_ratio_mean']:.1%}", highlight=False)
+    console.print(_table("delivered, by distance in m", metrics.distances, DISTANCE_COLUMNS))
+    worst = metrics.worst_links(WORST_LINKS)
+    console.print(_table("the worst links; distances in m, times in ms", worst, LINK_COLUMNS))
+
+
+def _table(title: str, rows: pa.Table, columns: Mapping[str, str]) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading in columns:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows.select(list(columns.values())).to_pylist():
+        table.add_row(*(_cell(row[name], name.endswith("ratio")) for name in columns.values()))
+    return table
+
+
+def _cell(value: Any, share: bool = False) -> str:
+    if isinstance(value, float):
+        return f"{value:.1%}" if share else f"{value:,.1f}"
+    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def export(
+    run: RunArgument = LATEST,
+    to: Annotated[
+        Format, typer.Option(help="pcapng for Wireshark, mcap for Foxglove and Rerun, csv.")
+    ] = Format.CSV,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File, or for csv folder, that does not exist yet; by default in the run's folder."),
+    ] = None,
+) -> None:
+    """Write a run in a format that other tools read."""
+    with one_line_errors():
+        evidence = read_evidence(run)
+        match to:
+            case Format.PCAPNG:
+                path = out or run / "frames.pcapng"
+                print(f"{_write(path, evidence, write_pcapng):,} packets in {path}")
+            case Format.MCAP:
+                path = out or run / "run.mcap"
+                print(f"{_write(path, evidence, write_mcap):,} messages in {path}")
+            case Format.CSV:
+                path = out or run / "csv"
+                print(f"{', '.join(_write_folder(path, evidence))} in {path}")
+
+
+def _write(path: Path, evidence: Evidence, writer: Callable[[Evidence, BinaryIO], int]) -> int:
+    """Have a file written beside its place, and put there when it is whole."""
+    _refuse_existing(path)
+    part = path.with_name(f".{path.name}.part")
+    with _disk(path):
+        try:
+            with part.open("wb") as file:
+                count = writer(evidence, file)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    return count
+
+
+def _write_folder(path: Path, evidence: Evidence) -> list[str]:
+    _refuse_existing(path)
+    part = path.with_name(f".{path.name}.part")
+    with _disk(path):
+        try:
+            shutil.rmtree(part, ignore_errors=True)
+            part.mkdir(parents=True)
+            names = write_csv(evidence, part)
+            part.replace(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    return names
+
+
+def _refuse_existing(path: Path) -> None:
+    if path.exists():
+        raise VnetError(f"{path}: exists; remove it, or say --out")
+
+
+@contextlib.contextmanager
+def _disk(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None

@@ -1,0 +1,172 @@
+"""`vnet map`: looking at maps, and converting them."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from emulator.terminal.console import one_line_errors
+from emulator.world.maps.city import SIZE_M, city_roads
+from emulator.world.maps.files import read_roads, write_roads, writer_of
+from emulator.world.maps.problems import MapReport, examine
+from emulator.world.maps.roads import Roads
+from emulator.world.projection import Frame
+from emulator.world.trips.files import check_trips_name, write_trips
+from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
+from vnet.errors import ScenarioError
+from vnet.types import Array
+
+
+class DriveOn(StrEnum):
+    """The side of the road."""
+
+    RIGHT = "right"
+    LEFT = "left"
+
+
+app = typer.Typer(no_args_is_help=True, help="Look at maps, and convert them.")
+
+MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="OSM XML or PBF, SUMO .net.xml, GeoJSON or NPZ.")]
+OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="A file: .geojson, .json or .npz.")]
+OriginOption = Annotated[
+    str | None, typer.Option(metavar="LAT,LON", help="Where the map's metres start; else in its middle.")
+]
+
+
+@app.command()
+def show(
+    map_file: MapArgument,
+    out: Annotated[Path | None, typer.Option(help="Write a picture (PNG).")] = None,
+    origin: OriginOption = None,
+    at: Annotated[str | None, typer.Option(metavar="EAST,NORTH", help="The middle of a part, in metres.")] = None,
+    side_km: Annotated[float, typer.Option(min=0.01, max=1000, help="The side of that part, in km.")] = 3.0,
+) -> None:
+    """Say how long a map's roads are and what is odd about it, and draw it."""
+    with one_line_errors():
+        roads = read_roads(map_file, _pair("--origin", origin))
+        middle = _pair("--at", at)
+        if middle is not None:
+            roads = _part(map_file, roads, middle, side_km)
+        report = examine(roads)
+        _print(map_file, report, roads.frame)
+        if out is not None:
+            window = None if middle is None else _box(middle, side_km)
+            _draw(roads, out, f"{map_file.name}: {report.length_km:,.1f} km of road", window)
+
+
+@app.command()
+def convert(map_file: MapArgument, out: OutArgument, origin: OriginOption = None) -> None:
+    """Write a map as GeoJSON or NPZ, by the name of OUT."""
+    with one_line_errors():
+        writer_of(out)  # before a large file is read
+        write_roads(read_roads(map_file, _pair("--origin", origin)), out)
+        print(f"wrote {out}")
+
+
+@app.command()
+def city(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="*.geojson or *.npz.")],
+    seed: Annotated[int, typer.Option(min=0, help="Another seed, another city.")] = 1,
+    size_m: Annotated[
+        float, typer.Option(metavar="METRES", help="From one end to the other, 1000 to 10000.")
+    ] = SIZE_M,
+) -> None:
+    """Generate a city, the one in which vehicles drive with network.kind = "city"."""
+    with one_line_errors():
+        writer_of(out)
+        roads = city_roads(seed, size_m)
+        write_roads(roads, out)
+        print(f"wrote {out}: {float(roads.length_m.sum()) / 1000:.1f} km of road")
+
+
+@app.command()
+def trips(
+    map_file: MapArgument,
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="*.csv or *.parquet.")],
+    vehicles: Annotated[int, typer.Option(min=1, max=10_000, help="How many.")] = 50,
+    duration: Annotated[float, typer.Option(min=1, max=86_400, metavar="SECONDS", help="For how long.")] = 300.0,
+    rate_hz: Annotated[float, typer.Option(min=0.1, max=100, metavar="HZ", help="Samples a second.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Another seed, other trips.")] = 1,
+    drive_on: Annotated[DriveOn, typer.Option(help="On which side people drive.")] = DriveOn.RIGHT,
+) -> None:
+    """Generate trips along a map: a file for network.kind = "trips", in the map's metres."""
+    with one_line_errors():
+        check_trips_name(out)
+        periods = round(duration * rate_hz) + 1
+        motion = generate_motion(
+            map_file,
+            read_roads(map_file),
+            vehicles,
+            seed,
+            periods,
+            round(1e9 / rate_hz),
+            LEFT if drive_on is DriveOn.LEFT else RIGHT,
+        )
+        count = write_trips(motion, out, rate_hz)
+        print(f"wrote {out}: {len(motion.node_ids)} vehicles, {count:,} samples")
+
+
+def _pair(option: str, text: str | None) -> tuple[float, float] | None:
+    """Two numbers, written with a comma."""
+    if text is None:
+        return None
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        first = second = float("nan")
+    if not np.isfinite([first, second]).all():
+        raise ScenarioError(f"{option} {text}: two numbers with a comma between them are needed")
+    if option == "--origin" and not (abs(first) <= 90 and abs(second) <= 180):
+        raise ScenarioError(f"{option} {text}: latitudes are within ±90, longitudes within ±180")
+    return first, second
+
+
+def _part(path: Path, roads: Roads, middle_m: tuple[float, float], side_km: float) -> Roads:
+    part = roads.within(*_box(middle_m, side_km))
+    if not len(part):
+        raise ScenarioError(f"{path}: no road within {side_km:g} km around --at {middle_m[0]:g},{middle_m[1]:g}")
+    return part
+
+
+def _box(middle_m: tuple[float, float], side_km: float) -> tuple[Array, Array]:
+    """The south-western and the north-eastern corner of a square, in metres."""
+    middle, half_m = np.array(middle_m), side_km * 500
+    return middle - half_m, middle + half_m
+
+
+def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
+    east, north = report.size_km
+    console = Console()
+    print(f"{path.name}: {east:.1f} × {north:.1f} km, {report.roads:,} roads, {report.nodes:,} points")
+    print(
+        f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane"
+    )
+    if frame is None:
+        print("it does not say where on the earth it is")
+    else:
+        latitude, longitude = frame.to_wgs84(np.zeros(2))
+        print(f"its metres start at {latitude:.6f}, {longitude:.6f}")
+    table = Table("class", "roads", "km")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, (count, km) in report.by_class.items():
+        table.add_row(name, f"{count:,}", f"{km:,.1f}")
+    console.print(table)
+    for what, how_many in report.problems.items():
+        print(f"{what}: {how_many}")
+
+
+def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | None) -> None:
+    from emulator.world.maps.picture import draw_map  # matplotlib takes a second to import
+
+    try:
+        draw_map(roads, out, title, window)
+    except (OSError, ValueError) as error:  # a kind of picture that matplotlib does not know is a ValueError
+        raise ScenarioError(f"--out {out}: cannot be written: {error}") from None
+    print(f"wrote {out}")

@@ -1,0 +1,76 @@
+"""`vnet report` and `vnet compare`: a run on a page, and two runs side by side."""
+
+from __future__ import annotations
+
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from emulator.cli.viewing import LATEST, RunArgument
+from emulator.terminal.console import one_line_errors
+from vnet.errors import VnetError
+
+ReportOption = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
+]
+
+
+def report(
+    run: RunArgument = LATEST,
+    index: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Write FOLDER/index.html, a list of the runs in it, instead."),
+    ] = None,
+    show: Annotated[bool, typer.Option("--open", help="Open it in a browser here.")] = False,
+) -> None:
+    """Write a run's report.html anew, from its files alone."""
+    with one_line_errors():
+        path = _write_index(index) if index is not None else _write_report(run)
+        print(path, flush=True)
+        if show and not webbrowser.open(path.resolve().as_uri()):
+            raise VnetError(f"--open: no browser was found here; open {path}")
+
+
+def report_at_end(folder: Path) -> None:
+    """Write the report of a run that has just ended. What goes wrong is said, and changes nothing."""
+    try:
+        _write_report(folder)
+    except (Exception, KeyboardInterrupt) as error:  # a verdict that stands must not fall by a picture
+        what = str(error) if isinstance(error, VnetError) else f"{folder}: {error!r}"
+        print(f"vnet: the report could not be written: {what}", file=sys.stderr)
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="RUN_A", help="A run's folder.")],
+    second: Annotated[Path, typer.Argument(metavar="RUN_B", help="Another's.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Write a page with the curves of both as well.")
+    ] = None,
+) -> None:
+    """Set two runs side by side, and show where they first differ. Status 0: same trace; 1: another; 2: error."""
+    from emulator.report.comparison import Comparison, print_comparison
+
+    with one_line_errors():
+        comparison = Comparison.of(first, second)
+        print_comparison(comparison, Console())
+        if out is not None:
+            from emulator.report.compare_page import write_comparison
+
+            print(write_comparison(comparison, out))
+        raise typer.Exit(0 if comparison.same_trace else 1)
+
+
+def _write_report(folder: Path) -> Path:
+    from emulator.report.write import write_report  # matplotlib is slow to import
+
+    return write_report(folder)
+
+
+def _write_index(folder: Path) -> Path:
+    from emulator.report.index import write_index
+
+    return write_index(folder)

@@ -1,0 +1,126 @@
+"""How the emulator is attached to Zenoh: its session, its keys, and who is there.
+
+All of it can be closed and opened anew in the middle of a run (the fault `emulator_restart`): what a run is made of
+lives elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Any
+
+import zenoh
+
+from emulator.drivers.router import SeparateRouter
+from emulator.viewer.sinks import Sinks
+from vnet.transport import keys, wire
+from vnet.transport.access import EMULATOR, Access
+from vnet.transport.session import open_client, open_router, router_endpoint
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """How a live run is attached.
+
+    `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the
+    run); `launch` starts the agents; `record` is where a recorder process writes its recording, or None.
+    """
+
+    access: Access
+    listen: str = "tcp/127.0.0.1:0"
+    connect: str | None = None
+    launch: bool = True
+    record: Sinks | None = None
+    router: SeparateRouter | None = None
+
+
+class Attachment:
+    """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a node's id or a verb."""
+
+    def __init__(
+        self,
+        options: LiveOptions,
+        node_ids: tuple[str, ...],
+        lease_ms: int,
+        drops: bool,
+        on_tx: Callable[[str, bytes], None],
+        on_alive: Callable[[str, bool], None],
+        on_query: Callable[[str, zenoh.Query], None],
+    ) -> None:
+        self._connect = options.connect if options.router is None else options.router.endpoint
+        self.endpoint = self._connect or options.listen
+        self._options = options
+        self._run = options.access.run
+        self._node_ids = node_ids
+        self._lease_ms = lease_ms
+        self._drops = drops
+        self._on_tx = on_tx
+        self._on_alive = on_alive
+        self._on_query = on_query
+        self._stack = ExitStack()
+        self._rx: dict[str, zenoh.Publisher] = {}
+        self._observers: dict[str, zenoh.Publisher] = {}
+
+    def open(self) -> None:
+        """Listen or connect, and declare what is said and heard. Raises LinkError."""
+        stack, options = self._stack, self._options
+        if self._connect is None:
+            session = stack.enter_context(open_router(self.endpoint, options.access, self._lease_ms))
+            self.endpoint = router_endpoint(session)
+        else:
+            login = options.access.credentials(EMULATOR)
+            session = stack.enter_context(open_client(self._connect, login, self._lease_ms))
+        # In lockstep one message is outstanding per agent, so BLOCK is safe; in real time one frozen agent must
+        # not stall all others.
+        control = zenoh.CongestionControl.DROP if self._drops else zenoh.CongestionControl.BLOCK
+        self._rx = {
+            node: stack.enter_context(
+                session.declare_publisher(keys.node_rx(self._run, node), congestion_control=control, express=True)
+            )
+            for node in self._node_ids
+        }
+        self._observers = {
+            stream: stack.enter_context(
+                session.declare_publisher(
+                    keys.observe(self._run, stream), congestion_control=zenoh.CongestionControl.DROP
+                )
+            )
+            for stream in ("scene", "period", "end")
+        }
+        liveliness = session.liveliness()
+        stack.enter_context(session.declare_subscriber(keys.node_tx(self._run, "*"), self._take_tx))
+        alive = keys.node_alive(self._run, "*")
+        stack.enter_context(liveliness.declare_subscriber(alive, self._take_alive, history=True))
+        stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
+        stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
+
+    def close(self) -> None:
+        """Close everything."""
+        self._stack.close()
+
+    def _take_tx(self, sample: zenoh.Sample) -> None:
+        self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
+    def _take_query(self, query: zenoh.Query) -> None:
+        self._on_query(keys.verb_of(str(query.key_expr)), query)
+
+    def knows(self, node: str) -> bool:
+        """Whether there is a key for this node."""
+        return node in self._rx
+
+    def send(self, node: str, message: wire.EmulatorMessage) -> None:
+        """Say something to a node."""
+        self._rx[node].put(wire.encode(message))
+
+    def is_watched(self, stream: str) -> bool:
+        """Whether somebody observes this stream."""
+        return bool(self._observers[stream].matching_status.matching)  # type: ignore[attr-defined]
+
+    def publish(self, stream: str, message: dict[str, Any]) -> None:
+        """Tell those who watch."""
+        self._observers[stream].put(wire.encode_observation(message))

@@ -1,0 +1,111 @@
+"""The end of a run: its tables, its verdict, and how to have it again."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from emulator.checks.judge import Evidence, Judgement, Verdict, judge
+from emulator.checks.replay import AGAIN, check_replay
+from emulator.drivers.emulation import Emulation
+from emulator.radio.outcomes import Outcome
+from emulator.records.busy import BUSY, busy_table
+from emulator.records.metrics import summarize
+from emulator.records.verdicts import Finding, unknown
+
+FORMAT = 1
+
+
+def _start_up_s(emulation: Emulation) -> float | None:
+    """How long the processes took to start and join; None if they never did."""
+    started = [event for event in emulation.folder.events if event.kind == "started"]
+    return float(started[0].details["start_up_s"]) if started else None
+
+
+def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgement, dict[str, Any]]:
+    """Write what is kept of a run and judge it. `command` is the vnet command that ran it (run, simulate).
+
+    Returns the judgement and the contents of verdict.json. Raises VnetError if the disk is full.
+    """
+    folder = emulation.folder
+    emulated_s = emulation.emulated_ns / 1e9
+    folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
+    trace = emulation.engine.trace.to_table()
+    states = emulation.metrics.states_table()
+    metrics = emulation.metrics.metrics_table()
+    folder.put("trace.parquet", lambda path: pq.write_table(trace, path, compression="zstd"))
+    folder.put("states.parquet", lambda path: pq.write_table(states, path, compression="zstd"))
+    folder.put("metrics.parquet", lambda path: pq.write_table(metrics, path, compression="zstd"))
+    busy = _busy(emulation)
+    if busy is not None:
+        folder.put(BUSY, lambda path: pq.write_table(busy, path, compression="zstd"))
+    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
+    verdict = {
+        "format": FORMAT,
+        **_judged(judgement),
+        "trace_sha256": judgement.trace_sha256,
+        "metrics_sha256": emulation.metrics.sha256(),
+        "emulated_s": emulated_s,
+        "start_up_s": _start_up_s(emulation),
+        "wall_s": round(wall_s, 3),
+        "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,
+        "seed": emulation.scenario.run.seed,
+        "vehicles": len(emulation.world.node_ids),
+        "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
+        "figures": summarize(emulation.metrics.rows),
+        "reproduce": f"vnet {command} {shlex.quote(str(folder.path / 'scenario.toml'))}",
+        "versions": {
+            "vnet": version("vnet-emulator"),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
+    }
+    folder.put_json("verdict.json", verdict)
+    return judgement, verdict
+
+
+def _busy(emulation: Emulation) -> pa.Table | None:
+    """How busy the medium was; None where senders share none."""
+    if emulation.scenario.radio.mac is None:
+        return None
+    windows = emulation.engine.busy_ratios(emulation.emulated_ns)
+    nodes = emulation.world.node_ids
+    return busy_table(np.array(windows).reshape(-1, len(nodes)), nodes)
+
+
+def _judged(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "verdict": judgement.verdict.value,
+        "checks": [asdict(check) for check in judgement.checks],
+        "not_exercised": [asdict(check) for check in judgement.not_exercised],
+    }
+
+
+def run_again(
+    emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str, options: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Have a concluded run once more, in processes of its own, and add to its verdict how the two compare.
+
+    Returns the new contents of verdict.json.
+    """
+    path = emulation.folder.path
+    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN), "--no-report", *options]
+    # A process of its own: nothing that a program has left in this one may help it to agree with itself.
+    done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
+    finding: Finding = check_replay(path)
+    if done.returncode not in {each.exit_status for each in Verdict}:
+        finding = unknown("replay", f"the second run ended with status {done.returncode}")
+    judgement.put(finding)
+    verdict = {**verdict, **_judged(judgement), "reproduce": f"{verdict['reproduce']} --check-determinism"}
+    emulation.folder.put_json("verdict.json", verdict)
+    return verdict

@@ -1,0 +1,355 @@
+"""Emulation: one run's engine, world and records, without any transport.
+
+The drivers (live over Zenoh, or simulated in one process) bring what nodes hand over and take what is due;
+everything that must be the same in both happens here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.faults.plan import FaultPlan, PlannedFault
+from emulator.faults.selectors import Nodes
+from emulator.radio.connectivity import distances_m, reach_of
+from emulator.radio.engine import Delivery, Engine
+from emulator.records.metrics import Metrics, PeriodFigures
+from emulator.records.run_folder import RunFolder, write_text
+from emulator.scenario.faults import Fault, Infrastructure
+from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.world.gnss_faults import BentGnss, clock_of
+from emulator.world.world import Instant, World, components
+from vnet.node import Report
+from vnet.transport import wire
+from vnet.units import NS_PER_S
+
+
+@dataclass(frozen=True)
+class PeriodView:
+    """What happened up to the end of a period, for progress lines and observers."""
+
+    instant: Instant
+    reports: list[Report]
+    figures: PeriodFigures
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True)
+class ProcessActions:
+    """What processes suffer from an instant on.
+
+    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start (anew); `paused`:
+    all that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
+    """
+
+    stop: dict[str, bool]
+    start: list[str]
+    paused: set[str]
+    clocks: list[wire.ClockBend]
+    restarts: list[Infrastructure]
+
+
+class Emulation:
+    """The state of a run; see the module's text."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        world: World,
+        folder: RunFolder,
+    ) -> None:
+        start = world.at(0)
+        self.scenario = scenario
+        self.world = world
+        self.folder = folder
+        self._reach = reach_of(scenario.radio, scenario.run.seed, world.links)
+        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
+        self._placed = 0  # the period in which vehicles are where the engine has them
+        self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
+        self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
+        self.incarnation = dict.fromkeys(world.node_ids, 0)
+        self._outside = self._absent(0)  # whom no event says to be there
+        self._newcomers = set(self._outside)
+        self._down = set(self._outside)  # until a fault ends, or they enter
+        self._starting: set[str] = set()
+        self._ended: set[str] = set()
+        self._acting: set[str] = set()
+        self._acted_ns = -1
+        self._next_change_ns = self._find_next_change_ns()
+        self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
+        self.number = {node: number for number, node in enumerate(world.node_ids)}
+        self.up = dict.fromkeys(world.node_ids, True)
+        for node in self._outside:
+            self._take_down(node)
+        self._watchers: list[Callable[[PeriodView], None]] = []
+        self._period = 0
+        self._finished = False
+        self._reports: list[Report] = []
+        self._arrived: list[Delivery] = []
+
+    def _nodes_at(self, period: int) -> Nodes:
+        """What the selectors of faults look at in a period."""
+        world = self.world
+        degree = self._in_range(period).sum(axis=0)
+        return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
+
+    def _in_range(self, period: int) -> NDArray[np.bool_]:
+        if period == self._placed:
+            return self.engine.in_range
+        position_m = self.world.position_m(period)
+        return self._reach.in_range(position_m, distances_m(position_m))
+
+    def _component(self, period: int) -> NDArray[np.intp]:
+        """Which connected component each vehicle belongs to."""
+        return components(self.world.position_m(period), self.scenario.radio.range_m, self._in_range(period))
+
+    def _absent(self, period: int) -> set[str]:
+        """Who is not in the network."""
+        there = self.world.present(period).tolist()
+        return {node for node, present in zip(self.world.node_ids, there, strict=True) if not present}
+
+    def watch(self, watcher: Callable[[PeriodView], None]) -> None:
+        """Call `watcher` at the end of every period from now on."""
+        self._watchers.append(watcher)
+
+    @property
+    def duration_ns(self) -> int:
+        """Length of the run."""
+        return self.scenario.duration_ns
+
+    @property
+    def emulated_ns(self) -> int:
+        """How far the run has come, in whole periods."""
+        return min(self._period * self.world.period_ns, self.duration_ns)
+
+    def welcome(self, node: str, nonce: bytes) -> wire.Welcome:
+        """All that `node` is told; nothing in it says anything about the truth."""
+        scenario = self.scenario
+        incarnation = self.incarnation[node]
+        program = scenario.program.of(node)
+        return wire.Welcome(
+            node,
+            nonce,
+            incarnation,
+            scenario.run.pacing,
+            program.entry,
+            program.options,
+            self.world.lane_map.to_wire(),
+            node_seed(scenario.run.seed, node, incarnation),
+            self.world.period_ns,
+            scenario.radio.max_payload_bytes,
+            scenario.run.orphan_timeout_s,
+            scenario.run.spin_limit,
+            wire.boot_id(),
+            node not in self._ended,
+        )
+
+    def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
+        """What nodes hand over at `time_ns`: frames to the engine in node order, reports, endings."""
+        frames: dict[str, list[bytes]] = {}
+        endings: list[wire.Ending] = []
+        for part in traffic:
+            for frame in part.frames:
+                frames.setdefault(frame.node, []).append(frame.payload)
+            self._reports.extend(report for report in part.reports if self.up[report.node])
+            endings.extend(part.endings)
+        if frames:
+            self._place(time_ns // self.world.period_ns)
+        for node in sorted(frames, key=self.number.__getitem__):
+            if self.up[node]:
+                self.engine.transmit(time_ns, self.number[node], frames[node])
+        for ending in sorted(endings, key=lambda e: self.number[e.node]):
+            self._end(time_ns, ending)
+
+    def _place(self, period: int) -> None:
+        """Frames are sent from where vehicles are at the start of the period."""
+        if self.world.moves and period != self._placed:
+            self.engine.set_positions(self.world.position_m(period))
+            self._placed = period
+
+    def _end(self, time_ns: int, ending: wire.Ending) -> None:
+        if not self.up[ending.node]:
+            return
+        details: dict[str, Any] = {}
+        if ending.error:
+            details = {"error": ending.error, "where": ending.details}
+        self.folder.event(time_ns, ending.kind, ending.node, **details)
+        self._ended.add(ending.node)
+        self._take_down(ending.node)
+
+    def died(self, time_ns: int, node: str, **details: Any) -> None:
+        """A node's process ended without being told to."""
+        if self.up[node]:
+            self.folder.event(time_ns, "died", node, **details)
+            self._ended.add(node)
+            self._take_down(node)
+
+    def _take_down(self, node: str) -> None:
+        self.up[node] = False
+        self.engine.set_up(self.number[node], False)
+
+    # Faults, and vehicles that enter and leave.
+
+    def next_change_ns(self) -> int | None:
+        """When next a fault starts or ends, or a vehicle enters or leaves."""
+        return self._next_change_ns
+
+    def _find_next_change_ns(self) -> int | None:
+        changes = (self.faults.next_change_ns(self._acted_ns), self.world.next_change_ns(self._acted_ns))
+        return min((time_ns for time_ns in changes if time_ns is not None), default=None)
+
+    def act(self, time_ns: int, starts_at_once: bool = True) -> ProcessActions:
+        """Let the faults of `time_ns` act on links and senders, and vehicles enter and leave.
+
+        Returns what processes are to suffer. The caller has taken all that arrived before `time_ns`. Without
+        `starts_at_once` nodes that start are up only when it says that they `come_back`.
+        """
+        self.close_periods(time_ns)
+        self._acted_ns = time_ns
+        self._next_change_ns = self._find_next_change_ns()
+        active = self.faults.active(time_ns)
+        self.engine.set_faults(active, time_ns)
+        self._log_changes(time_ns, active)
+        absent = self._absent(time_ns // self.world.period_ns)
+        down = self._nodes_under(active, "kill", "restart") | absent
+        paused = self._nodes_under(active, "pause")
+        killed = self._nodes_under(active, "kill")
+        living = [node for node in self.world.node_ids if self.up[node] or node in self._starting]
+        stop = {node: node in killed for node in living if node in down}
+        start = [n for n in self.world.node_ids if n in self._down and n not in down]
+        for node in stop:
+            self._take_down(node)
+        self._log_departures(time_ns, absent)
+        for node in start:
+            self.incarnation[node] += node not in self._newcomers
+        self._newcomers.difference_update(start)
+        self._starting = (self._starting - stop.keys()) | set(start)
+        if starts_at_once:
+            self.come_back(start, time_ns)
+        self._down = (self._down | stop.keys()) - set(start)
+        clocks = [clock_of(active, node, number, time_ns) for node, number in self.number.items()]
+        restarts = [p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns]
+        return ProcessActions(stop, start, paused, clocks, restarts)
+
+    def come_back(self, nodes: Sequence[str], time_ns: int) -> None:
+        """Nodes that were down are up, but for those whose programs have ended by themselves."""
+        self._starting.difference_update(nodes)
+        for node in [node for node in nodes if node not in self._ended]:
+            self.up[node] = True
+            self.engine.set_up(self.number[node], True)
+            if node in self._outside:
+                self._outside.discard(node)
+                self.folder.event(time_ns, "entered", node, incarnation=self.incarnation[node])
+            else:
+                self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
+
+    def has_left(self, node: str) -> bool:
+        """Whether a vehicle is not in the network, as events tell it."""
+        return node in self._outside
+
+    def _log_departures(self, time_ns: int, absent: set[str]) -> None:
+        for node in self.world.node_ids:
+            if node in absent and node not in self._outside:
+                self.folder.event(time_ns, "left", node)
+        self._outside |= absent
+
+    def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
+        chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]
+        return {node for node, number in self.number.items() if any(mask[number] for mask in chosen)}
+
+    def _log_changes(self, time_ns: int, active: Sequence[PlannedFault]) -> None:
+        acting = {planned.label for planned in active}
+        for planned in active:
+            if planned.label not in self._acting:
+                nodes = [node for node, number in self.number.items() if planned.nodes[number]]
+                self.folder.event(time_ns, "fault_started", None, fault=planned.label, nodes=nodes)
+        for label in sorted(self._acting - acting):
+            self.folder.event(time_ns, "fault_ended", None, fault=label)
+        self._acting = acting
+
+    def inject(self, fault: Fault, now_ns: int) -> PlannedFault:
+        """Plan one more fault while the run is on, and write it into the run's scenario so that it replays.
+
+        It acts after `now_ns` at the earliest. Raises ScenarioError if it does not fit.
+        """
+        at_s = max(fault.at_s, (now_ns + 1) / NS_PER_S)
+        planned = self.faults.add(fault.model_copy(update={"at_s": at_s}))
+        self._change_plan()
+        return planned
+
+    def heal(self, label: str, now_ns: int) -> PlannedFault:
+        """End a fault right after `now_ns`, and write that down. Raises ScenarioError if none is called so."""
+        planned = self.faults.heal(label, now_ns + 1)
+        self._change_plan()
+        return planned
+
+    def end_at(self, time_ns: int) -> None:
+        """Let the run end at `time_ns`, by when all faults have healed, and write that down so that it replays."""
+        healed_ns = self.faults.last_end_ns
+        assert healed_ns <= time_ns <= self.duration_ns, (healed_ns, time_ns, self.duration_ns)
+        run = self.scenario.run
+        settle_s = min(run.settle_s, (time_ns - healed_ns) / NS_PER_S)
+        shorter = run.model_copy(update={"duration_s": time_ns / NS_PER_S, "settle_s": settle_s})
+        self._rewrite(self.scenario.model_copy(update={"run": shorter}))
+
+    def _change_plan(self) -> None:
+        self._next_change_ns = self._find_next_change_ns()
+        self._rewrite(self.scenario.model_copy(update={"fault": self.faults.as_written()}))
+
+    def _rewrite(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        text = dump_scenario(scenario)
+        self.folder.put("scenario.toml", lambda path: write_text(path, text))
+
+    def advance(self, time_ns: int) -> list[Delivery]:
+        """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
+        self.close_periods(time_ns)
+        deliveries = [*self._arrived, *self.engine.advance(time_ns)]
+        self._arrived = []
+        return deliveries
+
+    def look_ahead(self, time_ns: int, nodes: Iterable[str]) -> None:
+        """Let the radio come as far as anybody can act: `time_ns`, or an arrival at one of these nodes before."""
+        self.engine.look_ahead(time_ns, [self.number[node] for node in nodes])
+
+    def fix_time_ns(self, period: int) -> int | None:
+        """When the fix of a period is due; None after the end of the run."""
+        time_ns = period * self.world.period_ns
+        return time_ns if time_ns < self.duration_ns else None
+
+    def finish(self, time_ns: int) -> None:
+        """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once."""
+        if not self._finished:
+            self._finished = True
+            self.close_periods(time_ns)
+            self.engine.drain()
+
+    def close_periods(self, time_ns: int) -> None:
+        """Record the periods that end by then; nobody has anything more to report of them.
+
+        What arrives in them, whether or not anybody waits for it, has arrived by then: `advance` hands it out.
+        """
+        while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
+            self.engine.look_ahead(end_ns, ())
+            self._arrived += self.engine.advance(end_ns - 1)
+            instant = self.gnss.at(self._period)
+            reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
+            component = self._component(self._period) if self.world.moves else None
+            figures = self.metrics.record(instant, reports, component)
+            self._period += 1
+            counts = {outcome.name: count for outcome, count in self.engine.counts.items()}
+            view = PeriodView(instant, reports, figures, counts)
+            for watcher in self._watchers:
+                watcher(view)
+            self._reports = []
+
+
+def node_seed(seed: int, node: str, incarnation: int) -> int:
+    """The seed of a node's own random numbers, from which the scenario's seed cannot be told."""
+    digest = hashlib.sha256(f"vnet node seed/{seed}/{node}/{incarnation}".encode()).digest()
+    return int.from_bytes(digest[:7], "big")

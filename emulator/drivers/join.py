@@ -1,0 +1,121 @@
+"""Joining: which nodes have said hello, how they share processes, and who is refused.
+
+Pure: it is given hellos and says what to answer. A node belongs to the process that its own hello named, and
+only the holder of that hello's nonce speaks for it afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from vnet.transport import wire
+
+
+@dataclass
+class _Member:
+    lead: str
+    nonce: bytes | None  # None: it is to join again
+    pid: int
+    host: str
+    ready: bool = False
+
+
+class Membership:
+    """The nodes of a run and what they said when they joined.
+
+    Those that come `later` need not have joined before they `enter`, and may. `alone`: each is its own process.
+    """
+
+    def __init__(self, node_ids: Sequence[str], later: Iterable[str] = (), alone: bool = False) -> None:
+        self._node_ids = tuple(node_ids)
+        self.later = set(later)
+        self._alone = alone
+        self._members = {node: _Member(node, None, 0, "") for node in self.later}
+        self.closed = False
+
+    def hello(self, key_node: str, hello: wire.Hello) -> str | None:
+        """Take a hello that came on the key of `key_node`; returns why it is refused, or None."""
+        if hello.node != key_node or key_node not in self._node_ids or hello.lead not in self._node_ids:
+            return f"{hello.node!r} is not a node of this run"
+        if self._alone and hello.lead != hello.node:
+            return f"{hello.node}: vehicles enter and leave one by one: start an agent for each"
+        member = self._members.get(hello.node)
+        if member is not None and member.nonce not in (None, hello.nonce):
+            return f"{hello.node} is already present"
+        if member is None or member.nonce is None:
+            if self.closed and (member is None or member.lead != hello.lead):
+                return "the run has started"
+            lead = self._members.get(hello.lead)
+            if lead is not None and lead.nonce not in (None, hello.nonce):
+                return f"{hello.lead} belongs to another process"
+            member = self._members[hello.node] = _Member(hello.lead, hello.nonce, hello.pid, hello.host)
+        member.ready = member.ready or hello.ready
+        return None
+
+    def leave(self, node: str) -> None:
+        """Forget a node that went away before the start."""
+        self._members.pop(node, None)
+
+    def enter(self, node: str) -> bool:
+        """A node that was to come later is due; returns whether it is there already."""
+        self.later.discard(node)
+        return self._is_ready(node)
+
+    def expect(self, nodes: Sequence[str]) -> None:
+        """These nodes are to join again, from new processes."""
+        for node in nodes:
+            self._members[node].nonce = None
+            self._members[node].ready = False
+
+    @property
+    def missing(self) -> list[str]:
+        """Nodes that should be there and are not ready, or not of their lead's process, in number order."""
+        return [node for node in self._node_ids if node not in self.later and not self._is_ready(node)]
+
+    def _is_ready(self, node: str) -> bool:
+        member = self._members.get(node)
+        if member is None or not member.ready:
+            return False
+        lead = self._members.get(member.lead)
+        return lead is not None and lead.lead == member.lead and lead.nonce == member.nonce
+
+    @property
+    def joined(self) -> list[str]:
+        """Nodes that have said hello, or will later, in the order of their numbers."""
+        return [node for node in self._node_ids if node in self._members]
+
+    def speaks_for(self, lead: str, nonce: bytes) -> bool:
+        """Whether a message on the `tx` of `lead` with this nonce is its process's own."""
+        member = self._members.get(lead)
+        return member is not None and member.nonce == nonce and member.lead == lead
+
+    def nodes_with(self, lead: str) -> list[str]:
+        """The nodes of the process of `lead`, the lead first."""
+        others = [node for node in self._node_ids if node != lead and self._members[node].lead == lead]
+        return [lead, *others]
+
+    def lead_of(self, node: str) -> str:
+        """The lead of a node's process."""
+        return self._members[node].lead
+
+    def processes(self) -> list[list[str]]:
+        """The nodes of each process, lead first, in the order of their leads' numbers."""
+        assert not self.missing, self.missing
+        groups = {node: [node] for node in self._node_ids if self._members[node].lead == node}
+        for node in self._node_ids:
+            if node not in groups:
+                groups[self._members[node].lead].append(node)
+        return list(groups.values())
+
+    def describe(self, node: str) -> str:
+        """Where the process of a node runs."""
+        member = self._members[node]
+        return f"process {member.pid} on {member.host}"
+
+
+def split_into_processes(node_ids: Sequence[str], nodes_per_process: int) -> list[list[str]]:
+    """Consecutive nodes, `nodes_per_process` at a time: how the launcher and access rules group them."""
+    return [
+        list(node_ids[start : start + nodes_per_process]) for start in range(0, len(node_ids), nodes_per_process)
+    ]

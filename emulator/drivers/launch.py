@@ -1,0 +1,199 @@
+"""Starting agent processes, watching them, and ending every one of them.
+
+Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
+fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents stay in the emulator's
+session: Linux shares processors out between sessions first (autogroups, sched(7), where no CPU cgroup does),
+whatever their niceness.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence, Set
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from vnet.errors import VnetError
+from vnet.transport.access import Access, Credentials, node_user
+from vnet.transport.scheduling import default_time_slice
+from vnet.transport.session import AGENT_RUNTIME
+
+LOG_TAIL_LINES = 12
+LOWEST_PRIORITY = 19
+
+AGENT_ENVIRONMENT = {
+    "PYTHONHASHSEED": "0",
+    "ZENOH_RUNTIME": AGENT_RUNTIME,
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+@dataclass(frozen=True)
+class Exit:
+    """How a process ended."""
+
+    status: int
+    log_tail: str
+
+    @property
+    def how(self) -> str:
+        """In words: an exit status, or the signal that ended it."""
+        if self.status >= 0:
+            return f"exit status {self.status}"
+        try:
+            return signal.Signals(-self.status).name
+        except ValueError:
+            return f"signal {-self.status}"
+
+
+class Launcher:
+    """The processes that a run has started. `stop` ends all that are left, whatever happened before."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._services: set[str] = set()
+
+    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
+        """Start the process of `nodes`; its name here is that of its lead, the first node.
+
+        `nice` lowers its priority, so that on a full machine the emulator, which all wait for, comes first.
+        """
+        arguments = ["-P", "-m", "agents.cli", "--connect", endpoint, "--run", access.run]
+        for node in nodes:
+            arguments += ["--node", node]
+        self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
+        if nice:
+            nice = min(os.getpriority(os.PRIO_PROCESS, 0) + nice, LOWEST_PRIORITY)
+            os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
+
+    def start(
+        self,
+        name: str,
+        arguments: Sequence[str],
+        credentials: Credentials | None,
+        environment: Mapping[str, str],
+        own_session: bool = False,
+    ) -> None:
+        """Start `python ARGUMENTS`, with `--credentials` if there are any; its output goes to `logs/{name}.log`.
+
+        In a session of its own it gets processor time even where the run could use all of it, if autogroups act.
+        """
+        read_end, write_end = os.pipe()
+        command = [sys.executable, *arguments]
+        if credentials is not None:
+            os.write(write_end, credentials.dumps().encode())
+            command += ["--credentials", f"/dev/fd/{read_end}"]
+        os.close(write_end)
+        try:
+            inherit = nullcontext() if name in self._services else default_time_slice()
+            with (self._logs / f"{name}.log").open("ab") as log, inherit:
+                self._processes[name] = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    pass_fds=[read_end],
+                    process_group=None if own_session else 0,
+                    start_new_session=own_session,
+                    env={**os.environ, **environment},
+                )
+        except OSError as error:
+            raise VnetError(f"cannot start the process of {name}: {error.strerror}") from None
+        finally:
+            os.close(read_end)
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by name."""
+        return {name: process.pid for name, process in self._processes.items()}
+
+    def ended(self) -> dict[str, Exit]:
+        """The processes that have ended since the last call; they are forgotten."""
+        done = {}
+        for name, process in list(self._processes.items()):
+            status = process.poll()
+            if status is not None:
+                del self._processes[name]
+                done[name] = Exit(status, self.log_tail(name))
+        return done
+
+    def log_tail(self, name: str) -> str:
+        """The last lines of a process's log."""
+        try:
+            text = (self._logs / f"{name}.log").read_text(errors="replace")
+        except OSError:
+            return ""
+        return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])
+
+    def ask_where(self, name: str) -> None:
+        """Have a process write its stacks to its log (its faulthandler answers SIGUSR1)."""
+        if name in self._processes:
+            self._processes[name].send_signal(signal.SIGUSR1)
+
+    def start_service(self, name: str, arguments: Sequence[str]) -> None:
+        """Start `python ARGUMENTS`, which goes on until it is told to end."""
+        self._services.add(name)
+        self.start(name, arguments, None, {})
+
+    def kill(self, name: str) -> None:
+        """End a process at once; it is not among those that `ended` reports."""
+        process = self._processes.pop(name, None)
+        if process is not None:
+            process.kill()
+            process.wait()
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a process, if it is there."""
+        if name in self._processes:
+            self._processes[name].send_signal(number)
+
+    def let_go(self, name: str) -> Callable[[float], None]:
+        """Forget a process that has been told to go: `ended` does not report it.
+
+        Returns what waits so many seconds for its end, and kills it if it does not go.
+        """
+        process = self._processes.pop(name, None)
+
+        def see_off(patience_s: float) -> None:
+            if process is not None:
+                try:
+                    process.wait(patience_s)
+                except subprocess.TimeoutExpired:
+                    process.kill()
+                    process.wait()
+
+        return see_off
+
+    def wait_for(self, name: str, timeout_s: float) -> None:
+        """Wait for one process to end by itself."""
+        with suppress(KeyError, subprocess.TimeoutExpired):
+            self._processes[name].wait(timeout_s)
+
+    def stop(self, patience_s: float = 1.0) -> None:
+        """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL."""
+        self._wait(patience_s, self._services)
+        for process in self._processes.values():
+            process.terminate()
+        self._wait(0.5)
+        for process in self._processes.values():
+            process.kill()
+        for process in self._processes.values():
+            process.wait()
+        self._processes.clear()
+
+    def _wait(self, timeout_s: float, but: Set[str] = frozenset()) -> None:
+        """Wait until all but these have ended."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            for name, process in list(self._processes.items()):
+                if process.poll() is not None:
+                    del self._processes[name]
+            if self._processes.keys() <= but:
+                return
+            time.sleep(0.01)

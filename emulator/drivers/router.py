@@ -1,0 +1,62 @@
+"""A separate router as a process of its own (`vnet run --router separate`), which faults may end and start again.
+
+It is Zenoh's own router, run from Python with the configuration that `vnet access` writes for a `zenohd`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+
+import zenoh
+
+from emulator.drivers.launch import Launcher
+from vnet.errors import LinkError
+from vnet.transport.access import Access
+
+ROUTER = "router"
+START_TIMEOUT_S = 15.0
+ORPHAN_POLL_S = 0.5
+
+
+class SeparateRouter:
+    """The router of a run. Its configuration, with the passwords, is in `folder`, which is private."""
+
+    def __init__(self, access: Access, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = int(free.getsockname()[1])
+        self.endpoint = f"tcp/127.0.0.1:{self._port}"
+        self._config = folder / "zenohd.json5"
+        access.save(folder, self.endpoint, folder)
+
+    def start(self, launcher: Launcher) -> None:
+        """Start the process and wait until it listens. Raises LinkError if it does not."""
+        launcher.start_service(ROUTER, ["-P", "-m", "emulator.drivers.router", str(self._config)])
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while time.monotonic() < deadline:
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 1.0):
+                return
+            time.sleep(0.02)
+        raise LinkError(f"the separate router does not listen at {self.endpoint}: {launcher.log_tail(ROUTER)}")
+
+
+def main(config: str) -> None:
+    """Be the router until SIGTERM, or until the emulator is gone."""
+    emulator = os.getppid()
+    over = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: over.set())
+    with zenoh.open(zenoh.Config.from_file(config)):
+        while os.getppid() == emulator and not over.wait(ORPHAN_POLL_S):
+            pass
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

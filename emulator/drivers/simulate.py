@@ -1,0 +1,136 @@
+"""The simulated driver: the same programs and the same engine in one process, without Zenoh.
+
+One virtual-time loop hosts all nodes; its yields go straight to the barrier. In lockstep a live run and its
+simulation give the same trace, and a test holds them to it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from msgspec.structs import replace
+
+from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.lockstep import Lockstep
+from vnet.runtime.host import Host, load_programs
+from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.transport import wire
+
+_NONCE = b""
+
+
+class _RunOverError(Exception):
+    """The barrier has granted nothing more."""
+
+
+def simulate(emulation: Emulation, gate: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
+    """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
+
+    Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
+    it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
+    `gate` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
+    """
+    simulation = _Simulation(emulation, gate)
+    emulation.folder.event(0, "started", start_up_s=0.0)
+    started = time.monotonic()
+    interrupted = False
+    try:
+        with _ending_between_instants(simulation):
+            simulation.run()
+    except KeyboardInterrupt:
+        interrupted = True
+        emulation.folder.event(simulation.loop.now_ns, "interrupted")
+        emulation.finish(simulation.loop.now_ns)
+    return time.monotonic() - started, interrupted
+
+
+@contextmanager
+def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
+    """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
+
+    def ask(number: int, frame: object) -> None:
+        simulation.interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    here = threading.current_thread() is threading.main_thread()
+    if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # others see to it
+        yield
+        return
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+class _Simulation:
+    """All nodes on one loop, and the barrier that this loop yields to."""
+
+    def __init__(self, emulation: Emulation, gate: Callable[[Lockstep], None] | None) -> None:
+        node_ids = emulation.world.node_ids
+        self._lead = node_ids[0]
+        self._emulation = emulation
+        self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
+        self._gate = gate or (lambda lockstep: None)
+        self._seq = 0
+        self.interrupted = False
+        welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
+        welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
+        self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
+        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
+        self._host = Host(welcomes, lambda: self.loop.now_ns)
+
+    def run(self) -> None:
+        """From the first grant to the last."""
+        asyncio.set_event_loop(self.loop)
+        try:
+            self._host.start(self.loop, self._programs)
+            self._gate(self._lockstep)
+            self.loop.start_at(self._take(self._lockstep.start()))
+            while True:
+                try:
+                    self.loop.run_forever()
+                except SpinError as spin:
+                    self._host.end_spinning(self.loop, spin)
+        except _RunOverError:
+            self._host.close(self.loop)
+        except KeyboardInterrupt:
+            self._host.close(self.loop)
+            raise
+        finally:
+            asyncio.set_event_loop(None)
+            self.loop.close()
+
+    def _exchange(self, next_timer_ns: int | None) -> int:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self._lockstep.receive(self._lead, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
+        grants = self._lockstep.step()
+        while self._lockstep.held:
+            self._gate(self._lockstep)
+            grants = self._lockstep.step()
+        return self._take(grants)
+
+    def _take(self, grants: dict[str, wire.Grant]) -> int:
+        if not grants:
+            raise _RunOverError
+        grant = grants[self._lead]
+        self._seq = grant.seq
+        self._host.bend(grant.clocks, self.loop)
+        self._suffer(self._lockstep.take_actions())
+        self._host.deliver(grant.packets, grant.fixes)
+        return grant.time_ns
+
+    def _suffer(self, actions: Sequence[ProcessActions]) -> None:
+        """Do to the programs what faults do to processes."""
+        for action in actions:
+            for node, killed in action.stop.items():
+                self._host.stop(node, killed)
+            for node in action.start:
+                self._host.restart(self._emulation.welcome(node, _NONCE))
+            self._host.pause(action.paused)

@@ -1,0 +1,207 @@
+"""The course of a run: what its user wants to know while it is on, in plain figures with their units.
+
+A `Course` listens to an emulation; its `Snapshot` is what the terminal, JSON lines and `vnet status` show.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from emulator.drivers.emulation import Emulation, PeriodView
+from emulator.drivers.memory import resident_kb
+from emulator.faults.plan import PlannedFault
+from emulator.radio.outcomes import Outcome
+from emulator.records.run_folder import Event
+from vnet.units import NS_PER_S
+
+BINS = 120
+"""Into so many equal parts of the run the figures over time are summed up."""
+RATES_OVER_S = 1.0
+"""Of emulated time."""
+SPEED_OVER_S = 10.0
+"""Of wall clock."""
+SPEED_EVERY_S = 0.1
+FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m")
+"""Those of `PeriodFigures` that one wants to see."""
+EVENTS_KEPT = 8
+FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total")
+"""Kinds of events that hold measurements, and are no news."""
+
+
+@dataclass(frozen=True)
+class FaultState:
+    """A fault of the plan; `state` is "to come", "acting" or "ended", and `nodes` are those it concerns."""
+
+    fault: str
+    state: str
+    start_s: float
+    end_s: float
+    nodes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """How a run gets on.
+
+    `phase` is "starting", "joining" (`missing` are the vehicles that are awaited, `join_timeout_s` how long),
+    "running" or "judging"; `absent` are those that have not entered yet, or have left. Seconds are emulated ones,
+    but for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and
+    `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts pairs of a frame and a receiver so far,
+    `frames_per_s` those of the last emulated second. Figures are those of the last period, and None where programs
+    report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run.
+    """
+
+    run: str
+    pacing: str
+    seed: int
+    node_ids: tuple[str, ...]
+    phase: str
+    missing: tuple[str, ...]
+    down: tuple[str, ...]
+    emulated_s: float
+    duration_s: float
+    join_timeout_s: float
+    real_time_factor: float | None
+    remaining_s: float | None
+    idle_s: float
+    wall_s: float
+    common_error_rmse_m: float | None
+    deviation_m: float | None
+    position_rmse_m: float | None
+    fix_rmse_m: float | None
+    over_time: dict[str, tuple[float | None, ...]]
+    frames_by_outcome: dict[str, int]
+    frames_per_s: dict[str, float]
+    faults: tuple[FaultState, ...]
+    events: tuple[Event, ...]
+    emulator_memory_mb: float | None
+    absent: tuple[str, ...] = ()
+
+    def never_reported(self, figure: str) -> bool:
+        """Whether no program has reported anything of this kind yet."""
+        return not any(value is not None for value in self.over_time[figure])
+
+
+class Course:
+    """What has been seen of a run so far. `clock` gives the seconds of the wall clock."""
+
+    def __init__(self, emulation: Emulation, clock: Callable[[], float] = time.monotonic) -> None:
+        self._emulation = emulation
+        self._clock = clock
+        self._began_s = self._period_ended_s = clock()
+        self._phase = "starting"
+        self._missing: tuple[str, ...] = ()
+        self._figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+        self._over_time = {name: _Series(emulation.duration_ns) for name in FIGURES}
+        self._speed: deque[tuple[float, int]] = deque()  # wall clock in s, emulated ns
+        self._counts: deque[tuple[int, dict[Outcome, int]]] = deque([(0, dict(emulation.engine.counts))])
+        emulation.watch(self._period)
+
+    def awaits(self, nodes: Sequence[str]) -> None:
+        """These vehicles have not joined yet; when there are none any more the run starts."""
+        self._missing = tuple(nodes)
+        self._phase = "joining" if nodes else "running"
+
+    def judging(self) -> None:
+        """The run is over, and is being written down and judged."""
+        self._phase = "judging"
+
+    def _period(self, view: PeriodView) -> None:
+        self._phase = "running"
+        self._period_ended_s = now_s = self._clock()
+        end_ns = self._emulation.emulated_ns
+        if not self._speed or now_s - self._speed[-1][0] >= SPEED_EVERY_S:
+            self._speed.append((now_s, end_ns))
+        while len(self._speed) > 2 and self._speed[1][0] < now_s - SPEED_OVER_S:
+            self._speed.popleft()
+        self._counts.append((end_ns, dict(self._emulation.engine.counts)))
+        while len(self._counts) > 2 and self._counts[1][0] <= end_ns - RATES_OVER_S * NS_PER_S:
+            self._counts.popleft()
+        self._figures = {name: getattr(view.figures, name) for name in FIGURES}
+        for name, series in self._over_time.items():
+            series.add(end_ns, self._figures[name])
+
+    @property
+    def wall_s(self) -> float:
+        """Wall clock since the beginning."""
+        return self._clock() - self._began_s
+
+    def news(self, after: int = 0) -> list[Event]:
+        """What has happened, but for the first `after` events of the run."""
+        return [event for event in self._emulation.folder.events[after:] if event.kind not in FOR_THE_CHECKS]
+
+    def snapshot(self, now_ns: int | None = None) -> Snapshot:
+        """How the run gets on at this emulated instant, or at the end of its last period."""
+        emulation = self._emulation
+        run = emulation.scenario.run
+        factor = self._real_time_factor()
+        now_ns = emulation.emulated_ns if now_ns is None else min(now_ns, emulation.duration_ns)
+        memory_kb = resident_kb()
+        return Snapshot(
+            run=run.name,
+            pacing=run.pacing,
+            seed=run.seed,
+            node_ids=emulation.world.node_ids,
+            phase=self._phase,
+            missing=self._missing,
+            down=tuple(node for node, up in emulation.up.items() if not up and not emulation.has_left(node)),
+            absent=tuple(node for node in emulation.world.node_ids if emulation.has_left(node)),
+            emulated_s=now_ns / NS_PER_S,
+            duration_s=emulation.duration_ns / NS_PER_S,
+            join_timeout_s=run.join_timeout_s,
+            real_time_factor=factor,
+            remaining_s=None if not factor else (emulation.duration_ns - now_ns) / NS_PER_S / factor,
+            idle_s=self._clock() - self._period_ended_s,
+            wall_s=self.wall_s,
+            **self._figures,
+            over_time={name: series.means() for name, series in self._over_time.items()},
+            frames_by_outcome={outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
+            frames_per_s=self._rates(),
+            faults=tuple(fault_state(planned, emulation, now_ns) for planned in emulation.faults.faults),
+            events=tuple(self.news(-2 * EVENTS_KEPT)[-EVENTS_KEPT:]),
+            emulator_memory_mb=None if memory_kb is None else memory_kb / 1024,
+        )
+
+    def _real_time_factor(self) -> float | None:
+        """Emulated seconds a second, lately; None before there is anything to tell it from."""
+        if not self._speed or self._speed[0][1] == self._emulation.emulated_ns:
+            return None
+        first_s, first_ns = self._speed[0]  # the first period of all is not in it: programs start in it
+        return (self._emulation.emulated_ns - first_ns) / NS_PER_S / max(self._period_ended_s - first_s, 1e-9)
+
+    def _rates(self) -> dict[str, float]:
+        """Decided pairs an emulated second, by outcome."""
+        (first_ns, before), (last_ns, after) = self._counts[0], self._counts[-1]
+        changes = {outcome.name: after[outcome] - before[outcome] for outcome in Outcome if outcome.value}
+        over_s = max(last_ns - first_ns, 1) / NS_PER_S
+        return {name: change / over_s for name, change in changes.items() if change > 0}
+
+
+def fault_state(planned: PlannedFault, emulation: Emulation, now_ns: int) -> FaultState:
+    """A fault as its user sees it at an emulated instant."""
+    state = "acting" if planned.acts_at(now_ns) else ("ended" if planned.end_ns <= now_ns else "to come")
+    nodes = tuple(node for node, number in emulation.number.items() if planned.nodes[number])
+    return FaultState(planned.label, state, planned.start_ns / NS_PER_S, planned.end_ns / NS_PER_S, nodes)
+
+
+class _Series:
+    """Means of a figure in equal parts of the run. A period that is longer than a part counts in all it touches."""
+
+    def __init__(self, duration_ns: int) -> None:
+        self._duration_ns = duration_ns
+        self._sums: list[tuple[float, int]] = []
+
+    def add(self, end_ns: int, value: float | None) -> None:
+        """The value of the period that ends then."""
+        parts = min((end_ns - 1) * BINS // self._duration_ns, BINS - 1) + 1
+        first = min(len(self._sums), parts - 1)
+        self._sums += [(0.0, 0)] * (parts - len(self._sums))
+        if value is not None:
+            self._sums[first:] = [(total + value, count + 1) for total, count in self._sums[first:]]
+
+    def means(self) -> tuple[float | None, ...]:
+        """The parts so far; None where there was no value."""
+        return tuple(total / count if count else None for total, count in self._sums)

@@ -1,0 +1,209 @@
+"""A run as MCAP with JSON messages, for Foxglove and Rerun.
+
+Topics, each with its JSON schema: `/tf` the true place of each vehicle (foxglove.FrameTransforms, so that they
+appear with their names), `/vehicles/fix` and `/vehicles/estimate` (foxglove.PosesInFrame), `/states` all that is
+known of a period, `/metrics` its figures, `/frames` each frame with what became of it, `/events`. Times count from
+the start of the run, in nanoseconds. The scenario is an attachment.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import math
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+import pyarrow as pa
+
+from emulator.records.recorded_run import Evidence
+from emulator.scenario.scenario import dump_scenario
+from vnet.errors import VnetError
+
+Message = tuple[int, str, dict[str, Any]]
+"""When (ns), on which topic, and what."""
+
+NUMBER: dict[str, Any] = {"type": "number"}
+TEXT: dict[str, Any] = {"type": "string"}
+WHOLE: dict[str, Any] = {"type": "integer"}
+
+
+def _object(**properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+def _list(items: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": items}
+
+
+_TIME = _object(sec=WHOLE, nsec=WHOLE)
+_VECTOR = _object(x=NUMBER, y=NUMBER, z=NUMBER)
+_QUATERNION = _object(x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
+_POSES = _object(timestamp=_TIME, frame_id=TEXT, poses=_list(_object(position=_VECTOR, orientation=_QUATERNION)))
+_TRANSFORM = _object(
+    timestamp=_TIME, parent_frame_id=TEXT, child_frame_id=TEXT, translation=_VECTOR, rotation=_QUATERNION
+)
+_STATE = _object(
+    node=TEXT,
+    position_m=_list(NUMBER),
+    heading_rad=NUMBER,
+    fix_m=_list(NUMBER),
+    estimate_m=_list(NUMBER),
+    covariance_m2=_list(NUMBER),
+    common_error_estimate_m=_list(NUMBER),
+    values={"type": "object"},
+)
+_FRAME = _object(
+    sender=TEXT,
+    seq=WHOLE,
+    copy=WHOLE,
+    size_bytes=WHOLE,
+    payload_digest=TEXT,
+    cause=TEXT,
+    outcomes={"type": "object", "additionalProperties": _list(TEXT)},
+)
+SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
+    "/tf": ("foxglove.FrameTransforms", _object(transforms=_list(_TRANSFORM))),
+    "/vehicles/fix": ("foxglove.PosesInFrame", _POSES),
+    "/vehicles/estimate": ("foxglove.PosesInFrame", _POSES),
+    "/states": ("vnet.States", _object(period=WHOLE, common_error_m=_list(NUMBER), vehicles=_list(_STATE))),
+    "/metrics": ("vnet.PeriodFigures", {"type": "object"}),
+    "/frames": ("vnet.Frame", _FRAME),
+    "/events": ("vnet.Event", _object(kind=TEXT, node=TEXT, details={"type": "object"})),
+}
+"""Of each topic the name of its schema, and the schema."""
+_KEPT = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
+
+
+def write_mcap(evidence: Evidence, file: BinaryIO) -> int:
+    """Write a run; returns how many messages these are. Raises VnetError where the package mcap is missing."""
+    try:
+        from mcap.writer import Writer
+    except ImportError:
+        raise VnetError("MCAP needs the package mcap: pip install 'vnet-emulator[export]'") from None
+    writer = Writer(file)
+    writer.start(profile="", library="vnet")
+    channels = {}
+    for topic, (name, schema) in SCHEMAS.items():
+        described = json.dumps({"title": name, **schema}).encode()
+        schema_id = writer.register_schema(name, "jsonschema", described)
+        channels[topic] = writer.register_channel(topic, "json", schema_id)
+    count = 0
+    for time_ns, topic, message in heapq.merge(*_streams(evidence), key=lambda one: one[0]):
+        data = json.dumps(message, allow_nan=False).encode()
+        writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
+        count += 1
+    scenario = dump_scenario(evidence.scenario).encode()
+    writer.add_attachment(
+        create_time=0, log_time=0, name="scenario.toml", media_type="application/toml", data=scenario
+    )
+    writer.finish()  # type: ignore[no-untyped-call]
+    return count
+
+
+def _streams(evidence: Evidence) -> list[Iterator[Message]]:
+    """Messages, each stream in the order of their times."""
+    return [_periods(evidence), _metrics(evidence), _frames(evidence), _events(evidence)]
+
+
+def _periods(evidence: Evidence) -> Iterator[Message]:
+    count = len(evidence.node_ids)
+    for start in range(0, len(evidence.states), max(count, 1)):
+        rows = evidence.states.slice(start, count).to_pylist()
+        time_ns = rows[0]["time_ns"]
+        yield time_ns, "/tf", {"transforms": [_transform(row) for row in rows if _there(row["position_m"])]}
+        for topic, name in (("/vehicles/fix", "fix_m"), ("/vehicles/estimate", "estimate_m")):
+            poses = [_pose(row[name]) for row in rows if _there(row[name])]
+            yield time_ns, topic, {"timestamp": _stamp(time_ns), "frame_id": "map", "poses": poses}
+        yield (
+            time_ns,
+            "/states",
+            {
+                "period": rows[0]["period"],
+                "common_error_m": _finite(rows[0]["common_error_m"]),
+                "vehicles": [_state(row) for row in rows if _there(row["position_m"])],
+            },
+        )
+
+
+def _state(row: dict[str, Any]) -> dict[str, Any]:
+    told = {name: _finite(row[name]) for name in _KEPT}
+    values = {name: _finite(value) for name, value in row["values"] or ()}
+    return {
+        "node": row["node"],
+        **{name: value for name, value in told.items() if value is not None},
+        "values": values,
+    }
+
+
+def _there(point: list[float] | None) -> bool:
+    return point is not None and all(map(math.isfinite, point))
+
+
+def _finite(value: Any) -> Any:
+    """A number, or a list of some, as JSON can say it: null for NaN and infinity."""
+    if isinstance(value, list):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _stamp(time_ns: int) -> dict[str, int]:
+    sec, nsec = divmod(time_ns, 1_000_000_000)
+    return {"sec": sec, "nsec": nsec}
+
+
+def _vector(point: list[float]) -> dict[str, float]:
+    return {"x": point[0], "y": point[1], "z": 0.0}
+
+
+def _pose(point: list[float]) -> dict[str, Any]:
+    return {"position": _vector(point), "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
+def _transform(row: dict[str, Any]) -> dict[str, Any]:
+    heading_rad = row["heading_rad"] if math.isfinite(row["heading_rad"]) else 0.0
+    half = heading_rad / 2
+    return {
+        "timestamp": _stamp(row["time_ns"]),
+        "parent_frame_id": "map",
+        "child_frame_id": row["node"],
+        "translation": _vector(row["position_m"]),
+        "rotation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
+    }
+
+
+def _metrics(evidence: Evidence) -> Iterator[Message]:
+    for row in evidence.metrics.to_pylist():
+        yield row["time_ns"], "/metrics", {name: _finite(value) for name, value in row.items()}
+
+
+def _events(evidence: Evidence) -> Iterator[Message]:
+    for event in sorted(evidence.events, key=lambda event: event.time_ns):
+        yield event.time_ns, "/events", {"kind": event.kind, "node": event.node or "", "details": event.details}
+
+
+def _frames(evidence: Evidence) -> Iterator[Message]:
+    order = np.lexsort((evidence.receiver, evidence.emission, evidence.sent_ns))
+    edges = np.flatnonzero(np.diff(evidence.emission[order])) + 1
+    outcomes = evidence.trace["outcome"].cast(pa.string()).to_pylist()
+    causes = evidence.trace["cause"].cast(pa.string()).to_pylist()
+    sizes = evidence.column("size_bytes")
+    for rows in np.split(order, edges) if len(order) else ():
+        by_outcome: dict[str, list[str]] = {}
+        for row in rows.tolist():
+            by_outcome.setdefault(outcomes[row], []).append(evidence.node_ids[int(evidence.receiver[row])])
+        first = int(rows[0])
+        yield (
+            int(evidence.sent_ns[first]),
+            "/frames",
+            {
+                "sender": evidence.node_ids[int(evidence.sender[first])],
+                "seq": int(evidence.seq[first]),
+                "copy": int(evidence.copy[first]),
+                "size_bytes": int(sizes[first]),
+                "payload_digest": f"{int(evidence.digest[first]):016x}",
+                "cause": causes[first],
+                "outcomes": by_outcome,
+            },
+        )

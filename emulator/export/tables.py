@@ -1,0 +1,68 @@
+"""All tables of a run as CSV files: points in two columns, matrices in four, all else that is no number as JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pacsv
+
+from emulator.records.radio_metrics import radio_metrics
+from emulator.records.recorded_run import Evidence
+
+AXES = {2: ("x", "y"), 4: ("xx", "xy", "yx", "yy")}
+"""What the columns of a list of so many numbers are called."""
+
+
+def write_csv(evidence: Evidence, folder: Path) -> list[str]:
+    """Write all tables into a folder; returns the files' names. Raises OSError."""
+    events = [
+        {"time_ns": e.time_ns, "kind": e.kind, "node": e.node, "details": json.dumps(e.details)}
+        for e in evidence.events
+    ]
+    figures = radio_metrics(evidence)
+    tables = {
+        "trace": evidence.trace,
+        "states": evidence.states,
+        "metrics": evidence.metrics,
+        "events": pa.Table.from_pylist(events),
+        "links": figures.links,
+        "vehicles": figures.vehicles,
+        "distances": figures.distances,
+    }
+    if evidence.busy is not None:
+        tables["busy"] = evidence.busy
+    for name, table in tables.items():
+        pacsv.write_csv(flat(table), folder / f"{name}.csv")
+    return [f"{name}.csv" for name in tables]
+
+
+def flat(table: pa.Table) -> pa.Table:
+    """A table in which every column is of numbers or text."""
+    return pa.table(dict(_flat_columns(table)))
+
+
+def _flat_columns(table: pa.Table) -> Iterator[tuple[str, pa.Array]]:
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        kind = column.type
+        if pa.types.is_dictionary(kind):
+            yield name, column.cast(pa.string())
+        elif pa.types.is_fixed_size_list(kind) and kind.list_size in AXES:
+            for place, axis in enumerate(AXES[kind.list_size]):
+                yield f"{name}_{axis}", pc.list_element(column, place)
+        elif pa.types.is_nested(kind):
+            texts = (None if entry is None else json.dumps(_plain(entry)) for entry in column.to_pylist())
+            yield name, pa.array(texts, pa.string())
+        else:
+            yield name, column
+
+
+def _plain(entry: object) -> object:
+    """A list or map as JSON has it."""
+    if isinstance(entry, list) and entry and all(isinstance(pair, tuple) for pair in entry):
+        return dict(entry)
+    return entry

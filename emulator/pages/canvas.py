@@ -1,0 +1,285 @@
+"""Small charts as inline SVG: matplotlib draws them, the page's CSS variables colour them.
+
+A figure is drawn with the colours of light paper; `to_svg` puts the page's variables in their place, so that one
+picture serves light and dark. Text stays text, coordinates are rounded to a tenth of a pixel, and lines are thinned
+to what a screen can show.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Any
+from xml.etree import ElementTree
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from emulator.pages.page import escape
+from vnet.types import Array
+
+# Light paper's colours, which page.STYLE has under these names.
+PALETTE = {
+    "ink": "#1b1f24",
+    "quiet": "#59626d",
+    "line": "#d5d9df",
+    "grid": "#e6e9ed",
+    "paper": "#ffffff",
+    "blue": "#0072b2",
+    "orange": "#e69f00",
+    "green": "#009e73",
+    "red": "#d55e00",
+    "purple": "#cc79a7",
+    "sky": "#56b4e9",
+    "grey": "#8b929b",
+    "sand": "#bdb35c",
+    "rust": "#8a3a00",
+    "navy": "#004166",
+}
+INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY, SAND, RUST, NAVY = PALETTE.values()
+_VARIABLE = {colour: f"var(--{name})" for name, colour in PALETTE.items()}
+
+WIDTH_PX, PLOT_PX = 400, 190
+"""A figure's width, and the height of what is inside its axes, at the size that it is drawn for."""
+_LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 54, 12, 8, 42
+_LEGEND_ROW_PX, _LANE_PX = 18, 15
+_MOST_LANES = 6
+_LETTER_PX = 5.6
+"""The width of a letter of a fault's label, on average."""
+MOST_POINTS = 2 * (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
+
+STYLED: dict[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "vnet",
+    "text.parse_math": False,
+    "font.size": 11,
+    "axes.labelsize": 12,
+    "legend.fontsize": 11,
+    "legend.frameon": False,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": QUIET,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "axes.facecolor": "none",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.spines.left": False,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "grid.color": GRID,
+    "grid.linewidth": 1.0,
+    "ytick.major.size": 0,
+    "ytick.minor.size": 0,
+    "xtick.major.size": 3.5,
+    "lines.linewidth": 1.6,
+    "lines.solid_capstyle": "round",
+    "path.simplify": False,
+}
+
+
+@dataclass(frozen=True)
+class Span:
+    """A time [start, end) in seconds in which a fault acted."""
+
+    label: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A figure with one pair of axes, all of the same size and at the same place."""
+
+    figure: Figure
+    axes: Axes
+    unnamed: int = 0
+    """Faults that are shaded, but have no room for their name."""
+
+
+styled = matplotlib.rc_context(STYLED)
+
+
+def canvas(
+    x_label: str,
+    y_label: str,
+    legend_rows: int = 0,
+    spans: Sequence[Span] = (),
+    end_s: float = 0.0,
+    plot_px: float = PLOT_PX,
+) -> Canvas:
+    """Empty axes; with `spans`, faults are shaded on an axis of time until `end_s`, and named above it."""
+    lanes = _in_lanes(spans, end_s)
+    height_px = _TOP_PX + legend_rows * _LEGEND_ROW_PX + len(lanes) * _LANE_PX + plot_px + _BOTTOM_PX
+    figure = Figure(figsize=(WIDTH_PX / 72, height_px / 72), dpi=72)
+    figure.patch.set_visible(False)
+    width = (WIDTH_PX - _LEFT_PX - _RIGHT_PX) / WIDTH_PX
+    axes = figure.add_axes((_LEFT_PX / WIDTH_PX, _BOTTOM_PX / height_px, width, plot_px / height_px))
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.yaxis.set_label_coords(-40 / (WIDTH_PX * width), 0.5)
+    if end_s:
+        axes.set_xlim(0, end_s)
+    for span in spans:
+        axes.axvspan(span.start_s, span.end_s, color=PURPLE, alpha=0.16, linewidth=0, zorder=0.5)
+    if lanes:
+        bottom = (_BOTTOM_PX + plot_px) / height_px
+        strip = figure.add_axes((_LEFT_PX / WIDTH_PX, bottom, width, len(lanes) * _LANE_PX / height_px))
+        _draw_lanes(strip, lanes, end_s)
+    return Canvas(figure, axes, len(spans) - sum(map(len, lanes)))
+
+
+def _reach(span: Span, end_s: float) -> tuple[float, float]:
+    """From where to where a span and its label reach in seconds; a label stays left of the right edge."""
+    label_s = (_LETTER_PX * len(span.label) + 8) * end_s / (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
+    start_s = min(span.start_s, end_s - label_s)
+    return start_s, max(span.end_s, start_s + label_s)
+
+
+def _in_lanes(spans: Sequence[Span], end_s: float) -> list[list[Span]]:
+    """Spans in as few rows as hold them and their labels side by side; those beyond the last row are left out."""
+    lanes: list[list[Span]] = []
+    for span in sorted(spans, key=lambda span: (span.start_s, span.end_s)):
+        start_s, _ = _reach(span, end_s)
+        free = (lane for lane in lanes if _reach(lane[-1], end_s)[1] <= start_s)
+        lane = next(free, None)
+        if lane is not None:
+            lane.append(span)
+        elif len(lanes) < _MOST_LANES:
+            lanes.append([span])
+    return lanes
+
+
+def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[Span]], end_s: float) -> None:
+    strip.set(xlim=(0, end_s), ylim=(len(lanes), 0))
+    strip.set_axis_off()
+    for row, lane in enumerate(lanes):
+        for span in lane:
+            strip.plot(
+                [span.start_s, span.end_s], [row + 0.86] * 2, color=PURPLE, linewidth=2.5, solid_capstyle="butt"
+            )
+            strip.text(_reach(span, end_s)[0], row + 0.68, span.label, fontsize=10, color=QUIET, va="baseline")
+
+
+def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = 3) -> None:
+    """The legend of these, or of all that has a label, above the figure."""
+    of.figure.legend(
+        handles=of.axes.get_legend_handles_labels()[0] if handles is None else list(handles),
+        loc="upper left",
+        bbox_to_anchor=(_LEFT_PX / WIDTH_PX, 1),
+        ncols=columns,
+        handlelength=1.8,
+        handletextpad=0.5,
+        columnspacing=1.2,
+        labelspacing=0.35,
+        borderpad=0.1,
+        borderaxespad=0.1,
+    )
+
+
+def from_zero(axes: Axes) -> None:
+    """A linear axis of y from zero, with few ticks."""
+    top = axes.get_ylim()[1]
+    axes.set_ylim(0, top if top > 0 else 1)
+    axes.yaxis.set_major_locator(MaxNLocator(5))
+
+
+def logarithmic(axes: Axes) -> None:
+    """A logarithmic axis of y with plain numbers; where it has few powers of ten, with 2 and 5 between them."""
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    between = (1, 2, 5) if high < 200 * low else (1,)
+    axes.yaxis.set_major_locator(LogLocator(subs=between))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def whole_numbers(axes: Axes) -> None:
+    """Counts: ticks at whole numbers only, with commas at the thousands."""
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+
+
+def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
+    """A line of at most `MOST_POINTS` points: of every stretch the least and the most. NaN are gaps, and stay."""
+    if len(time_s) <= MOST_POINTS:
+        return time_s, value
+    kept: list[int] = []
+    for stretch in np.array_split(np.arange(len(value)), MOST_POINTS // 2):
+        if np.isnan(value[stretch]).all():
+            kept.append(int(stretch[0]))
+        else:
+            extremes = int(np.nanargmin(value[stretch])), int(np.nanargmax(value[stretch]))
+            kept += sorted(stretch[list(extremes)].tolist())
+    return time_s[kept], value[kept]
+
+
+def to_svg(figure: Figure, key: str, label: str) -> str:
+    """The figure as an `<svg>` element for a page; `key` makes its ids its own, `label` says what it shows."""
+    file = io.BytesIO()
+    figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    root = ElementTree.fromstring(file.getvalue())
+    numbers = count()
+    names = {name: f"{key}-{next(numbers)}" for element in root.iter() for name in _references(element)}
+    for parent in root.iter():
+        for child in [child for child in parent if child.tag.endswith(("}metadata", "}style"))]:
+            parent.remove(child)
+        _make_plain(parent, names)
+    height = root.attrib["viewBox"]
+    body = "".join(ElementTree.tostring(child, encoding="unicode") for child in root)
+    return f'<svg class="chart" viewBox="{height}" role="img" aria-label="{escape(label)}">{body}</svg>'
+
+
+_REFERENCE = re.compile(r"url\(#(.+?)\)")
+_HREF = "{http://www.w3.org/1999/xlink}href"
+
+
+def _references(element: ElementTree.Element) -> list[str]:
+    """The ids that an element refers to."""
+    href = element.get(_HREF)
+    return [href[1:]] if href else _REFERENCE.findall(element.get("clip-path", ""))
+
+
+def _make_plain(element: ElementTree.Element, names: dict[str, str]) -> None:
+    """Take away what a page does not need, and put its variables in place of colours."""
+    element.tag = element.tag.partition("}")[2] or element.tag
+    if element.tag != "text":
+        element.text = None
+    element.tail = None
+    styles = {child.get("style") for child in element}
+    if len(element) > 1 and len(styles) == 1 and all(child.tag.endswith("use") for child in element):
+        element.set("style", styles.pop() or "")
+        for child in element:
+            child.attrib.pop("style", None)
+    name = element.attrib.pop("id", None)
+    if name in names:
+        element.set("id", names[name])
+    if href := element.attrib.pop(_HREF, None):
+        element.set("href", f"#{names[href[1:]]}")
+    if "clip-path" in element.attrib:
+        element.set(
+            "clip-path", _REFERENCE.sub(lambda match: f"url(#{names[match[1]]})", element.get("clip-path", ""))
+        )
+    if "d" in element.attrib:
+        element.set("d", _round(" ".join(element.get("d", "").split())))
+    for attribute in ("x", "y"):
+        if attribute in element.attrib:
+            element.set(attribute, _round(element.get(attribute, "")))
+    if "transform" in element.attrib:
+        transform = element.attrib.pop("transform")
+        if not transform.startswith("rotate(-0 "):
+            element.set("transform", _round(transform))
+    if "style" in element.attrib:
+        style = re.sub(r" ?font-family:[^;]*;", "", element.get("style", ""))
+        element.set("style", re.sub("#[0-9a-f]{6}", lambda match: _VARIABLE[match[0]], style))
+
+
+def _round(numbers: str) -> str:
+    return re.sub(r"-?\d+\.\d+", lambda match: f"{float(match[0]):.1f}".removesuffix(".0"), numbers)

@@ -1,0 +1,1 @@
+"""The emulated radio: the engine, and the stages that decide every reception's outcome."""

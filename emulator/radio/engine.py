@@ -1,0 +1,319 @@
+"""The engine: frames in, deliveries out, in virtual time.
+
+It knows no Zenoh, no asyncio and no wall clock. Drivers `transmit` what nodes send, ask when something arrives
+next, and `advance` to an instant. Every (frame, receiver) pair gets exactly one outcome, final at the instant of
+its arrival; pairs in range are rows of the trace, pairs out of range are counted.
+
+A frame passes three places: it is handed over, it waits for the air and is on it, and it has been sent. How things
+stand (positions, who is up, faults) is kept with the frame when it is handed over. Only then do the stages run,
+over all frames at once that have been sent since anybody last asked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.faults.plan import PlannedFault
+from emulator.radio.connectivity import reach_of
+from emulator.radio.csma import Csma
+from emulator.radio.frames import Frame, Pairs, Stage
+from emulator.radio.in_flight import NEVER_NS, Arrivals, Deliveries, Delivery
+from emulator.radio.link_faults import LinkFaults
+from emulator.radio.mac import Access, TransmitQueue
+from emulator.radio.medium import WINDOW_NS
+from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
+from emulator.radio.reception import Reception
+from emulator.radio.sender_faults import Outgoing, SenderFaults
+from emulator.radio.signals import Signals
+from emulator.radio.stages import (
+    MIN_LATENCY_NS,
+    Latency,
+    Loss,
+    change_by_faults,
+    in_range,
+    lose_by_faults,
+    peer_cap,
+    sender_side,
+)
+from emulator.radio.topology import Topology
+from emulator.radio.trace import Trace
+from emulator.scenario.scenario import Radio
+
+__all__ = ["Deliveries", "Delivery", "Engine"]
+
+_COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
+_OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
+"""What a frame has for these columns of the trace."""
+
+
+class Engine:
+    """The state of the emulated radio. Nodes are known by their numbers, 0 … N-1, in the order of `node_ids`.
+
+    `position_m` (N, 2); `links` (N, N) is `radio.links` as loaded, whether i (row) hears j (column), or None where
+    `radio.range_m` decides.
+    """
+
+    def __init__(
+        self,
+        node_ids: Sequence[str],
+        radio: Radio,
+        seed: int,
+        position_m: NDArray[np.float64],
+        links: NDArray[np.bool_] | None,
+    ) -> None:
+        self._node_ids = tuple(node_ids)
+        self._max_payload_bytes = radio.max_payload_bytes
+        count = len(node_ids)
+        signals = Signals(seed, radio.fading, count) if radio.is_physical else None
+        nakagami = signals.nakagami if signals is not None else None
+        self._topology = Topology(position_m, reach_of(radio, seed, links), radio.max_peers, nakagami)
+        self._csma = (
+            Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
+        )
+        self._access: Access = self._csma or TransmitQueue(seed, radio)
+        self._links = LinkFaults(seed, self._access, count)
+        self._senders = SenderFaults(self._node_ids, self._next_copy)
+        self.chain: list[Stage] = [
+            in_range,
+            sender_side,
+            peer_cap,
+            lose_by_faults,
+            *([Reception(radio, signals)] if signals is not None else []),
+            Loss(seed, radio.loss),
+            Latency(seed, radio),
+            change_by_faults,
+        ]
+        self._trace = Trace(node_ids, knows_air=self._csma is not None)
+        self._counts = dict.fromkeys(Outcome, 0)
+        self._next_seq = [0] * len(node_ids)
+        self._copies: Counter[tuple[int, int]] = Counter()
+        self._arrivals = Arrivals(len(node_ids))
+
+    @property
+    def trace(self) -> Trace:
+        """One row for each frame that has been sent and receiver in range."""
+        self._settle()
+        return self._trace
+
+    @property
+    def counts(self) -> dict[Outcome, int]:
+        """How many pairs have which outcome so far."""
+        self._settle()
+        return self._counts
+
+    def set_positions(self, position_m: NDArray[np.float64]) -> None:
+        """Move the vehicles: (N, 2) in metres. Frames handed over before keep what they met."""
+        self._topology.move(position_m)
+
+    @property
+    def in_range(self) -> NDArray[np.bool_]:
+        """(N, N), rows are senders: who is in range of whom, where the vehicles are now."""
+        return self._topology.now.in_range
+
+    def set_up(self, node: int, up: bool) -> None:
+        """A node that is down sends nothing, and what arrives at it is `receiver_down`."""
+        self._topology.set_up(node, up)
+
+    def set_faults(self, active: Sequence[PlannedFault], time_ns: int) -> None:
+        """From now on, at `time_ns`, these faults act on frames and no others. What is in flight stays decided."""
+        for planned in active:
+            self._trace.name_cause(planned.number, planned.label)
+        self._links.update(active, time_ns)
+        self._senders.update(active)
+
+    def _next_copy(self, sender: int, seq: int) -> int:
+        self._copies[sender, seq] += 1
+        return self._copies[sender, seq]
+
+    # Handing over.
+
+    def transmit(self, time_ns: int, node: int, payloads: Sequence[bytes]) -> None:
+        """Frames that `node` broadcasts at `time_ns`, in order. Those of a node that is down are discarded."""
+        if not self._topology.is_up(node):
+            return
+        self._access.run(time_ns)
+        for payload in payloads:
+            seq = self._next_seq[node]
+            self._next_seq[node] = seq + 1
+            if not self._senders.misbehave:
+                self._hand_over(time_ns, node, Outgoing(payload, seq))
+                continue
+            self._settle()  # copies that arrive of frames sent before are numbered before new ones are sent
+            for outgoing in self._senders.frames(time_ns, node, seq, payload):
+                self._hand_over(time_ns, node, outgoing)
+
+    def _hand_over(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
+        frame = Frame(
+            node,
+            outgoing.seq,
+            time_ns,
+            len(outgoing.payload),
+            self._topology.now,
+            self._links.effects,
+            outgoing.copy,
+            outgoing.draw,
+            outgoing.payload,
+            outgoing.alias or self._node_ids[node],
+            outgoing.cause,
+        )
+        if frame.size_bytes > self._max_payload_bytes:  # never gets as far as the queue
+            frame.fate, frame.end_ns = Outcome.oversize, time_ns
+            self._access.sent.append(frame)
+        else:
+            self._access.hand_over(frame)
+        if frame.effects.copying:  # its copies are numbered before the next frame's
+            self._settle()
+
+    # What has been sent.
+
+    def _settle(self) -> None:
+        """Let the stages decide on the frames that have been sent."""
+        if frames := self._access.sent:
+            self._access.sent = []
+            pairs = Pairs.of(frames, len(self._node_ids))
+            for stage in self.chain:
+                stage(frames, pairs)
+            self._book(frames, pairs)
+
+    def _book(self, frames: Sequence[Frame], pairs: Pairs) -> None:
+        """Write the rows of pairs in range, and put those that arrive where they are awaited."""
+        for (number, node), flips in pairs.flips.items():
+            frames[number].altered[node] = _flipped(frames[number].payload, flips)
+        count = len(self._node_ids)
+        which = pairs.outcome != OUT_OF_RANGE
+        each = np.count_nonzero(which, axis=1)
+        receiver = np.broadcast_to(np.arange(count), which.shape)[which]
+        self._counts[Outcome.out_of_range] += len(frames) * (count - 1) - len(receiver)
+        self._enter(frames, each, receiver, pairs.outcome[which], pairs.arrival_ns[which], pairs.cause[which])
+        for number, copied, later_ns, cause in pairs.copies:
+            again = np.flatnonzero(copied & (pairs.outcome[number] == PENDING))
+            if len(again):
+                frame = frames[number]
+                frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
+                each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
+                arrival_ns = pairs.arrival_ns[number, again] + later_ns
+                self._enter([frame], each, again, pending, arrival_ns, np.int16(cause))
+
+    def _enter(
+        self,
+        frames: Sequence[Frame],
+        each: NDArray[np.intp],
+        receiver: NDArray[np.intp],
+        outcome: NDArray[np.uint8],
+        arrival_ns: NDArray[np.int64],
+        cause: NDArray[np.int16] | np.int16,
+    ) -> None:
+        """Pairs as rows of the trace, and perhaps in flight: of `each` frame so many, one after the other."""
+        columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
+        digests = np.array([_digest(frame.payload) for frame in frames], np.uint64)
+        first = self._trace.append(
+            {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns
+        )
+        place = np.repeat(np.arange(len(frames)), each)
+        for number, frame in enumerate(frames):
+            for node, payload in frame.altered.items():
+                for row in np.flatnonzero((place == number) & (receiver == node)).tolist():
+                    self._trace.alter(first + row, _digest(payload))
+        for kind, number in enumerate(np.bincount(outcome).tolist()):
+            if number:
+                self._counts[Outcome(kind)] += number
+        flying = np.flatnonzero(outcome == PENDING)
+        self._arrivals.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
+
+    # Arriving.
+
+    def next_arrival_ns(self, node: int) -> int | None:
+        """When the next frame that has been sent arrives at `node`."""
+        self._settle()
+        return self._arrivals.next_ns(node)
+
+    def next_time(self) -> int | None:
+        """When `advance` must be called next: something arrives, or happens on the air."""
+        self._settle()
+        # What happens on the air at an instant happens right after it.
+        air_ns = self._access.next_ns()
+        times_ns = (self._arrivals.soonest_ns(), None if air_ns is None else air_ns + 1)
+        return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
+
+    def look_ahead(self, time_ns: int, nodes: Sequence[int]) -> None:
+        """Let what happens on the air come as far as `time_ns`, or the first arrival at one of these nodes.
+
+        The caller promises that nobody hands over anything before that.
+        """
+        if self._csma is None:
+            return
+        until_ns = self._first_ns(time_ns, nodes)
+        while (next_ns := self._csma.next_ns()) is not None and next_ns < until_ns:
+            self._csma.step()
+            if self._csma.sent:
+                until_ns = self._first_ns(time_ns, nodes)
+
+    def _first_ns(self, time_ns: int, nodes: Sequence[int]) -> int:
+        """`time_ns`, or the first arrival at one of these nodes if that is earlier."""
+        arrivals_ns = [self.next_arrival_ns(node) for node in nodes]
+        return min([time_ns, *(arrival_ns for arrival_ns in arrivals_ns if arrival_ns is not None)])
+
+    def pending_rows(self) -> list[int]:
+        """The rows of the trace whose frames are on their way."""
+        self._settle()
+        return self._arrivals.rows()
+
+    def advance(self, time_ns: int) -> Deliveries:
+        """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
+        self._access.run(time_ns)
+        if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._access.sent):
+            self._settle()
+        return self._arrive(time_ns)
+
+    def _arrive(self, time_ns: int) -> Deliveries:
+        table = self._arrivals.take(time_ns)
+        receiver, row = table[1], table[2]
+        up = self._topology.up[receiver]
+        self._trace.decide(row[up], Outcome.delivered)
+        self._trace.decide(row[~up], Outcome.receiver_down)
+        heard = int(up.sum())
+        self._counts[Outcome.delivered] += heard
+        self._counts[Outcome.receiver_down] += len(row) - heard
+        self._counts[Outcome.pending] -= len(row)
+        return self._arrivals.deliveries(table[:, up], self._trace)
+
+    def busy_ratios(self, time_ns: int) -> list[NDArray[np.float64]]:
+        """How busy each vehicle found the medium, (N,) each, in all windows that are over by `time_ns`.
+
+        Nothing handed over from now on may be sent before that. None where senders share no medium.
+        """
+        if self._csma is None:
+            return []
+        self._csma.run(time_ns)
+        self._csma.medium.count(time_ns)
+        return self._csma.medium.windows[: time_ns // WINDOW_NS]
+
+    def lose(self, delivery: Delivery) -> None:
+        """A delivery that never reached its process (real time only); once for each."""
+        self._trace.decide([delivery.row], Outcome.transport)
+        self._counts[Outcome.delivered] -= 1
+        self._counts[Outcome.transport] += 1
+
+    def drain(self) -> None:
+        """End of the run: everything in flight arrives, and nobody is woken for it."""
+        self._access.run(None)
+        self._settle()
+        self._arrive(NEVER_NS - 1)
+
+
+def _digest(payload: bytes) -> int:
+    return int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little")
+
+
+def _flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
+    changed = bytearray(payload)
+    for place, change in flips:
+        changed[place] ^= change
+    return bytes(changed)

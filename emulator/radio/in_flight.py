@@ -1,0 +1,164 @@
+"""What is on its way to its receivers, and what has arrived.
+
+All pairs in flight stand in one table, whichever their receivers are, so that nothing is done for each pair by
+itself until a program is to be handed a packet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.radio.frames import Frame
+from emulator.radio.trace import Trace
+from vnet.node import Packet
+from vnet.types import IntArray
+
+NEVER_NS = np.iinfo(np.int64).max
+FIRST_ROOM = 1 << 12
+_ARRIVAL, _RECEIVER, _ROW, _FRAME = range(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Delivery:
+    """A packet that has reached `receiver` (a number); `row` is its row of the trace."""
+
+    receiver: int
+    packet: Packet
+    row: int
+
+
+@dataclass(slots=True)
+class Deliveries(Sequence[Delivery]):
+    """Packets that have reached their receivers, in the order (arrival, sender, seq, receiver, copy).
+
+    They are made one by one, and only when somebody looks.
+    """
+
+    _table: IntArray
+    _frames: dict[int, Frame]
+    _trace: Trace
+    _made: list[Delivery] | None = field(default=None, init=False)
+
+    def __len__(self) -> int:
+        return int(self._table.shape[1])
+
+    @overload
+    def __getitem__(self, place: int) -> Delivery: ...
+
+    @overload
+    def __getitem__(self, place: slice) -> list[Delivery]: ...
+
+    def __getitem__(self, place: int | slice) -> Delivery | list[Delivery]:
+        return self._all()[place]
+
+    def __iter__(self) -> Iterator[Delivery]:
+        return iter(self._all())
+
+    def _all(self) -> list[Delivery]:
+        if self._made is None:
+            self._made = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
+        return self._made
+
+    def _order(self) -> NDArray[np.intp]:
+        arrival, receiver, row, _ = self._table
+        order = np.argsort(arrival, kind="stable")
+        if (np.diff(arrival[order]) > 0).all():
+            return order
+        rows = self._trace.rows(row)
+        return np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))
+
+    def _delivery(self, arrival_ns: int, receiver: int, row: int, number: int) -> Delivery:
+        frame = self._frames[number]
+        payload = frame.altered.get(receiver, frame.payload)
+        return Delivery(receiver, Packet(frame.name, frame.sent_ns, arrival_ns, payload), row)
+
+
+class Arrivals:
+    """The pairs in flight between `count` nodes. Rows of the table: arrival, receiver, row of the trace, frame."""
+
+    def __init__(self, count: int) -> None:
+        self._table: IntArray = np.zeros((4, FIRST_ROOM), np.int64)
+        self._length = 0
+        self._frames: dict[int, Frame] = {}
+        self._frames_kept = 64
+        self._next_frame = 0
+        self._by_receiver: IntArray = np.full(count, NEVER_NS)
+        self._known = True
+        self._soonest_ns = NEVER_NS
+
+    def add(
+        self,
+        frames: Sequence[Frame],
+        place: NDArray[np.intp],
+        receiver: IntArray,
+        row: IntArray,
+        arrival_ns: IntArray,
+    ) -> None:
+        """Pairs in flight, (n,) each: of which of `frames`, to whom, which rows of the trace, arriving when."""
+        if not len(row):
+            return
+        self._make_room(len(row))
+        new = self._table[:, self._length : self._length + len(row)]
+        new[_ARRIVAL], new[_RECEIVER], new[_ROW] = arrival_ns, receiver, row
+        new[_FRAME] = place + self._next_frame
+        self._frames.update(enumerate(frames, self._next_frame))
+        self._next_frame += len(frames)
+        self._length += len(row)
+        self._soonest_ns = min(self._soonest_ns, int(arrival_ns.min()))
+        if self._known:
+            np.minimum.at(self._by_receiver, receiver, arrival_ns)
+
+    def _make_room(self, more: int) -> None:
+        if self._length + more > self._table.shape[1]:
+            grown = np.zeros((4, 2 * (self._length + more)), np.int64)
+            grown[:, : self._length] = self._table[:, : self._length]
+            self._table = grown
+
+    def soonest_ns(self) -> int | None:
+        """When the next pair arrives anywhere."""
+        return self._soonest_ns if self._length else None
+
+    def next_ns(self, receiver: int) -> int | None:
+        """When the next pair arrives at `receiver`."""
+        if not self._known:
+            self._by_receiver[:] = NEVER_NS
+            flying = self._table[:, : self._length]
+            np.minimum.at(self._by_receiver, flying[_RECEIVER], flying[_ARRIVAL])
+            self._known = True
+        next_ns = int(self._by_receiver[receiver])
+        return None if next_ns == NEVER_NS else next_ns
+
+    def rows(self) -> list[int]:
+        """The rows of the trace of all pairs in flight."""
+        return [int(row) for row in self._table[_ROW, : self._length]]
+
+    def take(self, time_ns: int) -> IntArray:
+        """Remove and return the table (4, n) of what arrives up to `time_ns`."""
+        if self._soonest_ns > time_ns:
+            return self._table[:, :0]
+        flying = self._table[:, : self._length]
+        due = flying[_ARRIVAL] <= time_ns
+        taken, left = flying[:, due], flying[:, ~due]
+        self._length = left.shape[1]
+        self._table[:, : self._length] = left
+        self._soonest_ns = int(left[_ARRIVAL].min(initial=NEVER_NS))
+        self._known = False
+        return taken
+
+    def deliveries(self, table: IntArray, trace: Trace) -> Deliveries:
+        """What was taken, as packets."""
+        deliveries = Deliveries(table, self._frames, trace)
+        self._forget()
+        return deliveries
+
+    def _forget(self) -> None:
+        """Forget the frames that no pair in flight needs; what is delivered keeps the dictionary it was given."""
+        if len(self._frames) > self._frames_kept:
+            needed = np.unique(self._table[_FRAME, : self._length]).tolist()
+            self._frames = {number: self._frames[number] for number in needed}
+            self._frames_kept = 2 * len(needed) + 64

@@ -1,0 +1,162 @@
+"""The air: what is on it, what every vehicle senses of it, and whom each receiver listens to.
+
+Everything here is done for all vehicles at once. It knows nothing of who may send when.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.radio.dot11p import DETECTION_NS
+from emulator.radio.frames import Frame, Signal
+from emulator.radio.reception import Threshold
+from vnet.types import Array
+
+WINDOW_NS = 100_000_000
+"""Over which time the channel busy ratio is taken (ETSI TS 102 687)."""
+SLICE_NS = WINDOW_NS // 10
+"""At such times somebody may listen to it."""
+LONG_AGO_NS = -(1 << 60)
+
+Listener = Callable[[int, NDArray[np.int64]], None]
+
+
+class Medium:
+    """Frames on air between `count` vehicles.
+
+    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, and where somebody sends, or None
+    if nothing is on air; `idle_ns` (N,) is when it last was no longer so.
+    """
+
+    def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
+        self._carrier_sense_mw = carrier_sense_mw
+        self._threshold = threshold
+        self._frames: list[Frame] = []
+        self._total_mw: Array = np.zeros(count)
+        self.sensed: NDArray[np.bool_] | None = None
+        self._busy_ns = np.full(count, LONG_AGO_NS)
+        self._busy_since_ns: int | None = None
+        self.idle_ns = np.full(count, LONG_AGO_NS)
+        self._counted_ns = 0
+        self._spans: list[tuple[NDArray[np.bool_], int]] = []
+        self._slice_ns = self._slice_ends_ns = WINDOW_NS
+        self._window_ns = np.zeros(count, np.int64)
+        self._listener: Listener | None = None
+        self.windows: list[Array] = []
+        """The channel busy ratios (N,) of the windows that are over."""
+
+    def is_sensed(self, node: int) -> bool:
+        """Whether the medium is busy at `node`."""
+        return self.sensed is not None and bool(self.sensed[node])
+
+    def busy_ns(self, node: int) -> int:
+        """Since when it has been busy at `node`, if it is."""
+        return int(self._busy_ns[node]) if self._busy_since_ns is None else self._busy_since_ns
+
+    def _know_since(self) -> None:
+        """Write down since when the first frame on air, until now alone, is sensed."""
+        if self._busy_since_ns is not None:
+            assert self.sensed is not None
+            np.copyto(self._busy_ns, self._busy_since_ns, where=self.sensed)
+            self._busy_since_ns = None
+
+    def begin(self, frame: Frame, time_ns: int) -> None:
+        """A frame begins, `frame.signal` its powers."""
+        self.count(time_ns)
+        signal = _signal(frame)
+        before_mw, others = self._total_mw, self._frames
+        if others:
+            total_mw = before_mw + signal.power_mw
+            self._listen(frame, signal, total_mw)
+            for other in others:
+                _signal(other).pieces.append((time_ns, before_mw))
+        else:
+            total_mw = signal.power_mw
+        others.append(frame)
+        self._sense(total_mw, time_ns)
+
+    def _listen(self, frame: Frame, signal: Signal, total_mw: Array) -> None:
+        """Who sets itself on a new signal: who detects it, and does not listen to another one yet.
+
+        A signal that has not been there long enough to be detected is given up where a new one drowns it, and the
+        new one's sender listens to nobody.
+        """
+        taken = np.zeros(len(total_mw), dtype=bool)
+        for other in self._frames:
+            known = _signal(other)
+            if known.locked is None:
+                known.locked = known.power_mw >= self._threshold.alone_mw
+            if other.on_air_ns + DETECTION_NS > frame.on_air_ns:
+                known.locked &= self._threshold.detects(known.power_mw, total_mw)
+            known.locked[frame.sender] = False
+            taken |= known.locked
+        signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
+
+    def end(self, frame: Frame, time_ns: int) -> None:
+        """A frame ends."""
+        self.count(time_ns)
+        signal, before_mw = _signal(frame), self._total_mw
+        self._frames.remove(frame)
+        if signal.pieces or self._frames:
+            signal.pieces.append((time_ns, before_mw))
+        if not self._frames:
+            assert self.sensed is not None
+            np.copyto(self.idle_ns, time_ns, where=self.sensed)
+            self.sensed = None
+            return
+        total_mw = _signal(self._frames[0]).power_mw
+        for other in self._frames:
+            _signal(other).pieces.append((time_ns, before_mw))
+            if other is not self._frames[0]:
+                total_mw = total_mw + _signal(other).power_mw
+        self._sense(total_mw, time_ns)
+
+    def _sense(self, total_mw: Array, time_ns: int) -> None:
+        sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
+        sensed[[frame.sender for frame in self._frames]] = True  # however deaf they are
+        if before is None:
+            self._busy_since_ns = time_ns
+        else:
+            self._know_since()
+            np.copyto(self._busy_ns, time_ns, where=sensed & ~before)
+            np.copyto(self.idle_ns, time_ns, where=before & ~sensed)
+        self._total_mw, self.sensed = total_mw, sensed
+
+    def count(self, time_ns: int) -> None:
+        """Add up for how long the medium has been busy, until `time_ns`."""
+        while time_ns >= self._slice_ends_ns:
+            self._count(self._slice_ends_ns)
+            self._end_slice()
+        if time_ns > self._counted_ns:
+            self._count(time_ns)
+
+    def _count(self, time_ns: int) -> None:
+        if self.sensed is not None:
+            self._spans.append((self.sensed, time_ns - self._counted_ns))
+        self._counted_ns = time_ns
+
+    def _end_slice(self) -> None:
+        busy_ns = np.zeros_like(self._window_ns)
+        if self._spans:
+            sensed, lengths_ns = zip(*self._spans, strict=True)
+            busy_ns = np.array(lengths_ns) @ np.array(sensed)
+            self._spans.clear()
+        if self._listener is not None:
+            self._listener(self._slice_ends_ns // SLICE_NS - 1, busy_ns)
+        self._window_ns += busy_ns
+        if self._slice_ends_ns % WINDOW_NS == 0:
+            self.windows.append(self._window_ns / WINDOW_NS)
+            self._window_ns[:] = 0
+        self._slice_ends_ns += self._slice_ns
+
+    def listen(self, listener: Listener) -> None:
+        """Tell `listener` of each slice when it is over: its number, and for how long (N,) it was busy."""
+        self._listener, self._slice_ns, self._slice_ends_ns = listener, SLICE_NS, SLICE_NS
+
+
+def _signal(frame: Frame) -> Signal:
+    assert frame.signal is not None
+    return frame.signal

@@ -1,0 +1,96 @@
+"""Senders that misbehave without the emulator knowing what their payloads mean: their own frames, sent again."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from emulator.faults.plan import PlannedFault
+from emulator.radio.frames import NO_CAUSE
+from emulator.scenario.faults import DataReplay, DoS, SenderFault, StaleMessages, Sybil
+from vnet.units import NS_PER_S
+
+REMEMBERED_FRAMES = 4096
+"""Of each sender that misbehaves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A frame on its way to the radio: the `copy`-th of frame `seq`; `alias` is another name that it goes under.
+
+    `draw` tells its draws from those of the other copies.
+    """
+
+    payload: bytes
+    seq: int
+    copy: int = 0
+    draw: int = 0
+    cause: int = NO_CAUSE
+    alias: str | None = None
+
+
+class SenderFaults:
+    """Which senders misbehave now, and what they have sent. `next_copy` numbers the copies of (sender, seq)."""
+
+    def __init__(self, node_ids: Sequence[str], next_copy: Callable[[int, int], int]) -> None:
+        self._node_ids = node_ids
+        self._next_copy = next_copy
+        self._acting: dict[int, list[PlannedFault]] = {}
+        self._sent: dict[int, deque[tuple[int, int, bytes]]] = {}
+
+    @property
+    def misbehave(self) -> bool:
+        """Whether any of them does."""
+        return bool(self._acting)
+
+    def update(self, active: Sequence[PlannedFault]) -> None:
+        """From now on these act and no others."""
+        self._acting = {}
+        for planned in active:
+            if isinstance(planned.fault, SenderFault):
+                for node in np.flatnonzero(planned.nodes).tolist():
+                    self._acting.setdefault(node, []).append(planned)
+        self._sent = {node: self._sent.get(node, deque(maxlen=REMEMBERED_FRAMES)) for node in self._acting}
+
+    def frames(self, time_ns: int, node: int, seq: int, payload: bytes) -> Iterator[Outgoing]:
+        """All that goes out when `node` hands over its frame `seq`."""
+        acting = self._acting.get(node)
+        if not acting:
+            yield Outgoing(payload, seq)
+            return
+        self._sent[node].append((time_ns, seq, payload))
+        original = Outgoing(payload, seq)
+        for planned in acting:
+            if isinstance(planned.fault, StaleMessages) and (old := self._from(node, time_ns, planned.fault.age_s)):
+                original = Outgoing(old[2], seq, cause=planned.number)
+        yield original
+        for planned in acting:
+            yield from self._again(planned, time_ns, node, original)
+
+    def _again(self, planned: PlannedFault, time_ns: int, node: int, original: Outgoing) -> Iterator[Outgoing]:
+        payload, seq = original.payload, original.seq
+        match planned.fault:
+            case DoS(factor=factor):
+                for place in range(1, factor):
+                    yield self._copy(planned, node, payload, seq, place)
+            case Sybil(ghosts=ghosts):
+                for ghost in range(1, ghosts + 1):
+                    yield self._copy(planned, node, payload, seq, ghost, f"{self._node_ids[node]}~{ghost}")
+            case DataReplay(age_s=age_s):
+                if old := self._from(node, time_ns, age_s):
+                    yield self._copy(planned, node, old[2], old[1], seq - old[1])
+
+    def _copy(
+        self, planned: PlannedFault, node: int, payload: bytes, seq: int, place: int, alias: str | None = None
+    ) -> Outgoing:
+        """Another copy of frame `seq`; of those that a fault makes of it, each has another `place`."""
+        draw = (planned.number + 1 << 32) + place
+        return Outgoing(payload, seq, self._next_copy(node, seq), draw, planned.number, alias)
+
+    def _from(self, node: int, time_ns: int, age_s: float) -> tuple[int, int, bytes] | None:
+        """The latest frame of `node` that is at least `age_s` old."""
+        before_ns = time_ns - round(age_s * NS_PER_S)
+        return next((sent for sent in reversed(self._sent[node]) if sent[0] <= before_ns), None)

@@ -1,0 +1,73 @@
+"""Who can hear whom, how well, and whom each receiver's peer cap admits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.radio.connectivity import Reach, distances_m
+from emulator.radio.propagation import Nakagami
+from vnet.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """How things stand between the vehicles, (N, N) each, rows are senders. Never changed once made.
+
+    `in_range` is who is in range of whom, and `admitted` whom the receiver's cap lets in. `power_mw` is the mean
+    power of signals and `fading` the shape of their fading, as `Nakagami` has it; None where signals have no power.
+    """
+
+    distance_m: Array
+    in_range: NDArray[np.bool_]
+    admitted: NDArray[np.bool_]
+    power_mw: Array | None = None
+    fading: NDArray[np.uint64] | None = None
+
+
+class Topology:
+    """The surroundings as they are `now`, made anew when vehicles move or go up or down.
+
+    Positions are (N, 2) in metres, NaN where a vehicle is not there. Powers are worked out only with `nakagami`.
+    """
+
+    def __init__(self, position_m: Array, reach: Reach, max_peers: int, nakagami: Nakagami | None = None) -> None:
+        self._reach = reach
+        self._max_peers = max_peers
+        self._nakagami = nakagami
+        self.up = np.ones(len(position_m), dtype=bool)
+        self.move(position_m)
+
+    def move(self, position_m: Array) -> None:
+        """Take new positions."""
+        distance_m = distances_m(position_m)
+        power_mw = fading = None
+        if self._nakagami is None:
+            in_range = self._reach.in_range(position_m, distance_m)
+        else:
+            power_mw = self._reach.power_mw(position_m, distance_m)
+            in_range = power_mw > 0  # to work the powers out takes longer than all else here: once is enough
+            np.fill_diagonal(in_range, False)
+            fading = self._nakagami.shape(distance_m)
+        self.now = Surroundings(distance_m, in_range, in_range, power_mw, fading)
+        self._rank()
+
+    def set_up(self, node: int, up: bool) -> None:
+        """A node that is down is nobody's peer."""
+        self.up[node] = up
+        self._rank()
+
+    def is_up(self, node: int) -> bool:
+        """Whether a node is up."""
+        return bool(self.up[node])
+
+    def _rank(self) -> None:
+        """`admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
+        candidate = self.now.in_range & self.up[:, None]
+        far_m = np.where(candidate, self.now.distance_m, np.inf)
+        order = np.argsort(far_m, axis=0, kind="stable")  # ties go to the lower number
+        rank = np.empty_like(order)
+        np.put_along_axis(rank, order, np.arange(len(order))[:, None], axis=0)
+        self.now = replace(self.now, admitted=candidate & (rank < self._max_peers))

@@ -1,0 +1,63 @@
+"""How busy each vehicle found the medium: the share of the time in which it sensed it taken, in 100 ms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from emulator.radio.medium import WINDOW_NS
+from vnet.errors import VnetError
+from vnet.types import Array
+
+BUSY = "busy.parquet"
+"""The file that a run has where senders share a medium."""
+
+
+def read_busy(folder: Path) -> pa.Table:
+    """busy.parquet of a run's folder. Raises VnetError in one line if it is not there or no table."""
+    path = folder / BUSY
+    try:
+        return pq.read_table(path)
+    except FileNotFoundError:
+        raise VnetError(f"{path.parent}: not a finished run's folder: there is no {path.name} in it") from None
+    except (OSError, pa.ArrowException) as error:
+        raise VnetError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
+
+
+def busy_table(windows: Array, node_ids: Sequence[str]) -> pa.Table:
+    """Busy ratios (windows, N) as a table, a row for each window and vehicle."""
+    count = len(windows)
+    node = pa.array(np.tile(np.arange(len(node_ids), dtype=np.int32), count))
+    return pa.table(
+        {
+            "time_ns": pa.array(np.repeat(np.arange(count, dtype=np.int64) * WINDOW_NS, len(node_ids))),
+            "node": pa.DictionaryArray.from_arrays(node, pa.array(list(node_ids), pa.string())),
+            "busy_ratio": pa.array(windows.ravel()),
+        }
+    )
+
+
+def busy_windows(table: pa.Table | None, node_ids: Sequence[str]) -> Array:
+    """The ratios (windows, N) of such a table; no windows if it is None. Raises VnetError if it is another one."""
+    count = len(node_ids)
+    if table is None:
+        return np.zeros((0, count))
+    if any(column not in table.column_names for column in ("time_ns", "node", "busy_ratio")):
+        raise VnetError(f"{BUSY} has the columns {', '.join(table.column_names)}, not time_ns, node and busy_ratio")
+    windows = len(table) // max(1, count)
+    number = pc.index_in(table["node"].cast(pa.string()), value_set=pa.array(list(node_ids), pa.string()))
+    if not np.array_equal(pc.fill_null(number, -1).to_numpy(), np.tile(np.arange(count), windows)):
+        raise VnetError(f"{BUSY}: its rows are not those of {count} vehicles, one window after the other")
+    return np.asarray(table["busy_ratio"].cast(pa.float64()).to_numpy()).reshape(windows, count)
+
+
+def mean_busy(windows: Sequence[Array] | Array, count: int, start_ns: int, end_ns: int) -> Array:
+    """The means (count,) of the windows (count,) that ended in (start, end], else the last before; NaN if none."""
+    end = min(end_ns // WINDOW_NS, len(windows))
+    some = windows[max(0, min(start_ns // WINDOW_NS, end - 1)) : end]
+    return np.mean(some, axis=0) if len(some) else np.full(count, np.nan)

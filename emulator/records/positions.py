@@ -1,0 +1,131 @@
+"""Where vehicles were when a frame was sent, and who was then in range of whom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.radio.connectivity import Reach, distances_m
+from vnet.types import Array, IntArray, Mask
+
+
+class Places:
+    """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
+
+    `reach` says who is in range of whom.
+    """
+
+    def __init__(self, position_m: Array, moves: bool, period_ns: int, reach: Reach) -> None:
+        self._position_m = position_m
+        self._moves = moves
+        self._period_ns = period_ns
+        self._reach = reach
+
+    def index(self, time_ns: IntArray) -> IntArray:
+        """Which of the K positions count at these instants."""
+        return np.asarray(time_ns // self._period_ns if self._moves else np.zeros_like(time_ns))
+
+    def known(self, time_ns: IntArray) -> Mask:
+        """At which instants positions are known: a run may end within a period, of which no states are kept."""
+        return np.asarray(self.index(time_ns) < len(self._position_m))
+
+    def present(self) -> Mask:
+        """(K, N), who was there."""
+        return np.isfinite(self._position_m[..., 0])
+
+    def position_m(self, index: int) -> Array:
+        """(N, 2) of one of the K; the last of them for all later ones."""
+        return np.asarray(self._position_m[min(index, len(self._position_m) - 1)])
+
+    def distance_m(self, index: int) -> Array:
+        """(N, N) between vehicles."""
+        return distances_m(self.position_m(index))
+
+    def in_range(self, index: int) -> Mask:
+        """(N, N), rows are senders: who is in range of whom."""
+        return self._reach.in_range(self.position_m(index), self.distance_m(index))
+
+    def power_mw(self, index: int) -> Array:
+        """(N, N), rows are senders: the mean power of signals, 0 out of range."""
+        return self._reach.power_mw(self.position_m(index), self.distance_m(index))
+
+    def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
+        """How far the two of each pair (n,) are apart at these instants; NaN where that is not known."""
+        there = self.known(time_ns)
+        index, sender, receiver = self.index(time_ns)[there], sender[there], receiver[there]
+        offset = self._position_m[index, sender] - self._position_m[index, receiver]
+        distance_m = np.full(len(there), np.nan)
+        distance_m[there] = np.hypot(offset[:, 0], offset[:, 1])
+        return distance_m
+
+    def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Mask:
+        """Which pairs of vehicles are in range at these instants; none where that is not known."""
+        return np.asarray(self._of_pairs(self.in_range, sender, receiver, time_ns) > 0)
+
+    def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
+        """With which mean power signals arrive at these instants; 0 out of range, or where that is not known."""
+        return self._of_pairs(self.power_mw, sender, receiver, time_ns)
+
+    def _of_pairs(
+        self,
+        matrix: Callable[[int], NDArray[Any]],
+        sender: NDArray[np.intp],
+        receiver: NDArray[np.intp],
+        time_ns: IntArray,
+    ) -> Array:
+        """The entries for pairs (n,) of the matrices of their times; 0 where positions are not known."""
+        found = np.zeros(len(time_ns))
+        rows = np.flatnonzero(self.known(time_ns))
+        index = self.index(time_ns)[rows]
+        order = np.argsort(index, kind="stable")
+        rows, index = rows[order], index[order]
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(index)) + 1):
+            if len(some):
+                found[rows[some]] = matrix(int(index[some[0]]))[sender[rows[some]], receiver[rows[some]]]
+        return found
+
+    @cached_property
+    def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """(K, N) each: how many are in range of a sender, and how many a receiver has in range."""
+        matrices = (self.in_range(index) for index in range(len(self._position_m)))
+        both = [(in_range.sum(axis=1), in_range.sum(axis=0)) for in_range in matrices]
+        out, into = zip(*both, strict=True) if both else ((), ())
+        shape = self._position_m.shape[:2]
+        return np.array(out, np.intp).reshape(shape), np.array(into, np.intp).reshape(shape)
+
+    def receivers_in_range(self, sender: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
+        """How many were in range of each of these senders at these instants; -1 where that is not known."""
+        count = np.full(len(sender), -1, dtype=np.intp)
+        there = self.known(time_ns)
+        count[there] = self._degrees[0][self.index(time_ns)[there], sender[there]]
+        return count
+
+    def senders_in_range(self, index: int) -> NDArray[np.intp]:
+        """(N,), how many each receiver has in range."""
+        return np.asarray(self._degrees[1][min(index, len(self._position_m) - 1)])
+
+    def mean_senders_in_range(self) -> Array:
+        """(N,), how many each receiver has in range, in the mean over the time in which it is there."""
+        there = self.present().sum(axis=0)
+        return np.asarray(self._degrees[1].sum(axis=0) / np.maximum(there, 1))
+
+    @property
+    def most_in_range(self) -> int:
+        """How many senders any receiver ever had in range."""
+        return int(self._degrees[1].max(initial=0))
+
+    @cached_property
+    def ever_lonely(self) -> Mask:
+        """(N,), who had nobody in range, or was not there itself, at some time, and somebody at another."""
+        lonely = self._degrees[0] == 0
+        return np.asarray(lonely.any(axis=0) & ~lonely.all(axis=0))
+
+    def was_lonely(self, sender: int, time_ns: IntArray) -> Mask:
+        """(n - 1,), whether a sender had nobody in range at some time between one of n instants and the next."""
+        lonely = np.concatenate([[0], np.cumsum(self._degrees[0][:, sender] == 0)])
+        index = np.minimum(self.index(time_ns), len(self._position_m) - 1)
+        return np.asarray(lonely[index[1:] + 1] > lonely[index[:-1]])

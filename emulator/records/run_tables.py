@@ -1,0 +1,260 @@
+"""A run's big tables, read forward in time and a piece at a time, so that memory does not grow with the run."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from emulator.radio.outcomes import Outcome
+from emulator.radio.trace import NOT_ARRIVING, ROW, decided_ns
+from emulator.records.recorded_run import VALUES_AS_LIST
+from emulator.stream.messages import WEIGHT, Beliefs, is_cloud
+from emulator.world.world import Instant
+from vnet.errors import VnetError
+from vnet.types import Array
+
+ROWS_AT_ONCE = 1 << 14
+
+
+class TableFile:
+    """A Parquet file and those of its columns that are wanted. Raises VnetError if it has not got them.
+
+    Columns that it has `perhaps` may be missing.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], perhaps: Sequence[str] = ()) -> None:
+        self.path = path
+        try:
+            self._file = pq.ParquetFile(path)
+        except FileNotFoundError:
+            raise VnetError(f"{path.parent}: not a finished run's folder: there is no {path.name} in it") from None
+        except (OSError, pa.ArrowException) as error:
+            raise self.error(f"cannot be read: {_one_line(error)}") from None
+        missing = [column for column in columns if column not in self._file.schema_arrow.names]
+        if missing:
+            raise self.error(f"has no column {missing[0]!r}")
+        self._columns = [*columns, *(name for name in perhaps if name in self._file.schema_arrow.names)]
+
+    def error(self, text: str) -> VnetError:
+        """What is wrong with the file."""
+        return VnetError(f"{self.path}: {text}")
+
+    def pieces(self, rows: int = ROWS_AT_ONCE) -> Iterator[pa.Table]:
+        """The rows, so many at a time. Raises VnetError if they cannot be read."""
+        with self.sound():
+            for batch in self._file.iter_batches(rows, columns=self._columns):
+                yield pa.Table.from_batches([batch])
+
+    @contextlib.contextmanager
+    def sound(self) -> Iterator[None]:
+        """What fails in here is the file's fault."""
+        try:
+            yield
+        except (OSError, pa.ArrowException, ValueError) as error:
+            raise self.error(f"cannot be read: {_one_line(error)}") from None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+class TraceReader:
+    """The trace of a run, forward in time."""
+
+    def __init__(self, path: Path, number: Mapping[str, int]) -> None:
+        columns = ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "arrival_ns", "copy")
+        self._file = TableFile(path, columns, perhaps=["left_ns"])
+        self._codes = {"sender": number, "receiver": number, "outcome": {o.name: o.value for o in Outcome}}
+        self._pieces = self._file.pieces()
+        self._ahead = np.zeros(0, ROW)
+        self._undecided = np.zeros(0, ROW)
+        self._last_ns = 0
+        self._ended = False
+
+    def until(self, end_ns: int) -> NDArray[np.void]:
+        """What was sent before `end_ns` and not decided by the last time, as records of type `ROW`.
+
+        Digests and causes are left out. Raises VnetError if the trace cannot be read or is no trace of this run.
+        """
+        while not self._ended and self._last_ns < end_ns:
+            self._read_on()
+        cut = int(np.searchsorted(self._ahead["sent_ns"], end_ns))
+        rows = np.concatenate([self._undecided, self._ahead[:cut]])
+        self._ahead = self._ahead[cut:]
+        self._undecided = rows[decided_ns(rows) >= end_ns]
+        return rows
+
+    def _read_on(self) -> None:
+        piece = next(self._pieces, None)
+        if piece is None:
+            self._ended = True
+            return
+        rows = np.zeros(len(piece), ROW)
+        for name in ("sent_ns", "seq", "size_bytes", "copy"):
+            rows[name] = self._whole(piece, name)
+        for name, codes in self._codes.items():
+            rows[name] = self._coded(piece, name, codes)
+        rows["arrival_ns"] = self._whole(piece, "arrival_ns", NOT_ARRIVING)
+        rows["left_ns"] = self._whole(piece, "left_ns") if "left_ns" in piece.column_names else rows["sent_ns"]
+        sent_ns = rows["sent_ns"]
+        if len(rows):
+            if sent_ns[0] < self._last_ns or (np.diff(sent_ns) < 0).any():
+                raise self._file.error("its rows are not in the order in which frames were sent")
+            self._last_ns = int(sent_ns[-1])
+        self._ahead = np.concatenate([self._ahead, rows])
+
+    def _whole(self, piece: pa.Table, name: str, missing: int | None = None) -> NDArray[np.int64]:
+        with self._file.sound():
+            column = piece[name] if missing is None else pc.fill_null(piece[name], missing)
+            if column.null_count:
+                raise ValueError(f"column {name!r} has gaps")
+            return np.asarray(column.to_numpy(), dtype=np.int64)
+
+    def _coded(self, piece: pa.Table, name: str, codes: Mapping[str, int]) -> NDArray[np.int64]:
+        """A column of names as numbers."""
+        with self._file.sound():
+            column = piece[name].cast(pa.string()).combine_chunks().dictionary_encode()
+        known = [codes.get(each, -1) for each in column.dictionary.to_pylist()]
+        if column.null_count or -1 in known:
+            stranger = None if column.null_count else column.dictionary[known.index(-1)].as_py()
+            raise self._file.error(f"column {name!r} names {stranger!r}, which this run has not got")
+        return np.asarray(np.array(known, dtype=np.int64)[column.indices.to_numpy()])
+
+
+class StatesReader:
+    """The states of a run, period by period. `number` gives each node's, in the order of the rows of a period."""
+
+    _VECTORS: Mapping[str, int] = {
+        "position_m": 2,
+        "fix_m": 2,
+        "common_error_m": 2,
+        "estimate_m": 2,
+        "covariance_m2": 4,
+        "common_error_estimate_m": 2,
+        "common_error_covariance_m2": 4,
+    }
+
+    def __init__(self, path: Path, number: Mapping[str, int], period_ns: int) -> None:
+        columns = ("period", "node", "heading_rad", *self._VECTORS, "cloud_m", "values")
+        self._file = TableFile(path, columns)
+        self._number = number
+        self._period_ns = period_ns
+        self._next_period = 0
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self._file.path
+
+    def first(self) -> pa.Table:
+        """The rows of the first period; none if the run ended within it."""
+        return next(self._file.pieces(len(self._number)), pa.table({}))
+
+    def periods(self) -> Iterator[tuple[Instant, Beliefs]]:
+        """The truth and the fixes of each period in turn, and what nodes reported in it.
+
+        Headings of fixes are not kept (NaN). Raises VnetError if the states cannot be read or are not of this run.
+        """
+        for table in self._whole_periods():
+            with self._file.sound():
+                parts = list(self._split(table))
+            yield from parts
+
+    def _whole_periods(self) -> Iterator[pa.Table]:
+        """Pieces that each hold a row of every node for one period or more."""
+        count = len(self._number)
+        rest: list[pa.Table] = []
+        for piece in self._file.pieces():
+            table = pa.concat_tables([*rest, piece])
+            whole = len(table) // count * count
+            rest = [table.slice(whole)]
+            if whole:
+                yield self._in_order(table.slice(0, whole).combine_chunks())
+        if rest and len(rest[0]):
+            raise self._file.error("ends in the middle of a period, or is of other vehicles")
+
+    def _in_order(self, table: pa.Table) -> pa.Table:
+        count = len(self._number)
+        periods = np.arange(self._next_period, self._next_period + len(table) // count)
+        nodes = table["node"].to_pylist()
+        if set(nodes) != set(self._number):
+            raise self._file.error("is of other vehicles than scenario.toml")
+        in_turn = np.array_equal(table["period"].to_numpy(), np.repeat(periods, count))
+        if not in_turn or nodes != list(self._number) * len(periods):
+            raise self._file.error("its rows are not those of one period after the other")
+        self._next_period += len(periods)
+        return table
+
+    def _split(self, table: pa.Table) -> Iterator[tuple[Instant, Beliefs]]:
+        count, node_ids = len(self._number), list(self._number)
+        heading = np.asarray(table["heading_rad"].to_numpy(), dtype=float).reshape(-1, count)
+        vectors = {
+            name: _vectors(table[name].combine_chunks(), size).reshape(-1, count, size)
+            for name, size in self._VECTORS.items()
+        }
+        clouds = _clouds(table["cloud_m"].combine_chunks())
+        weights = _weights(table["values"].combine_chunks(), self._number)
+        first = table["period"][0].as_py()
+        for place in range(len(heading)):
+            here = {name: array[place] for name, array in vectors.items()}
+            row_of = dict(zip(node_ids, range(place * count, (place + 1) * count), strict=True))
+            instant = Instant(
+                first + place,
+                (first + place) * self._period_ns,
+                here["position_m"],
+                heading[place],
+                here["common_error_m"][0],
+                here["fix_m"],
+                np.full(count, np.nan),
+            )
+            yield (
+                instant,
+                Beliefs(
+                    here["estimate_m"],
+                    here["covariance_m2"],
+                    here["common_error_estimate_m"],
+                    here["common_error_covariance_m2"],
+                    {node: clouds[row] for node, row in row_of.items() if row in clouds},
+                    {node: weights[row] for node, row in row_of.items() if row in weights},
+                ),
+            )
+
+
+def _vectors(column: pa.Array, size: int) -> Array:
+    """A column of points or matrices as (rows, size); NaN where there is none."""
+    array = np.full((len(column), size), np.nan)
+    there = np.asarray(column.is_valid())
+    array[there] = np.asarray(column.drop_null().flatten(), dtype=float).reshape(-1, size)
+    return array
+
+
+def _clouds(column: pa.Array) -> dict[int, Array]:
+    """The numbers of each cloud, by row."""
+    rows = np.flatnonzero(np.asarray(column.is_valid()))
+    lists = column.drop_null()
+    ends = np.cumsum(np.asarray(pc.list_value_length(lists), dtype=np.intp))
+    clouds = np.split(np.asarray(lists.flatten(), dtype=float), ends[:-1]) if len(rows) else []
+    return {row: cloud for row, cloud in zip(rows.tolist(), clouds, strict=True) if is_cloud(len(cloud))}
+
+
+def _weights(column: pa.Array, number: Mapping[str, int]) -> dict[int, Array]:
+    """The weights (n,) of each node's fusion, by row; 0 where none, and no entry where none at all."""
+    lists = column.cast(VALUES_AS_LIST)
+    entries = lists.flatten()
+    name, value = pc.struct_field(entries, "key"), pc.struct_field(entries, "value")
+    one = pc.and_(pc.starts_with(name, WEIGHT), pc.equal(pc.list_value_length(value), 1))
+    row = pc.list_parent_indices(lists).filter(one).to_numpy()
+    amount = np.asarray(value.filter(one).flatten(), dtype=float)
+    weights: dict[int, Array] = {}
+    for place, key, weight in zip(row.tolist(), name.filter(one).to_pylist(), amount.tolist(), strict=True):
+        other = number.get(key.removeprefix(WEIGHT))
+        if other is not None:
+            weights.setdefault(place, np.zeros(len(number)))[other] = weight
+    return weights

@@ -1,0 +1,67 @@
+"""What a run says of itself in `verdict.json`, read as a foreign file: typed and bounded."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from emulator.records.verdicts import CheckResult, Judgement, NotExercised, Verdict
+from emulator.scenario.sections import first_problem
+from vnet.bounded import read_bounded
+from vnet.errors import VnetError
+
+LARGEST_BYTES = 64 * 2**20
+
+
+@dataclass(frozen=True)
+class Record:
+    """The fields of `verdict.json`; lengths in metres, times in seconds."""
+
+    verdict: Verdict
+    checks: list[CheckResult]
+    not_exercised: list[NotExercised]
+    trace_sha256: str
+    emulated_s: float
+    wall_s: float
+    seed: int
+    vehicles: int
+    frames_by_outcome: dict[str, int]
+    figures: dict[str, float | None]
+    reproduce: str
+    real_time_factor: float | None = None
+    start_up_s: float | None = None
+    metrics_sha256: str = ""
+    versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def judgement(self) -> Judgement:
+        """The checks as they were judged."""
+        return Judgement(self.checks, self.not_exercised, self.trace_sha256)
+
+    @property
+    def in_range(self) -> int:
+        """How many pairs of a frame and a receiver in range there were."""
+        return sum(count for outcome, count in self.frames_by_outcome.items() if outcome != "out_of_range")
+
+    def share_of(self, outcome: str) -> float | None:
+        """The share of the pairs in range with this outcome; None without pairs."""
+        return self.frames_by_outcome.get(outcome, 0) / self.in_range if self.in_range else None
+
+
+_RECORD = TypeAdapter(Record)
+
+
+def read_record(folder: Path) -> Record:
+    """Read RUN/verdict.json. Raises VnetError where there is none, or it is not what vnet writes."""
+    path = folder / "verdict.json"
+    try:
+        return _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
+    except OSError as error:
+        raise VnetError(f"{path}: {error.strerror}") from None
+    except ValidationError as error:
+        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+    except (ValueError, RecursionError) as error:
+        raise VnetError(f"{path}: not JSON: {error}") from None

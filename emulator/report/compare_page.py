@@ -1,0 +1,156 @@
+"""A page that shows two runs side by side, their curves in the same axes: A is blue, B is dashed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend, styled, to_svg
+from emulator.pages.page import SIGNS, badge, escape, page, put_page, table
+from emulator.records.verdicts import Verdict
+from emulator.report.comparison import A, B, Comparison, turned
+from emulator.report.figures import DASHES, Chart, Drawing, Line, decided, latencies_ms, time_figure
+from emulator.report.source import Source
+from emulator.report.write import STYLE, figures_section
+from vnet.errors import VnetError
+
+LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
+METRICS = {
+    "common-error": ("Common error", "common_error_rmse_m", "RMSE of the common error (m)"),
+    "deviation": ("Deviation", "deviation_m", "deviation (m)"),
+    "position": ("Position", "position_rmse_m", "RMSE of position (m)"),
+    "consensus": ("Consensus error", "consensus_error_m", "consensus error (m)"),
+}
+BINS = 60
+
+
+def write_comparison(comparison: Comparison, path: Path) -> Path:
+    """Write the page. Raises VnetError if it cannot be written."""
+    return put_page(path, comparison_page(comparison))
+
+
+def comparison_page(comparison: Comparison) -> str:
+    """The whole page."""
+    charts, missing = _draw(comparison)
+    names = [source.folder.resolve().name for source in (comparison.first, comparison.second)]
+    body = [*_header(comparison), *_difference(comparison), *_tables(comparison), *figures_section(charts, missing)]
+    return page(f"vnet: {names[0]} and {names[1]}", body, STYLE)
+
+
+def _header(comparison: Comparison) -> Iterator[str]:
+    yield "<header><h1>Two runs side by side</h1>"
+    rows = zip((A, B), (comparison.first, comparison.second), comparison.records, strict=True)
+    for name, source, record in rows:
+        yield f"<p><b>{name}</b> {badge(record.verdict)} {escape(source.folder)}</p>"
+    yield "</header>"
+
+
+def _difference(comparison: Comparison) -> Iterator[str]:
+    finding = comparison.finding
+    yield '<section id="difference"><h2>First difference</h2>'
+    sign = "" if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} "
+    yield f"<p>{sign}{escape(finding.text)}.</p>"
+    if rows := finding.figures.get("rows"):
+        yield table(turned(rows))
+    yield "</section>"
+
+
+def _tables(comparison: Comparison) -> Iterator[str]:
+    yield '<section id="scenario"><h2>Scenario</h2>'
+    yield table(comparison.scenario, "keys that differ") if comparison.scenario else "<p>The same.</p>"
+    yield '</section><section id="key"><h2>Key figures</h2>'
+    yield table(comparison.figures, "errors are means after the first fifth of the run")
+    if comparison.outcomes:
+        yield f"<br>{table(comparison.outcomes, 'shares of the pairs in range; B − A in percentage points')}"
+    yield f'</section><section id="checks"><h2>Checks</h2>{table(comparison.checks)}</section>'
+
+
+# Curves.
+
+
+@styled
+def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, str]]:
+    charts, missing = [], {}
+    drawers: dict[str, tuple[str, Callable[[], Drawing]]] = {
+        key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
+    }
+    drawers["delivered"] = ("Delivered", partial(_delivered, comparison))
+    drawers["latency"] = ("Latency", partial(_latency, comparison))
+    for key, (title, draw) in drawers.items():
+        try:
+            drawing = draw()
+        except VnetError as error:
+            missing[title] = str(error)
+            continue
+        charts.append(Chart(key, title, to_svg(drawing.canvas.figure, key, title), drawing.caption))
+    return charts, missing
+
+
+def _of_both(comparison: Comparison, read: Callable[[Source], Any]) -> tuple[list[tuple[Any, Any]], str]:
+    """(look, what was read) of the runs that have it, and a note on one that does not; VnetError if neither has."""
+    found, note = [], ""
+    for look, source in zip(LOOKS, (comparison.first, comparison.second), strict=True):
+        try:
+            found.append((look, read(source)))
+        except VnetError as error:
+            if note:
+                raise
+            note = f" {look[0]} is not shown: {error}."
+    return found, note
+
+
+def _over_time(comparison: Comparison, read: Callable[[Source], Any], y_label: str, caption: str) -> Drawing:
+    """`read` gives times (n,) in seconds and values (n,) of a run."""
+    found, note = _of_both(comparison, read)
+    spans, said = _spans(comparison)
+    lines = [Line(name, times, values, colour, dash) for (name, colour, dash), (times, values) in found]
+    made = time_figure(lines, y_label, max(comparison.first.end_s, comparison.second.end_s), spans)
+    return Drawing(made, f"{caption}{said}{note}".strip())
+
+
+def _spans(comparison: Comparison) -> tuple[list[Span], str]:
+    """The faults that both runs had alike, and what is to be said of them."""
+    if comparison.first.spans == comparison.second.spans:
+        return comparison.first.spans, " Shaded: while a fault acted." if comparison.first.spans else ""
+    return [], " Faults are not shaded, as they differ."
+
+
+def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:
+    return _over_time(comparison, lambda source: (source.time_s, source.metric(name)), y_label, "")
+
+
+def _delivered(comparison: Comparison) -> Drawing:
+    width_s = max(comparison.first.end_s, comparison.second.end_s) / BINS
+
+    def share(source: Source) -> Any:
+        names, code, time_s = decided(source)
+        place = (time_s / width_s).astype(np.intp)
+        total = np.bincount(place)
+        good = np.bincount(place, weights=np.array([name == "delivered" for name in names])[code])
+        with np.errstate(invalid="ignore"):
+            return (np.arange(len(total)) + 0.5) * width_s, 100 * good / total
+
+    caption = f"The share of the pairs in range that was delivered, in stretches of {width_s:.3g} s."
+    drawing = _over_time(comparison, share, "delivered (%)", caption)
+    drawing.canvas.axes.set_yscale("linear")
+    drawing.canvas.axes.set_ylim(0, 100)
+    return drawing
+
+
+def _latency(comparison: Comparison) -> Drawing:
+    found, note = _of_both(comparison, latencies_ms)
+    end_ms = max(float(np.percentile(values, 99.5)) for _, values in found) * 1.1
+    made: Canvas = canvas("latency (ms)", "deliveries (%)", legend_rows=1)
+    for (name, colour, dash), values in found:
+        counts, edges = np.histogram(values, bins=50, range=(0, max(end_ms, 1e-3)))
+        label = f"{name}: median {np.median(values):.2f} ms"
+        made.axes.stairs(
+            100 * counts / len(values), edges, color=colour, linestyle=dash, linewidth=1.6, label=label
+        )
+    made.axes.set_xlim(0, max(end_ms, 1e-3))
+    legend(made)
+    return Drawing(made, f"From handing a frame over to its arrival; a few later ones are cut off.{note}")

@@ -1,0 +1,177 @@
+"""Two runs side by side: where their scenarios differ, what each came to, and the first row in which they part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from emulator.checks.replay import compare_folders
+from emulator.records.run_folder import check_is_run
+from emulator.records.verdict_file import Record
+from emulator.records.verdicts import CheckResult, Finding, Verdict
+from emulator.report.source import Source
+from emulator.scenario.toml import parse_toml
+from emulator.terminal.summary import FIGURES, cell
+
+A, B = "A", "B"
+LONGEST_VALUE = 200
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two finished runs, and the first difference between their tables: valid where there is none."""
+
+    first: Source
+    second: Source
+    finding: CheckResult
+
+    @classmethod
+    def of(cls, first: Path, second: Path) -> Comparison:
+        """Read two runs' folders. Raises VnetError if one is not that of a finished run of this vnet."""
+        for folder in (first, second):
+            check_is_run(folder)
+        sources = Source(first), Source(second)
+        for source in sources:
+            _ = source.record, source.scenario, source.evidence
+        return cls(*sources, _told(compare_folders(first, second)))
+
+    @property
+    def records(self) -> tuple[Record, Record]:
+        """What each run says of itself."""
+        return self.first.record, self.second.record
+
+    @property
+    def same_trace(self) -> bool:
+        """Whether the traces are the same; states and metrics may still differ."""
+        return self.finding.figures.get("table") != "trace"
+
+    @cached_property
+    def scenario(self) -> list[Row]:
+        """The keys of the scenarios that differ, with both values; None where a run has no such key."""
+        ours, theirs = (dict(_flat(parse_toml(source.scenario_text))) for source in (self.first, self.second))
+        keys = [key for key in ours | theirs if ours.get(key) != theirs.get(key)]
+        return [{"key": key, A: _short(ours.get(key)), B: _short(theirs.get(key))} for key in keys]
+
+    @cached_property
+    def checks(self) -> list[Row]:
+        """The verdict, and that of each check; "left out" where a run could not exercise it."""
+        judged = [
+            {check.name: check.verdict.value for check in record.checks}
+            | {left.name: "left out" for left in record.not_exercised}
+            for record in self.records
+        ]
+        rows = [{"check": "the run", A: self.records[0].verdict.value, B: self.records[1].verdict.value}]
+        for name in judged[0] | judged[1]:
+            verdicts = [each.get(name, "left out") for each in judged]
+            if verdicts != ["left out"] * 2:
+                rows.append({"check": name, A: verdicts[0], B: verdicts[1]})
+        return rows
+
+    @cached_property
+    def figures(self) -> list[Row]:
+        """Key figures with B − A; lengths in metres."""
+        ours, theirs = (record.figures for record in self.records)
+        rows = [
+            _difference(f"{title} (m)", ours.get(name), theirs.get(name), ".3f")
+            for name, title in FIGURES.items()
+            if ours.get(name) is not None or theirs.get(name) is not None
+        ]
+        times = [(record.emulated_s, record.wall_s) for record in self.records]
+        rows.append(_difference("emulated time (s)", times[0][0], times[1][0], ".1f"))
+        return [*rows, _difference("wall-clock time (s)", times[0][1], times[1][1], ".1f")]
+
+    @cached_property
+    def outcomes(self) -> list[Row]:
+        """Shares of the pairs in range by outcome, in percent, with B − A in percentage points."""
+        ours, theirs = self.records
+        rows = []
+        for name in ours.frames_by_outcome | theirs.frames_by_outcome:
+            shares = [record.share_of(name) for record in self.records]
+            if name != "out_of_range" and any(shares):
+                percent = [None if share is None else 100 * share for share in shares]
+                rows.append(_difference(f"{name} (%)", percent[0], percent[1], ".2f"))
+        return rows
+
+
+def _told(finding: Finding) -> CheckResult:
+    """The finding with the runs called by their letters."""
+    assert isinstance(finding, CheckResult), "two folders were compared"
+    figures = dict(finding.figures)
+    if "rows" in figures:
+        figures["rows"] = [{**row, "run": name} for row, name in zip(figures["rows"], (A, B), strict=True)]
+    return CheckResult("first difference", finding.verdict, finding.text, figures)
+
+
+def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value of nested tables and lists of tables by its dotted key."""
+    if isinstance(data, dict):
+        for name, value in data.items():
+            yield from _flat(value, f"{key}.{name}" if key else name)
+    elif isinstance(data, list) and data and all(isinstance(item, dict) for item in data):
+        for number, item in enumerate(data):
+            yield from _flat(item, f"{key}.{number}")
+    else:
+        yield key, data
+
+
+def _short(value: Any) -> str | None:
+    """A value as one short text."""
+    text = "" if value is None else str(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+
+
+def _difference(name: str, ours: float | None, theirs: float | None, form: str) -> Row:
+    values = ["–" if value is None else format(value, form) for value in (ours, theirs)]
+    change = "" if ours is None or theirs is None else format(theirs - ours, f"+{form}")
+    return {"figure": name, A: values[0], B: values[1], "B − A": change}
+
+
+def print_comparison(comparison: Comparison, console: Console) -> None:
+    """The whole comparison, for a terminal."""
+    console.print(f"A  {comparison.first.folder}", highlight=False, soft_wrap=True)
+    console.print(f"B  {comparison.second.folder}", highlight=False, soft_wrap=True)
+    if comparison.scenario:
+        console.print(_table("scenario, where they differ", comparison.scenario))
+    else:
+        console.print("scenario: the same")
+    console.print(_table("verdicts", comparison.checks, _verdict_style))
+    console.print(_table("figures (errors: means after the first fifth)", comparison.figures))
+    if comparison.outcomes:
+        console.print(_table("shares of the pairs in range", comparison.outcomes))
+    finding = comparison.finding
+    console.print(Text(finding.text, style="green" if finding.verdict is Verdict.VALID else "bold red"))
+    if rows := finding.figures.get("rows"):
+        console.print(_turned(rows))
+
+
+def _table(title: str, rows: Sequence[Mapping[str, Any]], style: Any = lambda text: "") -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in rows[0]:
+        numeric = "figure" in rows[0] and column != "figure"
+        table.add_column(column, overflow="fold", justify="right" if numeric else "left")
+    for row in rows:
+        table.add_row(*(Text(cell(value), style=style(value)) for value in row.values()))
+    return table
+
+
+def _verdict_style(value: object) -> str:
+    return {"valid": "green", "invalid": "bold red", "unknown": "yellow"}.get(str(value), "")
+
+
+def _turned(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Two rows of a table as columns: long rows do not fit into a terminal."""
+    return _table("", turned(rows))
+
+
+def turned(rows: Sequence[Mapping[str, Any]]) -> list[Row]:
+    """Two rows of a table, A and B, as columns."""
+    names = dict.fromkeys(key for row in rows for key in row if key != "run")
+    return [{"column": name, A: rows[0].get(name), B: rows[1].get(name)} for name in names]

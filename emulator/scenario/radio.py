@@ -1,0 +1,174 @@
+"""The sections of a physical radio: `[radio.path_loss]`, `shadowing`, `fading`, `receiver`, `mac`, `congestion`.
+
+Each is a stage of the channel, and left out it is no stage: without any of them the radio is the disc of
+`radio.range_m`. docs/radio.md has the formulas and where the defaults come from.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from emulator.scenario.sections import Section
+
+RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
+"""The bit rates of 802.11p in 10 MHz (802.11-2020, table 17-4)."""
+
+
+class _PathLoss(Section):
+    """What all path losses have."""
+
+    tx_power_dbm: float = Field(20.0, ge=-100, le=100)
+    """What all send with, antennas included."""
+    floor_dbm: float = Field(-94.0, ge=-300, le=100)
+    """Pairs whose mean power, with shadowing and without fading, is below it are out of range."""
+
+
+class FreeSpace(_PathLoss):
+    """Friis: 20 log10(4π d / λ) dB."""
+
+    kind: Literal["free_space"]
+    """This model."""
+    frequency_ghz: float = Field(5.9, ge=0.1, le=100)
+    """Of the carrier."""
+
+
+class LogDistance(_PathLoss):
+    """`reference_db` at one metre, and 10 · `exponent` · log10(d / 1 m) dB beyond it."""
+
+    kind: Literal["log_distance"]
+    """This model."""
+    exponent: float = Field(2.0, gt=0, le=10)
+    """How fast the power falls."""
+    reference_db: float = Field(47.86, ge=0, le=300)
+    """What is lost in the first metre."""
+
+
+class DualSlope(_PathLoss):
+    """As `log_distance` up to `break_m`, and with `far_exponent` beyond it."""
+
+    kind: Literal["dual_slope"]
+    """This model."""
+    exponent: float = Field(2.1, gt=0, le=10)
+    """How fast the power falls up to `break_m`."""
+    far_exponent: float = Field(3.8, gt=0, le=10)
+    """How fast it falls beyond."""
+    break_m: float = Field(100.0, ge=1, le=1e6)
+    """Where the slope changes."""
+    reference_db: float = Field(47.86, ge=0, le=300)
+    """What is lost in the first metre."""
+
+
+class TwoRay(_PathLoss):
+    """Two-ray interference: the direct ray and the one that the ground reflects."""
+
+    kind: Literal["two_ray"]
+    """This model."""
+    frequency_ghz: float = Field(5.9, ge=0.1, le=100)
+    """Of the carrier."""
+    antenna_m: float = Field(1.5, gt=0, le=1000)
+    """How high above the ground both antennas are."""
+    permittivity: float = Field(1.02, gt=1, le=1000)
+    """Of the ground, relative to the vacuum's."""
+
+
+PathLoss = Annotated[FreeSpace | LogDistance | DualSlope | TwoRay, Field(discriminator="kind")]
+
+
+class Shadowing(Section):
+    """`[radio.shadowing]`: log-normal, the same both ways of a link, and similar on links whose ends are near."""
+
+    sigma_db: float = Field(3.0, ge=0, le=50)
+    """Standard deviation."""
+    decorrelation_m: float = Field(25.0, gt=0, le=1e6)
+    """Moving one end so far leaves a correlation of 1/e."""
+
+
+class Fading(Section):
+    """`[radio.fading]`: Nakagami, drawn for each frame and receiver."""
+
+    m: tuple[Annotated[float, Field(ge=0.5, le=100)], ...] = (1.5, 0.75)
+    """The shapes up to each of the distances `until_m`, and beyond the last; 1 is Rayleigh."""
+    until_m: tuple[Annotated[float, Field(gt=0, le=1e9)], ...] = (80.0,)
+    """The distances, which grow."""
+
+    @model_validator(mode="after")
+    def _a_shape_for_each_stretch(self) -> Fading:
+        if len(self.m) != len(self.until_m) + 1:
+            raise ValueError(f"{len(self.m)} shapes m need {len(self.m) - 1} distances until_m between them")
+        if any(far <= near for near, far in pairwise(self.until_m)):
+            raise ValueError("the distances until_m must grow")
+        return self
+
+
+class Receiver(Section):
+    """`[radio.receiver]`: what a signal must stand out from. Its defaults hold wherever signals have a power."""
+
+    noise_dbm: float = Field(-104.0, ge=-300, le=100)
+    """The thermal noise in 10 MHz."""
+    noise_figure_db: float = Field(7.0, ge=0, le=100)
+    """What the receiver adds to it."""
+    min_snr_db: float = Field(4.0, ge=-50, le=100)
+    """A frame is detected from so much above noise and interference on."""
+    min_rssi_dbm: float = Field(-82.0, ge=-300, le=100)
+    """And from this power on."""
+
+
+class Mac(Section):
+    """`[radio.mac]`: all share one medium, and listen before they talk."""
+
+    access_category: Literal["VO", "VI", "BE", "BK"] = "BE"
+    """Of 802.11p's EDCA: how long one listens, and from how many slots the backoff is drawn."""
+    carrier_sense_dbm: float = Field(-85.0, ge=-300, le=100)
+    """The medium is busy where the sum of all signals is at least this."""
+
+
+class EtsiReactive(Section):
+    """The reactive table of ETSI TS 102 687. Each 100 ms a sender goes one state up or down, towards the one whose
+    busy ratio it has."""
+
+    kind: Literal["etsi"]
+    """This control."""
+    busy: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.3, 0.4, 0.5, 0.65)
+    """The busy ratios at which the second state begins, the third, …"""
+    pause_ms: tuple[Annotated[float, Field(ge=0, le=60_000)], ...] = (50.0, 100.0, 200.0, 250.0, 1000.0)
+    """By state, the least time from one frame of a sender to the next."""
+    waiting: int = Field(1, ge=1, le=1_000_000)
+    """Frames that wait for their turn; a newer one takes the oldest one's place (`held_back`)."""
+
+    @model_validator(mode="after")
+    def _a_pause_for_each_state(self) -> EtsiReactive:
+        if len(self.pause_ms) != len(self.busy) + 1:
+            raise ValueError(f"{len(self.pause_ms)} pauses need {len(self.pause_ms) - 1} busy ratios between them")
+        if any(more <= less for less, more in pairwise(self.busy)):
+            raise ValueError("the busy ratios must grow")
+        return self
+
+
+class Limeric(Section):
+    """LIMERIC, the adaptive approach of ETSI TS 102 687. Each 200 ms a sender's share of the time becomes
+    (1 - `alpha`) share + `beta` (`target` - busy ratio)."""
+
+    kind: Literal["limeric"]
+    """This control."""
+    alpha: float = Field(0.016, gt=0, lt=1)
+    """How fast the past is forgotten."""
+    beta: float = Field(0.0012, gt=0, lt=1)
+    """How fast the share follows."""
+    target: float = Field(0.68, gt=0, lt=1)
+    """The busy ratio that is aimed at."""
+    most_up: float = Field(0.0005, gt=0, lt=1)
+    """The share grows by no more at a time because the medium is free."""
+    most_down: float = Field(0.00025, gt=0, lt=1)
+    """It shrinks by no more because the medium is busy."""
+    least: float = Field(0.0006, gt=0, lt=1)
+    """The smallest share."""
+    most: float = Field(0.03, gt=0, le=1)
+    """The largest share."""
+    waiting: int = Field(1, ge=1, le=1_000_000)
+    """Frames that wait for their turn; a newer one takes the oldest one's place (`held_back`)."""
+
+
+Congestion = Annotated[EtsiReactive | Limeric, Field(discriminator="kind")]

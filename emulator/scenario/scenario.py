@@ -1,0 +1,449 @@
+"""The scenario file: what a run is made of, read from TOML, checked by pydantic.
+
+One frozen model a section. Whatever is wrong with a file or an override becomes one `ScenarioError` of one
+line that names the file, the key, the value and what is allowed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomli_w
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from emulator.scenario.faults import Fault
+from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
+from emulator.scenario.sections import Section, first_problem
+from emulator.scenario.sumo import input_files
+from emulator.scenario.toml import DEEPEST, check_plain, parse_toml, read_toml
+from vnet.errors import ScenarioError, did_you_mean, printable, shown
+from vnet.units import NS_PER_S
+
+DAY_S = 86_400
+"""No time in a scenario is longer, so that nanoseconds stay far within 64 bits."""
+FAR_M = 1e9
+"""No length in a scenario is larger, so that squares stay finite and millimetres mean something."""
+WILD_M = 1e5
+"""No standard deviation is larger, so that fixes stay near enough for frames to say."""
+MANY = 1_000_000_000
+FAR_S = 1e11
+"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
+OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
+"""Keys of `[network]` for vehicles that move."""
+NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
+MOST_NAMED = 8
+"""Files that a message names."""
+
+
+class Run(Section):
+    """`[run]`: what the run is called, how long it takes and how patient it is."""
+
+    name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
+    """Names the run's folder, and its keys on Zenoh."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """All that is drawn in the run comes from it: the same seed, the same run."""
+    duration_s: float = Field(30.0, gt=0, le=DAY_S)
+    """Length of the run, in emulated time."""
+    settle_s: float = Field(5.0, ge=0, le=DAY_S)
+    """All faults have healed so long before the end (emulated time), so that the network is judged at rest."""
+    pacing: Literal["lockstep", "realtime"] = "lockstep"
+    """`lockstep` is virtual time, `realtime` the wall clock."""
+    nodes_per_process: int = Field(1, ge=1, le=1000)
+    """How many vehicles share an agent process; they start, pause and die together."""
+    join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
+    """How long the emulator waits for its agents to join, or to come back after a fault (wall clock)."""
+    stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
+    """A process that does not yield for so long (wall clock) ends the run as unknown; lockstep, live."""
+    orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
+    """An agent that has lost its emulator for so long (wall clock) ends."""
+    spin_limit: int = Field(100_000, ge=100, le=MANY)
+    """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
+
+
+OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
+
+
+class Network(Section):
+    """`[network]`: which vehicles there are and where they are, or how they drive."""
+
+    kind: Literal["generated", "file", "trips", "sumo", "city"] = "generated"
+    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive,
+    `sumo` has SUMO drive, and in a `city`, a generated one or that of `[map]`, `vehicles` drive anywhere."""
+    path: Path | None = None
+    """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
+    CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
+    vehicles: int = Field(38, ge=1, le=10_000)
+    """How many are generated; they are called v01, v02, …"""
+    layout: Literal["urban", "dense"] = "urban"
+    """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
+    size_m: float = Field(3000.0, ge=1000, le=10_000)
+    """How far the generated city reaches from one end to the other."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """Draws the generated network, the city and its traffic, or SUMO's traffic, and nothing of the run."""
+    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
+    max_vehicles: int | None = Field(None, ge=1, le=10_000)
+    """Trips: no more than so many vehicles, those that enter first."""
+    disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
+    """Trips: vehicles are there only within this disc, x, y, radius in m."""
+    origin_deg: OriginDeg | None = None
+    """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
+    fastest_mps: float = Field(70.0, gt=0, le=1000)
+    """Trips: what is faster is a jump."""
+    longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
+    """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
+
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave."""
+        return self.kind in ("trips", "sumo", "city")
+
+    @model_validator(mode="after")
+    def _keys_go_with_their_kind(self) -> Network:
+        if (self.kind not in ("generated", "city")) != (self.path is not None):
+            raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
+        given = [name for name in OF_TRIPS if getattr(self, name) is not None]
+        if given and self.kind not in ("trips", "sumo"):
+            raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
+        return self
+
+
+class Map(Section):
+    """`[map]`: the roads on which vehicles drive, as programs know them. Without it they know none."""
+
+    path: Path
+    """Relative to the scenario file: OpenStreetMap's XML or PBF, SUMO's `.net.xml`, GeoJSON or NPZ."""
+    drive_on: Literal["right", "left"] = "right"
+    """On which side of the road people drive."""
+    origin_deg: OriginDeg | None = None
+    """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips'."""
+    sigma_m: float = Field(0.0, ge=0, le=WILD_M)
+    """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
+    aside_m: float = Field(0.0, ge=-FAR_M, le=FAR_M)
+    """How far to the right of the map's lanes vehicles really drive, in the mean; negative: to the left."""
+    margin_m: float = Field(300.0, ge=0, le=FAR_M)
+    """Programs are given the roads within so much of the box in which vehicles drive."""
+
+
+class CommonError(Section):
+    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process."""
+
+    sigma_m: float = Field(3.0, ge=0, le=WILD_M)
+    """Its standard deviation in each axis."""
+    tau_s: float = Field(600.0, gt=0)
+    """Its correlation time."""
+
+
+class Gnss(Section):
+    """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
+
+    rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
+    """Fixes a second. The time between two is the period by which states and metrics are recorded."""
+    sigma_m: float = Field(1.0, ge=0, le=WILD_M)
+    """Standard deviation of the receiver's noise in each axis."""
+    heading: bool = True
+    """Whether fixes bear a heading."""
+    heading_sigma_rad: float = Field(0.01, ge=0, le=1)
+    """Standard deviation of that heading."""
+
+
+class Lateral(Section):
+    """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
+
+    half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    """How far it strays at most; the map tells programs."""
+    sigma_m: float = Field(0.4, ge=0, le=WILD_M)
+    """Standard deviation of the offset, before it is reflected at the half-width."""
+    tau_s: float = Field(20.0, gt=0)
+    """Correlation time of the offset."""
+
+
+class WorldSection(Section):
+    """`[world]`: the truth that the vehicles never see."""
+
+    common_error: CommonError = CommonError()
+    gnss: Gnss = Gnss()
+    lateral: Lateral = Lateral()
+
+
+class Radio(Section):
+    """`[radio]`: what stands between one vehicle's broadcast and another's reception.
+
+    The subsections make it a physical radio, stage by stage; docs/radio.md says what each of them does.
+    """
+
+    range_m: float = Field(3000.0, gt=0, le=FAR_M)
+    """All within it hear each other, unless there are `links` or a `path_loss`."""
+    links: Path | tuple[tuple[int, ...], ...] | None = None
+    """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
+    (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
+    network's vehicles; the diagonal means nothing."""
+    max_peers: int = Field(30, ge=1, le=MANY)
+    """Each receiver hears so many senders at most: the nearest that are up."""
+    loss: float = Field(0.0, ge=0, le=1)
+    """Probability that a frame is lost, drawn for each receiver by itself."""
+    latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
+    """Least time from the end of the transmission to the arrival."""
+    jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Added to the latency: uniform up to so much, drawn for each receiver."""
+    access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
+    """Wait before the transmission: uniform up to so much, drawn for each frame."""
+    delivery_tick_us: int = Field(0, ge=0, le=MANY)
+    """Arrivals are rounded up to a multiple of it; 0 rounds nothing."""
+    max_payload_bytes: int = Field(1400, ge=1, le=65_000)
+    """A longer payload is refused."""
+    bitrate_mbps: float = Field(6.0, ge=1e-6)
+    """A frame takes its payload's bits over this to send; each sender sends one at a time. With a path loss or a
+    medium it is one of 802.11p's (3, 4.5, 6, 9, 12, 18, 24 or 27), and frames take as long as there."""
+    queue_frames: int = Field(64, ge=1, le=MANY)
+    """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
+    path_loss: PathLoss | None = None
+    """How much weaker signals arrive; in place of the range, the power decides who hears whom."""
+    shadowing: Shadowing | None = None
+    """What stands in the way of some signals and not of others."""
+    fading: Fading | None = None
+    """How the power of one frame differs from the mean."""
+    receiver: Receiver | None = None
+    """Noise, and what is detected; its defaults hold wherever signals have a power."""
+    mac: Mac | None = None
+    """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
+    congestion: Congestion | None = None
+    """Senders send less where the medium is busy."""
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether signals have a power, and frames the air time of 802.11p."""
+        return self.path_loss is not None or self.mac is not None
+
+    @model_validator(mode="after")
+    def _stages_fit_together(self) -> Radio:
+        if self.path_loss is not None and self.links is not None:
+            raise ValueError("path_loss and links both say who hears whom: leave one of them out")
+        for name in ("shadowing", "fading"):
+            if getattr(self, name) is not None and self.path_loss is None:
+                raise ValueError(f"{name} needs path_loss: without it no signal is weaker than another")
+        if self.receiver is not None and not self.is_physical:
+            raise ValueError("receiver needs path_loss or mac: without them there is no signal and no interference")
+        if self.congestion is not None and self.mac is None:
+            raise ValueError("congestion needs mac: without it nobody senses how busy the channel is")
+        if self.is_physical and self.bitrate_mbps not in RATES_MBPS:
+            rates = ", ".join(f"{rate:g}" for rate in RATES_MBPS)
+            raise ValueError(f"bitrate_mbps = {self.bitrate_mbps:g}: 802.11p has {rates}")
+        return self
+
+    @field_validator("links", mode="before")
+    @classmethod
+    def _links_are_a_file_or_a_matrix(cls, links: Any) -> Any:
+        if links is None or isinstance(links, (str, Path)):
+            return links
+        if not isinstance(links, (list, tuple)) or not links:
+            raise ValueError("write the name of a CSV file, or a square matrix of 0 and 1")
+        for number, row in enumerate(links, start=1):
+            if not isinstance(row, (list, tuple)) or len(row) != len(links):
+                raise ValueError(f"not square: row {number} of {len(links)} should be {len(links)} entries long")
+            for entry in row:
+                if type(entry) is not int or entry not in (0, 1):
+                    raise ValueError(f"row {number} holds {shown(entry)}: each entry should be 0 or 1")
+        return links
+
+
+class OneProgram(Section):
+    """A program as `package.module:function`, and the options it is given."""
+
+    entry: str = "agents.beacon:main"
+    """An async function of one argument, the `Node`."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Given to the program as `node.options`; what is allowed is its own business."""
+
+    @field_validator("entry")
+    @classmethod
+    def _entry_is_module_and_function(cls, entry: str) -> str:
+        if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", entry):
+            raise ValueError("write it as package.module:function")
+        return entry
+
+
+class ProgramException(OneProgram):
+    """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
+
+    nodes: tuple[str, ...] = Field(min_length=1)
+    """Their ids."""
+
+
+class Program(OneProgram):
+    """`[program]`: what every vehicle runs, but for the `exceptions`."""
+
+    exceptions: tuple[ProgramException, ...] = ()
+    """Those that run something else."""
+
+    @model_validator(mode="after")
+    def _one_program_a_node(self) -> Program:
+        named = Counter(node for exception in self.exceptions for node in exception.nodes)
+        if twice := sorted(node for node, count in named.items() if count > 1):
+            raise ValueError(f"node {shown(twice[0])} is in two exceptions")
+        return self
+
+    def of(self, node: str) -> OneProgram:
+        """What `node` runs."""
+        return next((exception for exception in self.exceptions if node in exception.nodes), self)
+
+
+class Scenario(Section):
+    """A whole scenario. All sections have defaults, so that an empty file is a valid run."""
+
+    run: Run = Run()
+    network: Network = Network()
+    map: Map | None = None
+    """The roads on which vehicles drive, if programs are to know them."""
+    world: WorldSection = WorldSection()
+    radio: Radio = Radio()
+    program: Program = Program()
+    fault: tuple[Fault, ...] = ()
+    """What breaks, and when."""
+
+    @model_validator(mode="after")
+    def _faults_start_in_time(self) -> Scenario:
+        for number, fault in enumerate(self.fault):
+            if fault.at_s >= self.healed_s:
+                raise ValueError(
+                    f"fault.{number}.at_s = {fault.at_s:g}: must be less than {self.healed_s:g}, which is "
+                    "run.duration_s - run.settle_s"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _roads_are_for_those_who_drive(self) -> Scenario:
+        if self.map is not None and not self.network.moves:
+            raise ValueError(f'map goes with vehicles that drive, not with network.kind = "{self.network.kind}"')
+        return self
+
+    @property
+    def healed_s(self) -> float:
+        """When all faults have healed, in emulated seconds."""
+        return self.run.duration_s - self.run.settle_s
+
+    @property
+    def duration_ns(self) -> int:
+        """Length of the run in nanoseconds."""
+        return round(self.run.duration_s * NS_PER_S)
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two GNSS fixes in nanoseconds: the period in which programs are thought to work."""
+        return round(NS_PER_S / self.world.gnss.rate_hz)
+
+
+def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
+    """Read a scenario and apply `section.key=value` overrides.
+
+    Values are in TOML syntax; bare words are strings. A relative `network.path` or `radio.links` is taken from
+    the scenario's own folder. Raises `ScenarioError`.
+    """
+    try:
+        data = read_toml(path)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
+    except ValueError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
+    recorded_digests = data.pop("inputs", {})
+    if not isinstance(recorded_digests, dict):
+        raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
+    for override in overrides:
+        _apply_override(data, override)
+    try:
+        check_plain(data)
+        scenario = Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
+    except ValueError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    scenario = _with_absolute_paths(scenario, path)
+    for name, digest in input_digests(scenario).items():
+        if recorded_digests.get(name, digest) != digest:
+            raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
+    return scenario
+
+
+def _instead(path: Path) -> str:
+    """What may have been meant by a path that is no file."""
+    try:
+        inside = sorted(each.name for each in path.glob("*.toml"))
+        if inside:
+            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+        return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
+    except (OSError, ValueError):
+        return ""
+
+
+def dump_scenario(scenario: Scenario) -> str:
+    """The scenario as TOML with every default spelled out and the digests of its input files."""
+    data = scenario.model_dump(mode="json", exclude_none=True)
+    data["inputs"] = input_digests(scenario)
+    return tomli_w.dumps(data)
+
+
+def input_digests(scenario: Scenario) -> dict[str, str]:
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
+    read = scenario.network.path, scenario.radio.links, scenario.map and scenario.map.path
+    paths = [path for path in read if isinstance(path, Path)]
+    if scenario.network.kind == "sumo" and scenario.network.path is not None:
+        paths += input_files(scenario.network.path)
+    return {str(path): _sha256(path) for path in paths}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
+    network, radio = scenario.network, scenario.radio
+    if network.path is not None:
+        path = _absolute(network.path, "network.path", scenario_path)
+        network = network.model_copy(update={"path": path})
+    if isinstance(radio.links, Path):
+        path = _absolute(radio.links, "radio.links", scenario_path)
+        radio = radio.model_copy(update={"links": path})
+    roads = scenario.map
+    if roads is not None:
+        roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
+    return scenario.model_copy(update={"network": network, "radio": radio, "map": roads})
+
+
+def _absolute(given: Path, key: str, scenario_path: Path) -> Path:
+    problem = f"{scenario_path}: {key} = {shown(str(given))}"
+    try:
+        path = (scenario_path.parent / given).resolve()
+        found = path.is_file()
+    except (OSError, ValueError, RuntimeError):  # a name too long, with a NUL, or links that lead in a circle
+        raise ScenarioError(f"{problem}: cannot be the name of a file") from None
+    if not found:
+        raise ScenarioError(f"{problem}: no such file: {path}")
+    if not os.access(path, os.R_OK):
+        raise ScenarioError(f"{problem}: not readable: {path}")
+    return path
+
+
+def _apply_override(data: dict[str, Any], override: str) -> None:
+    key, equals, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not 2 <= len(parts) <= DEEPEST or not all(parts):
+        raise ScenarioError(
+            f"--set {printable(override)}: write it as section.key=value, for example radio.loss=0.3"
+        )
+    try:
+        value = parse_toml(f"value = {text}")["value"]
+    except ValueError:
+        value = text.strip()
+    table = data
+    for part in parts[:-1]:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"--set {printable(override)}: {printable(part)} is not a section")
+    table[parts[-1]] = value

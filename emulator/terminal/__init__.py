@@ -1,0 +1,1 @@
+"""The terminal: errors in one line, live picture, plain lines, JSON, and the summary of a run."""

@@ -1,0 +1,263 @@
+"""How a run gets on, for its user: a live picture in a terminal, plain lines elsewhere, JSON for machines.
+
+All of it goes to stderr, and whatever becomes of stderr, the run goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, TextIO
+
+from rich.console import Console
+
+from emulator.drivers.emulation import Emulation, PeriodView
+from emulator.drivers.status import Course, Snapshot
+from emulator.records.run_folder import Event
+from emulator.terminal.console import LogFormat
+from emulator.terminal.dashboard import Dashboard, describe, is_bad
+from emulator.terminal.painter import EVERY_S, Painter
+
+PLAIN_LINE_EVERY_S = 5.0
+JSON_LINE_EVERY_S = 1.0
+
+
+class Progress:
+    """Shows nothing: what the others have in common. A context manager around the run; `close` ends it early."""
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Show nothing more. Harmless if done twice."""
+
+    def state(self, text: str) -> None:
+        """Say what is going on before the first period."""
+
+    def awaits(self, nodes: Sequence[str]) -> None:
+        """These vehicles have not joined yet; none: all have."""
+
+    def judging(self) -> None:
+        """The run is over, and is being written down and judged."""
+
+    def ended(self, verdict: dict[str, Any], folder: str, exit_status: int) -> None:
+        """The run has been judged: the contents of its verdict.json, and with what status the command ends."""
+
+
+def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool) -> Progress:
+    """What shows on stderr how this run gets on."""
+    if quiet:
+        return Progress()
+    if log_format is LogFormat.JSON:
+        return JsonLines(emulation, sys.stderr)
+    console = terminal(sys.stderr)
+    return PlainLines(emulation, sys.stderr) if console is None else Picture(emulation, console)
+
+
+def terminal(file: TextIO) -> Console | None:
+    """A console on a terminal that can show a picture; None for a file, a pipe, or a terminal that cannot."""
+    console = Console(file=file)
+    able = file.isatty() and console.is_interactive and not console.options.ascii_only
+    if able and console.no_color:  # and none of its sisters, bold and dim
+        console = Console(file=file, color_system=None)
+    return console if able else None
+
+
+class Picture(Progress):
+    """The live picture of a terminal."""
+
+    def __init__(self, emulation: Emulation, console: Console) -> None:
+        self._course = Course(emulation)
+        self._shot = self._course.snapshot()
+        self._taken_s = time.monotonic()
+        self._painter = Painter(console, self._picture)
+        self._open = False
+        emulation.watch(self._look)
+
+    def _picture(self) -> Dashboard:
+        return Dashboard(self._shot, time.monotonic() - self._taken_s)
+
+    def _look(self, view: PeriodView | None = None) -> None:
+        """Have the figures of now drawn; as often as anybody could see."""
+        now_s = time.monotonic()
+        if view is None or now_s - self._taken_s >= EVERY_S:
+            self._shot, self._taken_s = self._course.snapshot(), now_s
+
+    def __enter__(self) -> Picture:
+        self._painter.__enter__()
+        self._open = True
+        return self
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._open:
+            self._open = False
+            self._painter.__exit__()
+
+    def state(self, text: str) -> None:
+        """Leave it above the picture: one may want to copy it."""
+        self._painter.print_above(text + "\n")
+
+    def awaits(self, nodes: Sequence[str]) -> None:
+        """Draw who is missing."""
+        self._course.awaits(nodes)
+        self._look()
+
+    def judging(self) -> None:
+        """Draw that."""
+        self._course.judging()
+        self._look()
+
+
+class _Lines(Progress):
+    """Lines, as things happen and now and then."""
+
+    every_s: float
+
+    def __init__(self, emulation: Emulation, file: TextIO) -> None:
+        self._course = Course(emulation)
+        self._file = file
+        self._gone = False
+        self._told_events = 0
+        self._last_s = 0.0
+        self._closed = False
+        self._emulation = emulation
+        emulation.watch(self._period)
+
+    def _write(self, line: str) -> None:
+        if self._gone:
+            return
+        try:
+            self._file.write(line + "\n")
+            self._file.flush()
+        except (OSError, ValueError):  # nobody reads it any more
+            self._gone = True
+
+    def _is_time(self) -> bool:
+        now_s = time.monotonic()
+        if now_s - self._last_s < self.every_s:
+            return False
+        self._last_s = now_s
+        return True
+
+    def _period(self, view: PeriodView) -> None:
+        self._tell_events()
+        if view.instant.period and self._is_time():  # the first period includes every program's own start
+            self._progress(self._course.snapshot())
+
+    def _tell_events(self) -> None:
+        for event in self._course.news(self._told_events):
+            self._event(event)
+        self._told_events = len(self._emulation.folder.events)
+
+    def close(self) -> None:
+        """Tell what happened last."""
+        if not self._closed:
+            self._closed = True
+            self._tell_events()
+
+    def _progress(self, shot: Snapshot) -> None:
+        """How it gets on."""
+
+    def _event(self, event: Event) -> None:
+        """What has happened."""
+
+
+class PlainLines(_Lines):
+    """For logs: a line every few seconds, and one at once for what goes wrong."""
+
+    every_s = PLAIN_LINE_EVERY_S
+
+    def state(self, text: str) -> None:
+        """A line."""
+        self._last_s = time.monotonic()
+        self._write(text)
+
+    def awaits(self, nodes: Sequence[str]) -> None:
+        """A line now and then."""
+        self._course.awaits(nodes)
+        if nodes and self._is_time():
+            total = len(self._emulation.world.node_ids)
+            named = ", ".join(nodes[:8]) + (", …" if len(nodes) > 8 else "")
+            self._write(f"{total - len(nodes)} of {total} vehicles have joined; missing: {named}")
+        if not nodes:
+            self._last_s = 0.0
+
+    def _progress(self, shot: Snapshot) -> None:
+        delivered = shot.frames_by_outcome.get("delivered", 0)
+        rmse_m, rmse = shot.common_error_rmse_m, ""
+        if rmse_m is not None:
+            rmse = f"RMSE {rmse_m:.2f} m  "
+        lost = sum(shot.frames_by_outcome.values()) - delivered
+        lost -= sum(shot.frames_by_outcome.get(name, 0) for name in ("out_of_range", "pending"))
+        factor = f"{shot.real_time_factor or 0:4.1f}× real time"
+        down = f"  down {', '.join(shot.down)}" if shot.down else ""
+        self._write(f"{shot.emulated_s:6.1f} s  {factor}  {rmse}delivered {delivered:,}  not {lost:,}{down}")
+
+    def _event(self, event: Event) -> None:
+        if is_bad(event):
+            self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
+
+
+class JsonLines(_Lines):
+    """One JSON object a line; docs/terminal.md says what is in them."""
+
+    every_s = JSON_LINE_EVERY_S
+    _phase_told = ""
+
+    def _say(self, kind: str, **fields: Any) -> None:
+        self._write(json.dumps({"kind": kind, "wall_s": round(self._course.wall_s, 3), **fields}))
+
+    def _state(self, **text: str) -> None:
+        shot = self._course.snapshot()
+        self._phase_told = shot.phase
+        self._say("state", phase=shot.phase, vehicles=len(shot.node_ids), missing=shot.missing, **text)
+
+    def _period(self, view: PeriodView) -> None:
+        if self._phase_told != "running":
+            self._state()
+        super()._period(view)
+
+    def __enter__(self) -> JsonLines:
+        self._state()
+        return self
+
+    def state(self, text: str) -> None:
+        """An object with a text."""
+        self._state(text=text)
+
+    def awaits(self, nodes: Sequence[str]) -> None:
+        """An object when joining begins, when it is over, and now and then."""
+        began = self._course.snapshot().phase
+        self._course.awaits(nodes)
+        if not nodes or began == "starting" or self._is_time():
+            self._state()
+
+    def judging(self) -> None:
+        """The last figures, and an object."""
+        self._progress(self._course.snapshot())
+        self._course.judging()
+        self._state()
+
+    def ended(self, verdict: dict[str, Any], folder: str, exit_status: int) -> None:
+        """The last object."""
+        self.close()
+        told = {key: verdict[key] for key in ("verdict", "emulated_s", "real_time_factor", "seed")}
+        self._say("ended", exit_status=exit_status, folder=folder, **told)
+
+    def _progress(self, shot: Snapshot) -> None:
+        acting = [fault.fault for fault in shot.faults if fault.state == "acting"]
+        left_out = {"node_ids", "phase", "missing", "over_time", "faults", "events"}
+        left_out |= {"join_timeout_s", "idle_s", "wall_s"}
+        fields = {key: value for key, value in asdict(shot).items() if key not in left_out}
+        self._say("progress", **fields, vehicles=len(shot.node_ids), faults_acting=acting)
+
+    def _event(self, event: Event) -> None:
+        line = {"time_ns": event.time_ns, "kind": event.kind, "node": event.node, **event.details}
+        self._say("event", event=line)

@@ -1,0 +1,275 @@
+"""The whole network's part of a recording: the map, what vehicles believe, figures against time, faults, events."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from emulator.radio.outcomes import Outcome
+from emulator.records.paper_values import paper_rmse
+from emulator.stream.messages import unpack
+from emulator.viewer.bound import Limit
+from emulator.viewer.drawing import (
+    BLUE,
+    COMMON_RINGS_M,
+    DARK,
+    GREEN,
+    GREY,
+    OUTCOME_COLOURS,
+    POSITION_RINGS_M,
+    PURPLE,
+    RED,
+    SKY,
+    Canvas,
+    Floats,
+    Period,
+    drawable,
+    ellipses,
+    in_length,
+    link_states,
+    nice_length,
+    outcome_colours,
+    outcome_title,
+)
+from emulator.viewer.radio_scene import next_charts_s
+
+LANE_HALF_LENGTH_M = 250.0
+ELLIPSES_EVERY_S = 1.0
+CLOUDS_EVERY_S = 1.0
+LARGEST_MATRIX = 400
+"""Vehicles of which a matrix is drawn."""
+LIMIT_VEHICLES = 100
+"""The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
+WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
+LONGEST_DETAIL = 60
+NAMED_DOWN = 6
+ACTING, NOBODY = "acting", "none"
+"""States of faults, and of those who are down."""
+LEGEND_STEP = 3.1
+"""From one name of the legend to the next; its rows are 1 apart."""
+
+
+class OverviewScene:
+    """Draws the network, from the scene and period messages of a run."""
+
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
+        self._canvas = canvas
+        self._node_ids: list[str] = scene["node_ids"]
+        few, lanes = len(self._node_ids) <= LIMIT_VEHICLES, len(scene["lane_heading_rad"]) > 0
+        self._limit = Limit(scene) if few and lanes and not scene["moves"] else None
+        self._paper = paper_rmse(scene)
+        self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
+        self._faults: set[str] = set()
+        self._known_faults: set[str] = set()
+        self._down: list[str] | None = None
+        self._clouds: dict[str, Floats] = {}  # each vehicle's latest
+        self._trusted = False  # whether any weights have been reported
+        self._next_ellipses_s = self._next_clouds_s = self._next_weights_s = 0.0
+        self._draw_static(scene)
+
+    def _draw_static(self, scene: Mapping[str, Any]) -> None:
+        canvas = self._canvas
+        canvas.log("about", rr.TextDocument(describe(scene), media_type=rr.MediaType.MARKDOWN), static=True)
+        point, heading = unpack(scene["lane_point_m"], 2), unpack(scene["lane_heading_rad"])[:, 0]
+        length = unpack(scene["lane_length_m"])[:, 0]
+        endless = np.isinf(length)
+        ahead, behind = np.where(endless, LANE_HALF_LENGTH_M, length), np.where(endless, LANE_HALF_LENGTH_M, 0)
+        along = np.column_stack([np.cos(heading), np.sin(heading)])
+        lanes = np.stack([point - behind[:, None] * along, point + ahead[:, None] * along], axis=1)
+        canvas.strip_style("map/lanes", (*GREY, 120), 1.0, -30.0)
+        canvas.strips("map/lanes", lanes, static=True)
+        self._set_styles()
+        draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
+        draw_legend(canvas, scene)
+        canvas.rings("common", COMMON_RINGS_M)
+        canvas.rings("position", POSITION_RINGS_M)
+        common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
+        if self._limit is not None:
+            common.append(("limit: one filter that hears all", GREEN, 1.5))
+        if self._paper is not None:
+            common.append((self._paper[0], GREY, 1.5))
+        canvas.series("figures/common", common)
+        canvas.states("faults/down", {NOBODY: DARK})
+        consensus = [("consensus error", BLUE, 2.0), ("error of the network's mean", GREEN, 1.5)]
+        canvas.series("figures/consensus", consensus)
+        canvas.series("figures/position", [("estimate", SKY, 2.0), ("raw fix", GREY, 1.0)])
+
+    def _set_styles(self) -> None:
+        canvas = self._canvas
+        canvas.strip_style("map/links", None, 1.8, -10.0)
+        canvas.point_style("map/true", None, 5.0, self._node_ids)
+        canvas.point_style("map/fix", GREY, 2.0)
+        canvas.point_style("map/estimate", BLUE, 2.5, order=31.0)
+        canvas.point_style("position/fix", GREY, 3.0, self._node_ids)
+        canvas.point_style("position/estimate", SKY, 4.0, self._node_ids)
+        canvas.point_style("common/particles", GREY, 1.0)
+        canvas.point_style("common/estimates", SKY, 4.0, self._node_ids)
+        canvas.strip_style("common/ellipses", (*SKY, 130), 1.2)
+
+    def period(self, period: Period) -> None:
+        """Draw a period."""
+        self._map(period)
+        self._beliefs(period)
+        self._figures(period)
+        self._trust(period)
+        self._faults_and_downs(period)
+        self.events(period.message["events"])
+        self._canvas.at(period.time_ns)
+
+    def _map(self, period: Period) -> None:
+        canvas, position = self._canvas, period.points("position_m")
+        sender, receiver, state = link_states(period)
+        # Each direction is the half of the line that is nearer to its sender.
+        halves = np.stack([position[sender], (position[sender] + position[receiver]) / 2], axis=1)
+        canvas.strips("map/links", halves, outcome_colours(state))
+        canvas.points("map/true", position)
+        canvas.points("map/fix", period.points("fix_m"))
+        canvas.points("map/estimate", period.points("estimate_m"))
+
+    def _beliefs(self, period: Period) -> None:
+        canvas, truth = self._canvas, period.truth_m
+        position = period.points("position_m")
+        canvas.points("position/fix", period.points("fix_m") - position)
+        canvas.points("position/estimate", period.points("estimate_m") - position)
+        common = period.points("common_error_estimate_m") - truth
+        canvas.points("common/estimates", common)
+        self._clouds |= {node: cloud - truth for node, cloud in period.clouds().items()}
+        for node, up in zip(self._node_ids, period.up, strict=True):
+            if not up:
+                self._clouds.pop(node, None)
+        if period.time_s >= self._next_ellipses_s:
+            self._next_ellipses_s = period.time_s + ELLIPSES_EVERY_S
+            outlines = ellipses(common, period.covariances("common_error_covariance_m2"))
+            canvas.strips("common/ellipses", outlines)
+        if self._clouds and period.time_s >= self._next_clouds_s:
+            self._next_clouds_s = period.time_s + CLOUDS_EVERY_S
+            clouds = [self._clouds[node] for node in self._node_ids if node in self._clouds]
+            canvas.points("common/particles", np.concatenate(clouds))
+
+    def _figures(self, period: Period) -> None:
+        plot, figure = self._canvas.plot, period.figure
+        common = [figure("common_error_rmse_m"), figure("deviation_m")]
+        if self._limit is not None:
+            limit_m = self._limit.step(period.message)
+            common.append(float("nan") if limit_m is None else limit_m)
+        if self._paper is not None:
+            common.append(self._paper[1])
+        plot("figures/common", *common)
+        plot("figures/consensus", figure("consensus_error_m"), figure("bias_m"))
+        plot("figures/position", figure("position_rmse_m"), figure("fix_rmse_m"))
+
+    def _trust(self, period: Period) -> None:
+        for node, row in period.weights().items():
+            self._weights[self._node_ids.index(node)] = row
+            self._trusted = True
+        self._weights[~period.up] = np.nan
+        if not self._trusted or period.time_s < self._next_weights_s or len(self._node_ids) > LARGEST_MATRIX:
+            return
+        self._next_weights_s = next_charts_s(period.time_s)
+        axes = ("fuses", "is weighed")
+        self._canvas.log("weights", rr.Tensor(self._weights, dim_names=axes, value_range=(0, 1)))
+
+    def _faults_and_downs(self, period: Period) -> None:
+        acting = set(period.message["faults"])
+        for label in sorted(acting ^ self._faults):
+            if label not in self._known_faults:
+                self._known_faults.add(label)
+                self._canvas.states(f"faults/{label}", {ACTING: PURPLE})
+            state = ACTING if label in acting else ""  # an empty state ends the one before
+            self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
+        self._faults = acting
+        down = period.down
+        if down != self._down:
+            colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
+            self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
+            shown = ", ".join(down[:NAMED_DOWN]) + (" …" if len(down) > NAMED_DOWN else "")
+            self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else NOBODY))
+            self._down = down
+
+    def events(self, events: Iterable[Mapping[str, Any]]) -> None:
+        """Write down what happened, each event at its own time."""
+        for event in events:
+            self._canvas.at(event["time_ns"])
+            level = "WARN" if event["kind"] in WARNINGS else "INFO"
+            self._canvas.log("events", rr.TextLog(in_words(event), level=level))
+
+
+def in_words(event: Mapping[str, Any]) -> str:
+    """An event in a line: `v03 died: how SIGKILL`."""
+    details = [f"{key} {_short(value)}" for key, value in event["details"].items()]
+    who = f"{event['node']} " if event["node"] else ""
+    what = event["kind"].replace("_", " ")
+    return drawable(f"{who}{what}: {', '.join(details)}" if details else f"{who}{what}")
+
+
+def _short(value: object) -> str:
+    text = str(value).translate(str.maketrans("", "", '"[]{}'))
+    return text if len(text) <= LONGEST_DETAIL else f"{text[: LONGEST_DETAIL - 1]}…"
+
+
+def draw_scale(canvas: Canvas, point_m: Floats) -> None:
+    """A bar with its length in words, below the map on the left."""
+    low, high = point_m.min(axis=0), point_m.max(axis=0)
+    length_m = nice_length(max(float(high[0] - low[0]) / 5, 1.0))
+    x, y = low[0], low[1] - max(0.08 * float(high[1] - low[1]), length_m / 10)
+    ends = [[[end, y - length_m / 30], [end, y + length_m / 30]] for end in (x, x + length_m)]
+    canvas.strip_style("map/scale/bar", GREY, 2.0)
+    canvas.strips("map/scale/bar", [[[x, y], [x + length_m, y]], *ends], static=True)
+    canvas.labels("map/scale/length", [[x + length_m / 2, y]], GREY, [in_length(length_m)])
+
+
+def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
+    """What the colours of the map mean, in a view of its own: two rows of points with their names."""
+    vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
+    never = impossible(scene)
+    links = [(outcome_title(one), colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
+    for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
+        place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
+        canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
+        colours = [list(colour) for _, colour in items]
+        canvas.point_style(f"legend/{entity}", colours, 5.0, [label for label, _ in items], show_labels=True)
+        canvas.points(f"legend/{entity}", place, static=True)
+
+
+def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
+    """The outcomes that nothing in this run can have, whatever faults there will be."""
+    scenario = tomllib.loads(scene["scenario"])
+    radio = scenario["radio"]
+    can_be = {
+        Outcome.faded: "path_loss" in radio,
+        Outcome.collided: "mac" in radio,
+        Outcome.held_back: "congestion" in radio,
+        Outcome.lost: radio["loss"] > 0,
+        Outcome.peer_cap: scene["max_peers"] < len(scene["node_ids"]) - 1,
+        Outcome.transport: scenario["run"]["pacing"] == "realtime",
+    }
+    return {outcome for outcome, is_possible in can_be.items() if not is_possible}
+
+
+def in_reach(radio: Mapping[str, Any]) -> str:
+    """Who hears whom, in words, by the scenario's section."""
+    if "path_loss" not in radio:
+        return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
+    stages = {"shadowing": "shadowing", "fading": "fading", "mac": "CSMA", "congestion": "congestion"}
+    words = [f"radio: {radio['path_loss']['kind'].replace('_', ' ')}"]
+    return ", ".join(words + [text for name, text in stages.items() if name in radio])
+
+
+def describe(scene: Mapping[str, Any]) -> str:
+    """A run in a heading and a line, as Markdown."""
+    scenario = tomllib.loads(scene["scenario"])
+    run, radio, program = scenario["run"], scenario["radio"], scenario["program"]
+    count = int(np.frombuffer(scene["component"], dtype="<i2").max()) + 1
+    fusion = program["options"].get("fusion")
+    at_first = " at first" if scene["moves"] else ""
+    parts = [
+        f"{len(scene['node_ids'])} vehicles in {count} component{'s' if count > 1 else ''}{at_first}",
+        program["entry"].removesuffix(":main") + (f" ({fusion})" if fusion else ""),
+        f"{in_reach(radio)}, loss {radio['loss']:.0%}, at most {scene['max_peers']} peers",
+        f"{run['pacing']}, {run['duration_s']:g} s, seed {run['seed']}",
+    ]
+    return f"### {drawable(scene['name'])}\n\n{drawable(' · '.join(parts))}"

@@ -1,0 +1,104 @@
+"""A Rerun recording of a run, from what the emulator tells observers.
+
+Few batched entities: one for all vehicles, one for all links, one for all particles. Periods are drawn several at
+a time. `blueprints` says how it is laid out; lengths are in metres, times in emulated seconds, east is right and
+north is up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
+
+import rerun as rr
+
+from emulator.viewer.blueprints import blueprint
+from emulator.viewer.drawing import Canvas, Period
+from emulator.viewer.overview_scene import OverviewScene
+from emulator.viewer.radio_scene import RadioScene
+from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
+from emulator.viewer.vehicle_scene import VehicleScene
+from vnet.errors import VnetError
+
+DRAWN_TOGETHER_S = 1.0
+"""Periods are drawn some at a time: ten take hardly longer than three that come apart."""
+NAMED = 8
+
+
+class Recorder:
+    """Writes into `sinks` as a context manager; `take` messages in order.
+
+    `missed` counts the periods that never came. Raises VnetError if the file cannot be written, or nobody is called
+    as the vehicle that `sinks` want to be looked at closely.
+    """
+
+    def __init__(self, sinks: Sinks, name: str) -> None:
+        self._stack = ExitStack()
+        self._recording = self._stack.enter_context(open_recording(sinks, name))
+        self._canvas = Canvas(self._recording)
+        self._vehicle = sinks.vehicle
+        self._overview: OverviewScene | None = None
+        self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
+        self._node_ids: list[str] = []
+        self._waiting: deque[Period] = deque()
+        self._last: int | None = None
+        self.missed = 0
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self.draw()
+        finally:
+            self._stack.close()
+
+    def take(self, stream: str, message: Mapping[str, Any]) -> None:
+        """Draw a message of `scene`, `period` or `end`; others, and periods before the first scene, are ignored."""
+        if stream == "scene" and not self._parts:
+            self._begin(message)
+        elif stream == "period" and self._parts:
+            self._waiting.append(Period(message, self._node_ids))
+            first_s = self._waiting[0].time_s
+            if self._last is None or self._waiting[-1].time_s - first_s > DRAWN_TOGETHER_S:
+                self.draw()
+        elif stream == "end" and self._overview is not None:
+            self.draw()
+            self._overview.events(message.get("events", []))
+
+    def _begin(self, scene: Mapping[str, Any]) -> None:
+        self._node_ids = scene["node_ids"]
+        vehicle = self._vehicle or self._node_ids[0]
+        if vehicle not in self._node_ids:
+            known = ", ".join(self._node_ids[:NAMED]) + (", …" if len(self._node_ids) > NAMED else "")
+            raise VnetError(f"no vehicle is called {vehicle}; there are {known}")
+        self._overview = OverviewScene(self._canvas, scene)
+        self._parts = [
+            self._overview,
+            RadioScene(self._canvas, scene),
+            VehicleScene(self._canvas, scene, vehicle),
+        ]
+        self._recording.send_blueprint(blueprint(vehicle))
+        self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
+
+    def draw(self) -> None:
+        """Draw the periods that wait, which `take` does only once there are some."""
+        while self._waiting:
+            period = self._waiting.popleft()
+            self._canvas.at(period.time_ns)
+            if self._last is not None and period.number > self._last + 1:
+                self._tell_gap(period.number - self._last - 1)
+            self._last = period.number
+            for part in self._parts:
+                part.period(period)
+        self._canvas.send()
+
+    def _tell_gap(self, count: int) -> None:
+        self.missed += count
+        text = f"{count} periods before this one are missing: the recording could not keep up"
+        self._canvas.log("events", rr.TextLog(text, level="ERROR"))

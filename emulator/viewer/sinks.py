@@ -1,0 +1,345 @@
+"""Where a recording goes: into a file, to those who look at it from elsewhere, to a window on this machine.
+
+Nothing of it listens on more than the loopback interface unless that is asked for. A viewer that is slow, or stands
+still, holds nothing up: what waits for it is bounded, and it is dropped when it no longer answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import ipaddress
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from vnet.errors import VnetError
+
+if TYPE_CHECKING:  # Rerun is slow to import, and only those who open a recording need it
+    import rerun
+
+CHOICES = ("spawn", "serve", "save", "off")
+RECORDING = "recording.rrd"
+LOOPBACK = "127.0.0.1"
+DEFAULT_PORT = 9876
+PORTS_TRIED = 50
+SERVER_MEMORY = "256MiB"
+"""What the server keeps for viewers that come late; the oldest goes first, what does not change stays."""
+VIEWER_MEMORY = "2GiB"
+CLOSE_TIMEOUT_S = 10.0
+_END_OF_A_CLOSED_FILE = b"RRF2FOOT"
+_ITS_NAME = "/__properties"
+
+
+@dataclass(frozen=True)
+class ServeAt:
+    """Where a recording is served: viewers connect to `port` of `address`, browsers to the one after it."""
+
+    address: str = LOOPBACK
+    port: int = DEFAULT_PORT
+
+    @property
+    def web_port(self) -> int:
+        """Where browsers find the viewer."""
+        return self.port + 1
+
+    @property
+    def host(self) -> str:
+        """What others call this machine, as it stands in an URL."""
+        address = ipaddress.ip_address(self.address)
+        if address.is_unspecified:
+            return socket.gethostname()
+        return f"[{self.address}]" if address.version == 6 else self.address
+
+    @property
+    def url(self) -> str:
+        """For the native viewer."""
+        return f"rerun+http://{self.host}:{self.port}/proxy"
+
+    @property
+    def web_url(self) -> str:
+        """For a browser."""
+        return f"http://{self.host}:{self.web_port}/?url={quote(self.url, safe='')}"
+
+    @property
+    def origin(self) -> str:
+        """The pages that may read what is served, as a pattern."""
+        host = "*" if ipaddress.ip_address(self.address).is_unspecified else self.host
+        return f"http://{host}:{self.web_port}"
+
+    def told(self) -> str:
+        """Both addresses, for people; with a warning where others than this machine can reach them."""
+        text = f"viewer: rerun --connect {self.url}\nbrowser: {self.web_url}"
+        if not ipaddress.ip_address(self.address).is_loopback:
+            text += f"\nwhoever can reach port {self.port} of this machine can watch"
+        return text
+
+
+@dataclass(frozen=True)
+class Sinks:
+    """Where a recording goes: `save` into a file, `serve` to viewers, `spawn` a viewer on this machine.
+
+    A spawned viewer looks at what is served. `vehicle` is the one that is looked at closely, by default the first.
+    """
+
+    save: Path | None = None
+    serve: ServeAt | None = None
+    spawn: bool = False
+    vehicle: str | None = None
+
+    def inside(self, folder: Path) -> Sinks:
+        """The same, saved in a run's folder."""
+        return self if self.save is None else replace(self, save=folder / self.save)
+
+    @property
+    def arguments(self) -> list[str]:
+        """These sinks as options of `vnet record`."""
+        words = [] if self.vehicle is None else ["--rerun-vehicle", self.vehicle]
+        if self.serve is not None:
+            words += ["--rerun", "spawn" if self.spawn else "serve"]
+            words += ["--rerun-bind", self.serve.address, "--rerun-port", str(self.serve.port)]
+        return words
+
+
+def choose_sinks(
+    words: Sequence[str],
+    address: str | None = None,
+    port: int | None = None,
+    vehicle: str | None = None,
+    live: bool = True,
+) -> Sinks | None:
+    """What `--rerun` and its companions ask for; None for nothing. Saved as `recording.rrd`.
+
+    Raises VnetError for what is not among the choices (or cannot be had of what is not `live`), where there is no
+    display for `spawn`, and where `address` and `port` cannot be listened at; without `port` the first that is
+    free is taken.
+    """
+    chosen = _chosen(words)
+    served = "serve" in chosen or "spawn" in chosen
+    if served and not live:
+        raise VnetError(
+            f"--rerun {','.join(chosen)}: a simulation is not watched: save it, and look at it with vnet view"
+        )
+    if "spawn" in chosen and not has_display():
+        raise VnetError(
+            "--rerun spawn: there is no display here (neither DISPLAY nor WAYLAND_DISPLAY is set); "
+            "use --rerun serve, and look from a browser"
+        )
+    if not served and (address is not None or port is not None):
+        raise VnetError("--rerun-bind and --rerun-port are for --rerun serve")
+    if not chosen:
+        return None
+    place = place_to_serve(address, port) if served else None
+    return Sinks(Path(RECORDING), place, "spawn" in chosen, vehicle)
+
+
+def _chosen(words: Sequence[str]) -> list[str]:
+    """What is written once or several times, one or several separated by commas; none for `off`."""
+    chosen = [word.strip() for several in words for word in several.split(",")]
+    for word in chosen:
+        if word not in CHOICES:
+            raise VnetError(f"--rerun {word}: one or more of {', '.join(CHOICES)} are allowed")
+    if "off" not in chosen:
+        return chosen
+    if set(chosen) != {"off"}:
+        raise VnetError(f"--rerun {','.join(chosen)}: off excludes the others")
+    return []
+
+
+def place_to_serve(address: str | None = None, port: int | None = None) -> ServeAt:
+    """Where a recording can be served; see `choose_sinks`. Raises VnetError."""
+    address = address or LOOPBACK
+    try:
+        ipaddress.ip_address(address)
+    except ValueError:
+        raise VnetError(
+            f"--rerun-bind {address}: an IP address of this machine is wanted (0.0.0.0 for all)"
+        ) from None
+    wanted = range(DEFAULT_PORT, DEFAULT_PORT + 2 * PORTS_TRIED, 2) if port is None else [port]
+    reason = ""
+    for first in wanted:
+        reason = _why_not(address, first) or _why_not(address, first + 1)
+        if not reason:
+            return ServeAt(address, first)
+    raise VnetError(f"--rerun-port {wanted[-1]}: cannot listen at {address}, this port and the next: {reason}")
+
+
+def _why_not(address: str, port: int) -> str:
+    """Why this port cannot be listened at; empty if it can."""
+    if not 0 < port < 65536:
+        return f"{port} is no port"
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    try:
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((address, port))
+            probe.listen()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def has_display() -> bool:
+    """Whether a window can be opened on this machine."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextmanager
+def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
+    """A recording called `name` that goes to all of `sinks`; closed cleanly at the end of the block.
+
+    The server of web pages ends with it; a spawned viewer stays, it is the user's. Raises VnetError if the file
+    cannot be written.
+    """
+    import rerun
+
+    with ExitStack() as stack:
+        recording = rerun.RecordingStream("vnet", recording_id=os.urandom(16).hex())
+        try:
+            recording.set_sinks(*_rerun_sinks(sinks))
+        except RuntimeError as error:
+            raise VnetError(f"{sinks.save}: cannot write the recording: {error}") from None
+        recording.set_log_time_enabled(False)  # emulated time is all that counts
+        stack.callback(recording.disconnect)
+        stack.callback(recording.flush, timeout_sec=CLOSE_TIMEOUT_S)
+        recording.send_recording_name(name)
+        if sinks.serve is not None:
+            stack.enter_context(_looked_at(sinks.serve, sinks.spawn))
+        yield recording
+
+
+def _rerun_sinks(sinks: Sinks) -> Iterator[rerun.FileSink | rerun.GrpcServerSink]:
+    import rerun
+
+    if sinks.save is not None:
+        yield rerun.FileSink(sinks.save)
+    if sinks.serve is not None:
+        yield rerun.GrpcServerSink(
+            bind_ip=sinks.serve.address,
+            port=sinks.serve.port,
+            server_memory_limit=SERVER_MEMORY,
+            cors_allow_origin=[sinks.serve.origin],
+        )
+
+
+@contextmanager
+def _looked_at(place: ServeAt, spawn: bool) -> Iterator[None]:
+    """The web viewer for as long as the block lasts, and a native one if `spawn`."""
+    if spawn:
+        local = replace(place, address=LOOPBACK) if ipaddress.ip_address(place.address).is_unspecified else place
+        native = viewer_command("--connect", local.url, "--memory-limit", VIEWER_MEMORY, "--hide-welcome-screen")
+        subprocess.Popen(native, stdin=subprocess.DEVNULL, start_new_session=True)
+    pages = viewer_command(
+        *("--serve-web", "--web-viewer-port", str(place.web_port), place.url), bind=place.address
+    )
+    with _running(pages):
+        yield
+
+
+TIED = [sys.executable, "-P", "-m", "emulator.viewer.die_with_parent"]
+"""Before a command: it ends with the process that starts it, however that ends."""
+
+
+def viewer_command(*arguments: str, bind: str = LOOPBACK) -> list[str]:
+    """Rerun's own program with these arguments; what it listens at by itself is bound to `bind`."""
+    return [_program(), "--bind", bind, *arguments]
+
+
+def _program() -> str:
+    """Rerun's own program. Its Python front end is passed by: ended by a signal, that would leave it behind."""
+    spec = importlib.util.find_spec("rerun_cli")
+    assert spec is not None and spec.submodule_search_locations, "rerun-sdk brings rerun_cli along"
+    folder = Path(spec.submodule_search_locations[0])
+    bundled = folder / "Rerun.app" / "Contents" / "MacOS" / "Rerun"
+    return str(bundled if bundled.exists() else folder / "rerun")
+
+
+def serve_file(path: Path, place: ServeAt) -> None:
+    """Serve a finished recording until Ctrl-C or SIGTERM."""
+    ports = ("--port", str(place.port), "--web-viewer-port", str(place.web_port))
+    origin = ("--cors-allow-origin", place.origin)
+    command = viewer_command("--serve-web", *ports, *origin, str(path), bind=place.address)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt), _running(command) as served:
+        served.wait()
+
+
+@contextmanager
+def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """A command for as long as the block lasts; of Rerun's only warnings are seen. Ctrl-C does not reach it."""
+    process = subprocess.Popen(
+        [*TIED, *command],
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "RUST_LOG": "warn"},
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(CLOSE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a recording was closed cleanly; the viewer opens no other."""
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(0, file.tell() - 16))
+        return _END_OF_A_CLOSED_FILE in file.read()
+
+
+def mended_path(path: Path) -> Path:
+    """Where the whole recording goes that is made of one that was not closed."""
+    return path.with_name(f"{path.stem}-mended{path.suffix}")
+
+
+def mending_command(path: Path) -> str:
+    """What makes a whole recording of one that was not closed, as one types it."""
+    return f"rerun {shlex.join(_mending(path))}"
+
+
+def mend(path: Path) -> Path:
+    """Make a whole recording of one that was not closed, and return where it is.
+
+    Raises VnetError if it cannot be mended, or there is nothing in it.
+    """
+    done = subprocess.run([_program(), *_mending(path)], capture_output=True, text=True)
+    if done.returncode:
+        last = (done.stderr.strip() or "nothing was said").splitlines()[-1]
+        raise VnetError(f"{path}: was not closed, and cannot be mended: {last}")
+    mended = mended_path(path)
+    if _is_empty(mended):
+        mended.unlink()
+        raise VnetError(
+            f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} makes it anew"
+        )
+    return mended
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether a closed recording has nothing in it but its name."""
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(str(path))
+    if not reader.recordings():
+        return True
+    return all(str(chunk.entity_path).startswith(_ITS_NAME) for chunk in reader.stream())
+
+
+def _mending(path: Path) -> list[str]:
+    return ["rrd", "optimize", "--continue-on-error", str(path), "-o", str(mended_path(path))]

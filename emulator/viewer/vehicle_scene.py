@@ -1,0 +1,141 @@
+"""One vehicle's part of a recording: where it is and thinks it is, what it believes, whom it hears and trusts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from emulator.radio.outcomes import Outcome
+from emulator.viewer.drawing import (
+    COMMON_RINGS_M,
+    GREEN,
+    GREY,
+    POSITION_RINGS_M,
+    RED,
+    SKY,
+    Canvas,
+    Period,
+    ellipses,
+    flipped,
+    link_states,
+    outcome_colours,
+)
+from emulator.viewer.radio_scene import WINDOW_S, Window, next_charts_s
+
+SLOW_EVERY_S = 1.0
+"""How often ellipses and neighbours are drawn."""
+LABELLED = 40
+"""As many neighbours have their names written beside them."""
+
+
+class VehicleScene:
+    """Draws one vehicle below `/vehicle`, from the scene and period messages of a run."""
+
+    def __init__(self, canvas: Canvas, scene: Mapping[str, Any], vehicle: str) -> None:
+        self._canvas = canvas
+        self._node_ids: list[str] = scene["node_ids"]
+        self._vehicle = vehicle
+        self._number = self._node_ids.index(vehicle)
+        periods = round(WINDOW_S * 1e9 / scene["period_ns"])
+        self._tried, self._heard = Window(periods), Window(periods)
+        self._weights = np.full(len(self._node_ids), np.nan)
+        self._next_s = self._next_slow_s = 0.0
+        self._set_styles()
+        canvas.rings("vehicle/position", POSITION_RINGS_M)
+        canvas.rings("vehicle/common", COMMON_RINGS_M)
+        reach_m: float | None = scene["range_m"]
+        if reach_m is not None:
+            canvas.rings("vehicle/hears", (reach_m / 3, reach_m * 2 / 3, reach_m), cross=False)
+        canvas.series("vehicle/errors", (("position", SKY, 2.0), ("common error", RED, 2.0)))
+        canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
+
+    def period(self, period: Period) -> None:
+        """Draw a period."""
+        self._errors(period)
+        self._frames(period)
+        weights = period.weights().get(self._vehicle)
+        if weights is not None:
+            self._weights = weights.copy()
+        if period.time_s >= self._next_s:
+            self._next_s = next_charts_s(period.time_s)
+            self._table(period)
+
+    def _set_styles(self) -> None:
+        canvas = self._canvas
+        canvas.point_style("vehicle/position/fix", GREY, 5.0)
+        for view in ("position", "common"):
+            canvas.point_style(f"vehicle/{view}/estimate", SKY, 6.0)
+            canvas.strip_style(f"vehicle/{view}/ellipse", SKY, 2.0)
+        canvas.point_style("vehicle/common/particles", GREY, 1.5)
+        canvas.strip_style("vehicle/hears/links", None, 2.0)
+        canvas.point_style("vehicle/hears/neighbours", None, 5.0)
+        canvas.point_style("vehicle/hears/self", SKY, 7.0, [self._vehicle], show_labels=True)
+        canvas.points("vehicle/hears/self", [[0.0, 0.0]], static=True)
+
+    def _errors(self, period: Period) -> None:
+        """Its position and its common error, as differences from the truth."""
+        canvas, one = self._canvas, slice(self._number, self._number + 1)
+        position = period.points("position_m")[one]
+        fix, estimate = period.points("fix_m")[one] - position, period.points("estimate_m")[one] - position
+        common = period.points("common_error_estimate_m")[one] - period.truth_m
+        canvas.points("vehicle/position/fix", fix)
+        canvas.points("vehicle/position/estimate", estimate)
+        canvas.points("vehicle/common/estimate", common)
+        cloud = period.clouds().get(self._vehicle)
+        if not period.up[self._number]:
+            cloud = np.empty((0, 2), dtype=np.float32)
+            self._weights[:] = np.nan
+        if cloud is not None:
+            canvas.points("vehicle/common/particles", cloud - period.truth_m)
+        canvas.plot("vehicle/errors", *(float(np.hypot(*error[0])) for error in (estimate, common)))
+        if period.time_s >= self._next_slow_s:
+            self._next_slow_s = period.time_s + SLOW_EVERY_S
+            covariance = period.covariances("covariance_m2")[one]
+            canvas.strips("vehicle/position/ellipse", ellipses(estimate, covariance))
+            covariance = period.covariances("common_error_covariance_m2")[one]
+            canvas.strips("vehicle/common/ellipse", ellipses(common, covariance))
+            self._neighbours(period)
+
+    def _neighbours(self, period: Period) -> None:
+        """Whom it hears: lines from those in range, coloured by what became of their frames."""
+        canvas, position = self._canvas, period.points("position_m")
+        place = position - position[self._number]
+        sender, receiver, state = link_states(period)
+        mine = receiver == self._number
+        sender, colour = sender[mine], outcome_colours(state[mine])
+        strips = np.stack([np.zeros((len(sender), 2), np.float32), place[sender]], axis=1)
+        canvas.strips("vehicle/hears/links", strips, colour)
+        names = rr.Points2D.from_fields(
+            positions=flipped(place[sender]),
+            colors=colour,
+            labels=[self._node_ids[number] for number in sender],
+            show_labels=len(sender) <= LABELLED,
+        )
+        canvas.log("vehicle/hears/neighbours", names)
+
+    def _frames(self, period: Period) -> None:
+        received = period.pairs[period.pairs[:, 1] == self._number]
+        got = received[received[:, 2] == Outcome.delivered, 3].sum()
+        self._canvas.plot("vehicle/frames", float(got), float(received[:, 3].sum() - got))
+        self._tried.add(np.bincount(received[:, 0], received[:, 3], len(self._node_ids)))
+        got_from = received[received[:, 2] == Outcome.delivered]
+        self._heard.add(np.bincount(got_from[:, 0], got_from[:, 3], len(self._node_ids)))
+
+    def _table(self, period: Period) -> None:
+        """Neighbours by weight: what was heard of each lately, and how much it counts in the fusion."""
+        tried, heard = self._tried.total, self._heard.total
+        numbers = [n for n in range(len(self._node_ids)) if tried[n] or self._weights[n] > 0]
+        numbers.sort(key=lambda n: (-np.nan_to_num(self._weights[n], nan=-1.0), -heard[n], n))
+        rows = [self._row(n, int(tried[n]), int(heard[n])) for n in numbers]
+        head = f"| hears | frames in {WINDOW_S:g} s | delivered | weight |\n|:--|--:|--:|--:|\n"
+        text = rr.TextDocument(head + "\n".join(rows), media_type=rr.MediaType.MARKDOWN)
+        self._canvas.log("vehicle/table", text)
+
+    def _row(self, number: int, tried: int, heard: int) -> str:
+        weight = self._weights[number]
+        share = f"{heard / tried:.0%}" if tried else "–"
+        name = self._node_ids[number] + (" (itself)" if number == self._number else "")
+        return f"| {name} | {tried or '–'} | {share} | {'–' if np.isnan(weight) else f'{weight:.3f}'} |"

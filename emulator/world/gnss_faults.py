@@ -1,0 +1,102 @@
+"""What the faults do to a vehicle's GNSS receiver and clock: functions of the plan and the time alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from emulator.faults.plan import PlannedFault, stream
+from emulator.scenario.faults import (
+    ConstPosOffset,
+    Drift,
+    GnssFault,
+    GnssFreeze,
+    GnssJump,
+    GnssOutage,
+    GnssRamp,
+    RandomPos,
+    Skew,
+)
+from emulator.world.world import Instant, World
+from vnet.node import Fix
+from vnet.transport.wire import ClockBend
+from vnet.types import Array
+from vnet.units import NS_PER_S
+
+
+class BentGnss:
+    """The fixes of a run as the receivers give them: the world's, and what faults make of them."""
+
+    def __init__(self, world: World, faults: Sequence[PlannedFault], seed: int) -> None:
+        self._world = world
+        self._faults = faults
+        self._seed = seed
+
+    def fix(self, period: int, number: int) -> Fix | None:
+        """The fix of vehicle `number` at the start of `period`; None in an outage."""
+        time_ns = period * self._world.period_ns
+        acting = [
+            planned
+            for planned in self._faults
+            if planned.acts_at(time_ns)
+            and isinstance(planned.fault, GnssFault)
+            and planned.placed(time_ns).nodes[number]
+        ]
+        fix = self._world.fix(period, number)
+        if not acting:
+            return fix
+        if any(isinstance(planned.fault, GnssOutage) for planned in acting):
+            return None
+        position_m = self._start(acting, fix, number)
+        for planned in acting:
+            position_m = self._moved(planned, position_m, time_ns, period, number)
+        return replace(fix, position_m=position_m)
+
+    def at(self, period: int) -> Instant:
+        """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""
+        instant = self._world.at(period)
+        if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
+            return instant
+        nothing = np.full(2, np.nan)
+        there = instant.present.tolist()
+        fixes = [self.fix(period, number) if here else None for number, here in enumerate(there)]
+        return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
+
+    def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
+        """The position that frozen receivers repeat: their last before the earliest freeze, or first since."""
+        frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
+        if not frozen:
+            return fix.position_m
+        last = max(0, math.ceil(min(frozen) / self._world.period_ns) - 1)
+        while not self._world.present(last)[number]:
+            last += 1
+        return self._world.fix(last, number).position_m
+
+    def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:
+        match planned.fault:
+            case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
+                return np.asarray(position_m + np.array(offset_m))
+            case GnssRamp(rate_m_s=rate_m_s):
+                return np.asarray(position_m + np.array(rate_m_s) * (time_ns - planned.start_ns) / NS_PER_S)
+            case RandomPos(radius_m=radius_m):
+                # A place of its own for each vehicle and period, whatever was drawn before.
+                draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
+                angle, away_m = 2 * math.pi * draws[0], radius_m * math.sqrt(draws[1])
+                return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
+            case _:
+                return position_m
+
+
+def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockBend:
+    """How the clock of a vehicle goes at `time_ns`: skews add up; drifts multiply, so that it never stands."""
+    acting = [planned for planned in faults if planned.acts_at(time_ns) and planned.nodes[number]]
+    offset_ns = sum(p.fault.offset_ms * 1e6 for p in acting if isinstance(p.fault, Skew))
+    drifts = [(p.start_ns, p.fault.rate_ppm / 1e6) for p in acting if isinstance(p.fault, Drift)]
+    pace, since_ns = 1.0, 0
+    for start_ns, rate in [*sorted(drifts), (time_ns, 0.0)]:
+        offset_ns += (pace - 1) * (start_ns - since_ns)
+        pace, since_ns = pace * (1 + rate), start_ns
+    return ClockBend(node, time_ns, round(offset_ns), pace - 1)

@@ -1,0 +1,358 @@
+"""The checks of a physical radio: what really happened is valid, and every breach of its rules is seen."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.radio.csma import Csma
+from emulator.radio.trace import read_trace
+from emulator.records.run_folder import RunFolder, read_events
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import build_world
+from vnet.errors import VnetError
+
+LOG_DISTANCE = {"kind": "log_distance", "tx_power_dbm": 33.0}
+Change = Callable[[dict[str, Any], np.ndarray], None]
+"""Changes the trace's columns, given which rows arrived."""
+
+
+def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) -> Evidence:
+    """Twelve beacons within four kilometres for three seconds."""
+    scenario = Scenario.model_validate(
+        {
+            "run": {"duration_s": 3.0, "settle_s": 0.5},
+            "network": {"vehicles": 12, "layout": "dense"},
+            "program": {"entry": "agents.beacon:main"},
+            "radio": {"access_jitter_ms": 5.0, "path_loss": LOG_DISTANCE, **radio},
+            "fault": faults or [],
+        }
+    )
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    wall_s, _ = simulate(emulation)
+    conclude(emulation, wall_s, "simulate")
+    states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
+    busy = pq.read_table(folder / "busy.parquet") if "mac" in radio else None
+    return Evidence(scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder), busy=busy)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    return run(tmp_path_factory.mktemp("shared") / "run", mac={})
+
+
+@pytest.fixture(scope="module")
+def faded(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    return run(tmp_path_factory.mktemp("faded") / "run", fading={}, shadowing={}, mac={}, loss=0.1)
+
+
+def found(evidence: Evidence, name: str) -> CheckResult | NotExercised:
+    judgement = judge(evidence)
+    return next(check for check in [*judgement.checks, *judgement.not_exercised] if check.name == name)
+
+
+def verdict(evidence: Evidence, name: str) -> Verdict:
+    check = found(evidence, name)
+    assert isinstance(check, CheckResult), check
+    return check.verdict
+
+
+def changed(evidence: Evidence, change: Change) -> Evidence:
+    """The evidence with some columns of the trace changed."""
+    trace = evidence.trace
+    names = ("sent_ns", "on_air_ns", "left_ns", "arrival_ns", "outcome")
+    columns = {
+        name: trace[name].cast(pa.string() if name == "outcome" else pa.int64()).to_pylist() for name in names
+    }
+    change(columns, np.flatnonzero(evidence.arrived))
+    for name, values in columns.items():
+        column = pa.array(values, pa.string()).dictionary_encode() if name == "outcome" else pa.array(values)
+        trace = trace.set_column(trace.column_names.index(name), name, column)
+    return replace(evidence, trace=trace)
+
+
+def became(columns: dict[str, Any], row: int, outcome: str) -> None:
+    """Another outcome, that does not arrive."""
+    columns["outcome"][row], columns["arrival_ns"][row] = outcome, None
+
+
+def test_what_really_happened_is_valid(shared: Evidence, faded: Evidence) -> None:
+    for evidence in (shared, faded):
+        judgement = judge(evidence)
+        assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
+        assert {"fading", "medium", "latency", "range"} <= {check.name for check in judgement.checks}
+        assert evidence.outcome_is("collided").sum() > 10
+
+
+def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
+    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "program": {"entry": "agents.beacon:main"}})
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    judgement, _ = conclude(emulation, 1.0, "simulate")
+    left = {check.name: check.reason for check in judgement.not_exercised}
+    assert "no power" in left["fading"]
+    assert "no medium" in left["medium"]
+    assert not (tmp_path / "run" / "busy.parquet").exists()
+
+
+def test_without_a_medium_only_the_fading_is_judged(tmp_path: Path) -> None:
+    evidence = run(tmp_path / "run", fading={})
+    assert verdict(evidence, "fading") is Verdict.VALID
+    assert isinstance(found(evidence, "medium"), NotExercised)
+    judgement = judge(evidence)
+    assert judgement.verdict is Verdict.VALID, judgement.checks
+
+
+def test_a_run_in_which_nobody_speaks_is_unknown_and_not_valid(shared: Evidence) -> None:
+    silent = replace(shared, trace=shared.trace.slice(0, 0))
+    assert verdict(silent, "fading") is Verdict.UNKNOWN
+    assert verdict(silent, "medium") is Verdict.UNKNOWN
+
+
+def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: Evidence) -> None:
+    hopeless = np.flatnonzero(shared.outcome_is("faded"))[0]
+
+    def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
+        columns["outcome"][hopeless] = "delivered"
+        columns["arrival_ns"][hopeless] = columns["left_ns"][hopeless] + 2_500_000
+
+    broken = found(changed(shared, arrives), "fading")
+    assert broken.verdict is Verdict.INVALID
+    assert broken.figures["impossible"] == 1
+    assert broken.figures["rows"][0]["outcome"] == "delivered"
+    certain = changed(shared, lambda columns, arrived: became(columns, arrived[0], "faded"))
+    assert found(certain, "fading").figures["impossible"] == 1
+
+
+def test_with_fading_any_pair_may_do_anything_once(faded: Evidence) -> None:
+    weakest = np.flatnonzero(faded.outcome_is("faded"))[0]
+
+    def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
+        columns["outcome"][weakest] = "delivered"
+        columns["arrival_ns"][weakest] = columns["left_ns"][weakest] + 2_500_000
+
+    assert verdict(changed(faded, arrives), "fading") is Verdict.VALID
+
+
+def test_too_much_fading_is_seen(faded: Evidence) -> None:
+    def fade(columns: dict[str, Any], arrived: np.ndarray) -> None:
+        for row in arrived[::4].tolist():
+            became(columns, row, "faded")
+
+    assert verdict(changed(faded, fade), "fading") is Verdict.INVALID
+
+
+def test_another_law_than_the_scenarios_is_seen(faded: Evidence) -> None:
+    """The same trace, but a scenario in which senders are 2 dB stronger, or in which nothing is in the way."""
+    for update in ({"path_loss": {**LOG_DISTANCE, "tx_power_dbm": 35.0}}, {"shadowing": None}):
+        data = faded.scenario.model_dump()
+        data["radio"] = {**data["radio"], **update}
+        other = replace(faded, scenario=Scenario.model_validate(data))
+        assert verdict(other, "fading") is Verdict.INVALID
+
+
+def test_a_collision_needs_somebody_to_collide_with(shared: Evidence) -> None:
+    """A pair whose frame was alone on air."""
+    began, left = shared.on_air_ns, shared.column("left_ns")
+    alone = next(
+        row
+        for row in np.flatnonzero(shared.outcome_is("delivered")).tolist()
+        if not ((began < left[row]) & (left > began[row]) & (shared.emission != shared.emission[row])).any()
+    )
+    broken = found(changed(shared, lambda columns, _: became(columns, alone, "collided")), "medium")
+    assert broken.verdict is Verdict.INVALID
+    assert broken.figures["collided_alone"] == 1
+
+
+def test_nobody_hears_while_it_sends(shared: Evidence) -> None:
+    began, left = shared.on_air_ns, shared.column("left_ns")
+    deaf = next(
+        row
+        for row in np.flatnonzero(shared.outcome_is("collided")).tolist()
+        if ((shared.sender == shared.receiver[row]) & (began < left[row]) & (left > began[row])).any()
+    )
+
+    def hears(columns: dict[str, Any], _: np.ndarray) -> None:
+        columns["outcome"][deaf] = "delivered"
+        columns["arrival_ns"][deaf] = columns["left_ns"][deaf] + 2_500_000
+
+    assert found(changed(shared, hears), "medium").figures["heard_while_sending"] == 1
+
+
+def moved(evidence: Evidence, row: int, by_ns: int) -> Evidence:
+    """The frame of a row was on air at another time."""
+    rows = np.flatnonzero(evidence.emission == evidence.emission[row])
+
+    def move(columns: dict[str, Any], _: np.ndarray) -> None:
+        for each in rows.tolist():
+            for name in ("on_air_ns", "left_ns", "arrival_ns"):
+                if columns[name][each] is not None:
+                    columns[name][each] += by_ns
+
+    return changed(evidence, move)
+
+
+def test_who_talks_while_another_is_heard_breaks_the_rules(shared: Evidence) -> None:
+    """The second of two frames that follow each other begins 20 µs after the first."""
+    order = np.argsort(shared.on_air_ns, kind="stable")
+    first = next(
+        row
+        for row, after in zip(order, np.roll(order, -1), strict=True)
+        if shared.sender[row] != shared.sender[after]
+        and 300_000 < shared.on_air_ns[after] - shared.on_air_ns[row] < 900_000
+        and shared.sent_ns[after] < shared.on_air_ns[row]
+    )
+    second = np.roll(order, -1)[np.flatnonzero(order == first)[0]]
+    early = moved(shared, second, int(shared.on_air_ns[first] + 20_000 - shared.on_air_ns[second]))
+    assert found(early, "medium").figures["into_others"] > 0
+
+
+def test_a_sender_pauses_between_its_frames(shared: Evidence) -> None:
+    again = np.flatnonzero(shared.seq == 1)[0]
+    last = np.flatnonzero((shared.sender == shared.sender[again]) & (shared.seq == 0))[0]
+    by_ns = int(shared.column("left_ns")[last] + 50_000 - shared.on_air_ns[again])
+
+    def early(columns: dict[str, Any], _: np.ndarray) -> None:
+        for row in np.flatnonzero(shared.emission == shared.emission[again]).tolist():
+            for name in columns:
+                if name != "outcome" and columns[name][row] is not None:
+                    columns[name][row] += by_ns
+
+    assert found(changed(shared, early), "medium").figures["without_pause"] == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "by_ns"), [("on_air_ns", -6_000_000), ("left_ns", -1), ("left_ns", 1), ("on_air_ns", None)]
+)
+def test_frames_are_on_air_for_their_airtime_after_they_are_sent(shared: Evidence, name: str, by_ns: int) -> None:
+    def change(columns: dict[str, Any], arrived: np.ndarray) -> None:
+        row = int(arrived[5])
+        columns[name][row] = None if by_ns is None else columns[name][row] + by_ns
+
+    assert found(changed(shared, change), "medium").figures["mistimed"] >= 1
+
+
+def test_arrivals_are_held_to_the_end_of_the_transmission(shared: Evidence) -> None:
+    def late(columns: dict[str, Any], arrived: np.ndarray) -> None:
+        columns["arrival_ns"][int(arrived[3])] += 1_100_000
+
+    def shifted(columns: dict[str, Any], arrived: np.ndarray) -> None:
+        for row in arrived.tolist():
+            columns["arrival_ns"][row] -= 100_000
+
+    assert found(changed(shared, late), "latency").figures["late"] == 1
+    assert verdict(changed(shared, shifted), "latency") is Verdict.INVALID
+
+
+def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: Evidence) -> None:
+    assert shared.busy is not None
+    ratio = pc.multiply(shared.busy["busy_ratio"], 0.001)
+    idle = shared.busy.set_column(2, "busy_ratio", ratio)
+    assert found(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
+
+
+def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:
+    """Carrier sense above all that anybody sends with: Aloha."""
+    evidence = run(tmp_path / "run", mac={"carrier_sense_dbm": 40.0})
+    judgement = judge(evidence)
+    assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
+    airtime_ns = np.bincount(evidence.sender, evidence.airtime_ns * (evidence.on_air_ns >= 0), minlength=12)
+    assert airtime_ns.min() > 0
+    assert evidence.busy_ratio.sum(axis=0).min() > 0
+
+
+def test_frames_held_back_too_briefly_are_seen(tmp_path: Path) -> None:
+    pauses = {"kind": "etsi", "pause_ms": (250, 250, 250, 250, 250)}
+    held = run(tmp_path / "run", mac={}, congestion=pauses)
+    assert judge(held).verdict is Verdict.VALID
+    assert held.outcome_is("held_back").sum() > 100
+    data = held.scenario.model_dump()
+    data["radio"]["congestion"]["pause_ms"] = (400,) * 5
+    longer = replace(held, scenario=Scenario.model_validate(data))
+    assert found(longer, "medium").figures["without_pause"] > 10
+
+
+def test_a_busy_table_that_cannot_be_read_is_said_in_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    run(folder, mac={})
+    assert check_run(folder).verdict is Verdict.VALID
+    path = folder / "busy.parquet"
+    table = pq.read_table(path)
+    spoilt = (
+        (table.drop_columns(["node"]), "has the columns"),
+        (table.slice(1), "not those of 12 vehicles"),
+        (table.set_column(1, "node", pa.array(["x"] * len(table))), "not those of 12 vehicles"),
+    )
+    for wrong, text in spoilt:
+        pq.write_table(wrong, path)
+        with pytest.raises(VnetError, match=text):
+            check_run(folder)
+    path.write_bytes(b"nothing")
+    with pytest.raises(VnetError, match=r"busy\.parquet: cannot be read"):
+        check_run(folder)
+    path.unlink()
+    with pytest.raises(VnetError, match=r"there is no busy\.parquet in it"):
+        check_run(folder)
+
+
+# Faults on a physical radio.
+
+FAULTS: list[dict[str, Any]] = [
+    {"kind": "block", "senders": {"ids": ["v01"]}, "receivers": {"ids": ["v02", "v03"]}},
+    {"kind": "range", "nodes": {"ids": ["v04"]}, "range_m": 600.0},
+    {"kind": "loss", "probability": 0.3},
+    {"kind": "burst_loss", "senders": {"ids": ["v05", "v06"]}, "enter": 0.3, "leave": 0.3},
+    {"kind": "partition", "groups": "halves"},
+    {"kind": "delay", "delay_ms": 40.0},
+    {"kind": "duplicate", "probability": 0.5, "copies": 2, "delay_ms": 5.0},
+    {"kind": "corrupt", "probability": 0.5, "flips": 3},
+    {"kind": "throttle", "nodes": {"ids": ["v01", "v02"]}, "bitrate_mbps": 0.02},
+    {"kind": "DoS", "nodes": {"ids": ["v03"]}, "factor": 5},
+    {"kind": "Sybil", "nodes": {"ids": ["v03"]}, "ghosts": 2},
+    {"kind": "DataReplay", "nodes": {"ids": ["v07"]}, "age_s": 0.5},
+    {"kind": "StaleMessages", "nodes": {"ids": ["v07"]}, "age_s": 0.5},
+    {"kind": "kill", "nodes": {"ids": ["v08"]}},
+    {"kind": "pause", "nodes": {"ids": ["v09"]}},
+]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=[fault["kind"] for fault in FAULTS])
+def test_a_fault_acts_on_a_shared_medium_as_it_says(tmp_path: Path, fault: dict[str, Any]) -> None:
+    evidence = run(
+        tmp_path / "run", [{"at_s": 0.9, "duration_s": 1.2, **fault}], fading={}, mac={}, access_jitter_ms=60.0
+    )
+    judgement = judge(evidence)
+    assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
+    bit = next(check for check in judgement.checks if check.name == f"bit:{fault['kind']}-0")
+    assert bit.figures["count"] > 0
+
+
+def test_a_throttle_that_does_nothing_did_not_bite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that wait as long for their jitter are none that it slowed."""
+    monkeypatch.setattr(Csma, "throttle", lambda *_: None)
+    throttle = {"kind": "throttle", "at_s": 0.9, "duration_s": 1.2, "nodes": {"ids": ["v01", "v02"]}}
+    evidence = run(tmp_path / "run", [{**throttle, "bitrate_mbps": 3.0}], fading={}, mac={}, access_jitter_ms=60.0)
+    assert verdict(evidence, "bit:throttle-0") is Verdict.UNKNOWN
+
+
+def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> None:
+    """A block takes the words and not the signal: as many pairs collide, though nobody hears v01's."""
+    block = {"kind": "block", "at_s": 0.0, "duration_s": 2.5, "senders": {"ids": ["v01"]}}
+    plain, blocked = run(tmp_path / "a", mac={}), run(tmp_path / "b", [block], mac={})
+    assert np.array_equal(plain.on_air_ns, blocked.on_air_ns)
+    others = (plain.sender != 0) & (plain.sent_ns < 2_500_000_000)
+    assert (
+        plain.trace["outcome"].to_numpy()[others].tolist() == blocked.trace["outcome"].to_numpy()[others].tolist()
+    )
+    mine = (blocked.sender == 0) & (blocked.sent_ns < 2_500_000_000)
+    assert set(blocked.trace["outcome"].to_numpy()[mine]) == {"fault"}

@@ -1,0 +1,112 @@
+"""Two runs are compared row by row, and the first that differs is shown; also as users ask for it."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from rich.console import Console
+
+from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
+from emulator.checks.replay import compare
+from emulator.records.metrics import STATES
+from emulator.terminal.summary import print_checks
+from tests.emulator.checks.test_faults import with_cells
+from tests.emulator.checks.test_judge import first, four, result, with_names
+from tests.support.paths import ROOT
+from vnet.node import Node
+
+
+async def throws_dice(node: Node) -> None:
+    """From the third fix on, one vehicle says what no seed decides."""
+    async for fix in node.gnss:
+        dice = node.id == "v02" and fix.time_ns >= 300_000_000
+        await node.radio.broadcast(os.urandom(8) if dice else b"nothing")
+
+
+@pytest.fixture(scope="module")
+def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    return four(tmp_path_factory.mktemp("replay"))
+
+
+def compared(evidence: Evidence, **again: pa.Table) -> CheckResult:
+    tables = {name: getattr(evidence, name) for name in ("trace", "states", "metrics")}
+    found = compare([(name, table, again.get(name, table)) for name, table in tables.items()])
+    assert isinstance(found, CheckResult)
+    return found
+
+
+def test_runs_that_agree_are_valid_though_a_number_is_none(evidence: Evidence) -> None:
+    rows = evidence.states.to_pylist()
+    rows[3]["fix_m"] = [float("nan"), 1.0]
+    with_nan = replace(evidence, states=pa.Table.from_pylist(rows, schema=STATES))
+    assert compared(with_nan, states=pa.Table.from_pylist(rows, schema=STATES)).verdict is Verdict.VALID
+
+
+@pytest.mark.parametrize(("column", "value"), [("arrival_ns", 1), ("payload_digest", 1), ("outcome", "lost")])
+def test_the_first_row_that_differs_is_shown_from_both_runs(evidence: Evidence, column: str, value: object) -> None:
+    row = first(evidence, "delivered")
+    found = compared(evidence, trace=with_cells(evidence.trace, column, [row, len(evidence.trace) - 1], value))
+    assert found.verdict is Verdict.INVALID
+    assert (found.figures["table"], found.figures["row"]) == ("trace", row)
+    assert column in found.figures["differing"]
+    assert [shown["run"] for shown in found.figures["rows"]] == ["first", "again"]
+
+
+def test_a_row_that_only_one_run_has_is_a_difference(evidence: Evidence) -> None:
+    found = compared(evidence, trace=evidence.trace.slice(0, len(evidence.trace) - 1))
+    assert found.figures["row"] == len(evidence.trace) - 1
+    assert "no such row" in found.text
+
+
+def test_a_state_that_differs_is_found_where_the_traces_agree(evidence: Evidence) -> None:
+    rows = evidence.states.to_pylist()
+    rows[7]["estimate_m"] = [0.0, 0.0]
+    found = compared(evidence, states=pa.Table.from_pylist(rows, schema=STATES))
+    assert (found.figures["table"], found.figures["row"]) == ("states", 7)
+    assert found.figures["differing"] == ["estimate_m"]
+
+
+def test_a_run_that_was_had_once_does_not_say_whether_it_replays(evidence: Evidence) -> None:
+    assert isinstance(result(evidence, "replay"), NotExercised)
+
+
+def test_a_failed_check_prints_its_rows_and_the_command(evidence: Evidence) -> None:
+    forged = with_names(evidence.trace, "receiver", first(evidence, "lost"), "v0")
+    printed = StringIO()
+    console = Console(file=printed, width=200)
+    print_checks(judge(replace(evidence, trace=forged)), console, "vnet simulate here/scenario.toml")
+    lines = printed.getvalue().splitlines()
+    start = lines.index(next(line for line in lines if line.startswith("conservation: the first offending rows")))
+    assert lines[start + 1].split()[:4] == ["sent_ns", "sender", "seq", "receiver"]
+    assert lines[-1].startswith("to see this again: ")
+    assert lines[-1].endswith("vnet simulate here/scenario.toml")
+
+
+@pytest.mark.parametrize(("program", "status"), [("agents.beacon:main", 0), (f"{__name__}:throws_dice", 1)])
+def test_a_simulation_is_had_twice_and_judged_again(tmp_path: Path, program: str, status: int) -> None:
+    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", "scenarios/beacon.toml"]
+    options = ["--duration", "1", "--program", program, "--out", str(tmp_path / "run"), "--check-determinism"]
+    environment = {**os.environ, "PYTHONHASHSEED": "0"}  # it need not start itself anew for that
+    done = subprocess.run(
+        [*command, *options], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == status, done.stderr
+    written = json.loads((tmp_path / "run" / "verdict.json").read_text())
+    replay = next(check for check in written["checks"] if check["name"] == "replay")
+    assert (written["verdict"] == "invalid", replay["verdict"] == "invalid") == (status == 1, status == 1)
+    assert written["reproduce"].endswith("--check-determinism")
+    assert check_run(tmp_path / "run").exit_status == status
+
+
+def test_in_real_time_no_two_runs_are_compared(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "emulator.cli", "run", "scenarios/beacon.toml"]
+    options = ["--pacing", "realtime", "--out", str(tmp_path / "run"), "--check-determinism"]
+    done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "use --pacing lockstep" in done.stderr

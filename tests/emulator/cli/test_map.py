@@ -1,0 +1,102 @@
+"""`vnet map`: what it says of a map, its picture, and what it writes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from emulator.world.maps.files import read_roads
+from emulator.world.maps.problems import examine
+from emulator.world.maps.roads import RoadsBuilder
+from tests.support import maps
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    path = tmp_path / "town.geojson"
+    path.write_text(maps.geojson())
+    return path
+
+
+def vnet_map(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["map", *map(str, arguments)], env={"COLUMNS": "100"})
+    return result.exit_code, result.output
+
+
+def test_show_says_how_long_roads_are_and_what_is_odd(town: Path) -> None:
+    status, text = vnet_map("show", town, "--origin", "42.28,-83.74")
+    assert status == 0
+    assert "town.geojson: 0.4 × 0.2 km, 2 roads, 4 points" in text
+    assert "0.6 km of road, 0.1 km one way; 0.9 km of lane" in text or "0.5 km of road" in text
+    assert "its metres start at 42.280000, -83.740000" in text
+    assert "dead ends: 3" in text
+
+
+def test_show_draws_a_picture(town: Path, tmp_path: Path) -> None:
+    status, text = vnet_map("show", town, "--out", tmp_path / "town.png")
+    assert status == 0 and f"wrote {tmp_path / 'town.png'}" in text.replace("\n", "")
+    assert (tmp_path / "town.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_show_a_part(town: Path) -> None:
+    arguments = ("--origin", "42.28,-83.74", "--side-km", "0.1")
+    assert "1 roads, 2 points" in vnet_map("show", town, "--at", "200,120", *arguments)[1]
+    status, text = vnet_map("show", town, "--at", "9000,0", *arguments)
+    assert status == 2 and "no road within 0.1 km around --at 9000,0" in text
+
+
+def test_convert_writes_what_show_reads(town: Path, tmp_path: Path) -> None:
+    assert vnet_map("convert", town, tmp_path / "town.npz") == (0, f"wrote {tmp_path / 'town.npz'}\n")
+    assert read_roads(tmp_path / "town.npz").length_m.sum() == pytest.approx(550, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--origin", "42"), "--origin 42: two numbers with a comma between them are needed"),
+        (("--origin", "a,b"), "--origin a,b: two numbers"),
+        (("--origin", "-83.74,42.28,1"), "two numbers"),
+        (("--origin", "142.28,-83.74"), "latitudes are within ±90"),
+        (("--at", "nan,0"), "--at nan,0: two numbers"),
+        (("--out", "town.shp"), "--out town.shp: cannot be written"),
+        (("--out", "no/such/folder/town.png"), "cannot be written"),
+    ],
+)
+def test_what_cannot_be_is_said(
+    town: Path, arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, text = vnet_map("show", town, *arguments)
+    assert status == 2 and said in text
+
+
+def test_a_file_that_cannot_be_written_is_known_before_the_map_is_read(tmp_path: Path) -> None:
+    status, text = vnet_map("convert", tmp_path / "none.npz", tmp_path / "town.shp")
+    assert status == 2 and "town.shp: no kind of map is called so; allowed are *.geojson" in text
+
+
+def test_problems_of_a_map_are_found() -> None:
+    builder = RoadsBuilder("town")
+    lines = [
+        [(0.0, 0.0), (100.0, 0.0)],
+        [(0.0, 0.0), (100.0, 0.0)],  # once more
+        [(100.5, 0.0), (200.0, 0.0)],  # begins half a metre after the first ends
+        [(0.0, 500.0), (3000.0, 500.0)],  # far from all
+    ]
+    for line in lines:
+        builder.add("road", [(point, point) for point in line], 0, (1, 1), 3.0)
+    builder.add("road", [(1, (0.0, 0.0)), (2, (0.0, 0.0))], 0, (1, 1), 3.0)  # two points at one place
+    found = examine(builder.build(builder.places(), None)).problems
+    assert found["segments under another"] == "1"
+    assert found["segments without length"] == "1"
+    assert found["isolated pieces"].startswith("3, 0.3 km") or found["isolated pieces"].startswith("3, ")
+    assert any(what.startswith("ends within 1 m") for what in found)
+
+
+def test_a_map_without_problems_has_none() -> None:
+    builder = RoadsBuilder("ring")
+    ring = [(100 * float(np.cos(a)), 100 * float(np.sin(a))) for a in np.linspace(0, 6, 20)]
+    builder.add("ring", [(point, point) for point in [*ring, ring[0]]], 0, (1, 1), 3.0)
+    assert examine(builder.build(builder.places(), None)).problems == {}

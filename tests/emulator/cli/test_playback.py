@@ -1,0 +1,150 @@
+"""`vnet render` and `vnet play`, as one types them: what they make, what they refuse, and how they end."""
+
+import shutil
+import signal
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from emulator.scenario.scenario import Scenario
+from emulator.viewer.recorder import Recorder
+from emulator.viewer.sinks import Sinks
+from tests.emulator.stream.test_playback import Watched, watch
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
+    scenario = Scenario.model_validate(
+        {
+            "run": {"duration_s": 2.0, "settle_s": 0.5, "name": "watched"},
+            "network": {"vehicles": 4},
+            "program": {"entry": "agents.cooperative:main", "options": {"particles": 40}},
+            "fault": [{"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"random": 1}}],
+        }
+    )
+    watched = watch(scenario, tmp_path_factory.mktemp("cli") / "run")
+    with Recorder(Sinks(save=watched.folder / "live.rrd"), "watched") as recorder:
+        for stream, message in watched.told:
+            recorder.take(stream, message)
+    return watched
+
+
+def contents(path: Path) -> dict[tuple[str, str], list[str]]:
+    """All that a recording holds, by entity and component, with its emulated time."""
+    found: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for chunk in RrdReader(path).stream().to_chunks():
+        rows = chunk.to_record_batch()
+        timeless = [None] * len(rows)
+        times = (
+            rows["emulated time"].cast("int64").to_pylist() if "emulated time" in rows.schema.names else timeless
+        )
+        for name in set(rows.schema.names) - {"rerun.controls.RowId", "emulated time"}:
+            found[str(chunk.entity_path), name] += [
+                f"{time_ns} {value}" for time_ns, value in zip(times, rows[name].to_pylist(), strict=True) if value
+            ]
+    return {column: sorted(rows) for column, rows in found.items()}
+
+
+def vnet(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    return result.exit_code, result.output
+
+
+def test_what_is_rendered_is_what_was_recorded_live(watched: Watched, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for path in watched.folder.iterdir():
+        if path.suffix != ".rrd" and path.is_file():
+            shutil.copy(path, folder)
+    events = (folder / "events.jsonl").read_text().splitlines()
+    assert '"ended"' in events[-1], "written when nobody watched any more"
+    (folder / "events.jsonl").write_text("\n".join(events[:-1]) + "\n")
+    assert vnet("render", folder) == (0, f"{folder / 'recording.rrd'}\n{folder / 'report.html'}\n")
+    verify = [sys.executable, "-P", "-m", "rerun", "rrd", "verify", str(folder / "recording.rrd")]
+    assert subprocess.run(verify, capture_output=True).returncode == 0
+    live, again = contents(watched.folder / "live.rrd"), contents(folder / "recording.rrd")
+    assert live.keys() == again.keys()
+    assert "Points2D:positions" in {component for _, component in live}
+    differing = [column for column in live if live[column] != again[column]]
+    assert differing == [("/__properties", "RecordingInfo:start_time")], "when it was drawn, on the wall clock"
+
+
+def test_a_recording_may_be_put_elsewhere(watched: Watched, tmp_path: Path) -> None:
+    out = tmp_path / "mine.rrd"
+    assert vnet("render", watched.folder, "--out", out) == (0, f"{out}\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.rrd"]
+
+
+def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(watched.folder, tmp_path / "run"))
+    (folder / "recording.rrd").write_bytes(b"old")
+    states = folder / "states.parquet"
+    whole = states.read_bytes()
+    states.write_bytes(whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2 - 1000) + whole[-1000:])
+    status, output = vnet("render", folder)
+    assert status == 2
+    assert "states.parquet" in output
+    assert (folder / "recording.rrd").read_bytes() == b"old"
+    assert not [path for path in folder.iterdir() if path.name.endswith(".part")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["play", "RUN", "--speed", "0"], "--speed 0: more than 0"),
+        (["play", "RUN", "--speed", "nan"], "--speed nan: more than 0"),
+        (["play", "RUN", "--from", "3"], "--from 3: the run is over at 2 s"),
+        (["play", "RUN", "--from", "1", "--to", "1"], "--to 1: must come after --from 1"),
+        (["play", "NOWHERE"], "not a run's folder"),
+        (["render", "NOWHERE"], "not a run's folder"),
+        (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no vehicle is called v77"),
+        (["render", "RUN", "--out", "NOWHERE/x.rrd"], "there is no folder"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(
+    watched: Watched, tmp_path: Path, arguments: list[str], told: str
+) -> None:
+    places = {"RUN": str(watched.folder), "NOWHERE": str(tmp_path / "nowhere")}
+    given = [next((a.replace(k, v) for k, v in places.items() if k in a), a) for a in arguments]
+    status, output = vnet(*given)
+    assert status == 2
+    assert told in output
+    assert output.count("\n") == 1
+
+
+@contextmanager
+def playing(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-P", "-m", "emulator.cli", "play", str(folder), "--serve", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def until(process: subprocess.Popen[str], beginning: str) -> None:
+    assert process.stdout is not None
+    assert any(line.startswith(beginning) for line in process.stdout), "it ended before"
+
+
+def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
+    with playing(watched.folder, "--speed", "inf") as process:
+        until(process, "played")
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals) -> None:
+    with playing(watched.folder, "--speed", "0.001", "--from", "0.5") as process:
+        until(process, "playing")
+        process.send_signal(end)
+        assert process.wait(30) == 0

@@ -1,0 +1,26 @@
+"""Processes that a run starts: where they stand among the others of the machine."""
+
+import os
+from pathlib import Path
+
+from emulator.drivers.launch import Launcher
+
+SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
+
+
+def test_a_process_has_its_own_group_in_the_session_of_who_starts_it(tmp_path: Path) -> None:
+    """Ctrl-C must not reach it; and Linux gives processor time to sessions first, then to processes by niceness."""
+    launcher = Launcher(tmp_path)
+    launcher.start("v1", ["-c", SAY], None, {})
+    launcher.wait_for("v1", 60.0)
+    launcher.stop()
+    assert launcher.log_tail("v1").split() == [str(os.getsid(0)), "True"]
+
+
+def test_what_must_not_starve_has_a_session_of_its_own(tmp_path: Path) -> None:
+    launcher = Launcher(tmp_path)
+    launcher.start("recorder", ["-c", SAY], None, {}, own_session=True)
+    pid = launcher.pids["recorder"]
+    launcher.wait_for("recorder", 60.0)
+    launcher.stop()
+    assert launcher.log_tail("recorder").split() == [str(pid), "True"]

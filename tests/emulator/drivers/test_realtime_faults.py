@@ -1,0 +1,108 @@
+"""Faults on the wall clock, without one: what the pacing tells the driver and the processes."""
+
+from typing import Any
+
+import pytest
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.lockstep import RealTime
+from emulator.scenario.faults import parse_fault
+from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.transport import wire
+
+IDS = ["v01", "v02", "v03", "v04"]
+MS = 1_000_000
+
+
+def fault(kind: str, at_s: float, duration_s: float, **more: Any) -> dict[str, Any]:
+    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, "nodes": {"ids": ["v02"]}, **more}
+
+
+def started(*faults: dict[str, Any]) -> tuple[RealTime, Emulation]:
+    emulation = emulation_of(scenario_of(faults, "agents.beacon:main", run={"pacing": "realtime"}))
+    realtime = RealTime(emulation, [[node] for node in IDS])
+    realtime.start(0)
+    return realtime, emulation
+
+
+def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
+    return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
+
+
+def test_a_clock_goes_wrong_and_right_again_at_its_time() -> None:
+    realtime, _ = started(fault("skew", 0.5, 1.0, offset_ms=100), fault("drift", 1.0, 1.0, rate_ppm=1000))
+    assert clocks(realtime.due(400 * MS)) == []
+    assert clocks(realtime.due(500 * MS)) == [(100 * MS, 0.0)]
+    assert clocks(realtime.due(1000 * MS)) == [(100 * MS, pytest.approx(0.001))]
+    assert clocks(realtime.due(1500 * MS)) == [(MS // 2, pytest.approx(0.001))]
+    assert clocks(realtime.due(2000 * MS)) == [(0, 0.0)]
+
+
+def test_who_stands_still_is_given_nothing_and_then_all_without_blame() -> None:
+    realtime, _ = started(fault("pause", 0.5, 0.8))
+    realtime.due(450 * MS)
+    held = [realtime.due(t * MS) for t in range(500, 1300, 50)]
+    assert all("v02" not in batches for batches in held)
+    assert [a.paused for a in realtime.take_actions()] == [{"v02"}]
+    batch = realtime.due(1300 * MS)["v02"]
+    assert [fix.time_ns for fix in batch.fixes] == [600 * MS, 800 * MS, 1000 * MS, 1200 * MS]
+    assert batch.held
+    assert [a.paused for a in realtime.take_actions()] == [set()]
+    assert not realtime.due(1400 * MS)["v02"].held
+
+
+def test_who_is_killed_again_before_it_was_back_is_killed_and_comes_back_once_more() -> None:
+    realtime, emulation = started(fault("kill", 0.5, 0.3), fault("restart", 1.0, 0.4))
+    realtime.due(900 * MS)
+    assert [(a.stop, a.start) for a in realtime.take_actions()] == [({"v02": True}, []), ({}, ["v02"])]
+    assert not emulation.up["v02"], "its process is still starting"
+    realtime.due(1000 * MS)
+    assert [(a.stop, a.start) for a in realtime.take_actions()] == [({"v02": False}, [])]
+    realtime.due(1400 * MS)
+    assert [(a.stop, a.start) for a in realtime.take_actions()] == [({}, ["v02"])]
+    batch = realtime.returned(1700 * MS, "v02")
+    assert (batch.seq, batch.start_ns) == (0, 1700 * MS)
+    assert emulation.up["v02"]
+    assert emulation.incarnation["v02"] == 2
+
+
+def test_what_a_killed_process_still_says_counts_for_nothing() -> None:
+    realtime, emulation = started(fault("kill", 0.5, 1.0))
+    realtime.due(500 * MS)
+    realtime.receive(501 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v02", b"x")])))
+    realtime.due(600 * MS)
+    assert len(emulation.engine.trace) == 0
+    assert realtime.gaps == 0
+
+
+def test_what_an_operator_does_late_makes_no_fault_miss_its_end() -> None:
+    """A query is answered between the instant of a change and the moment at which the driver gets to it."""
+    realtime, emulation = started(fault("pause", 0.5, 0.5))
+    realtime.due(500 * MS)
+    emulation.inject(parse_fault(fault("loss", 2.0, 0.2, probability=0.5)), 1001 * MS)
+    realtime.take_actions()
+    realtime.due(1002 * MS)
+    assert [a.paused for a in realtime.take_actions()] == [set()]
+
+
+def test_healing_ends_a_fault_at_once_and_again_changes_nothing() -> None:
+    realtime, emulation = started(fault("kill", 0.5, 2.0))
+    realtime.due(500 * MS)
+    realtime.take_actions()
+    for _ in range(2):
+        emulation.heal("kill-0", 800 * MS)
+        realtime.due(801 * MS)
+    assert [a.start for a in realtime.take_actions()] == [["v02"]]
+    (written,) = emulation.scenario.fault
+    assert written.duration_s == pytest.approx(0.3)
+
+
+def test_whose_program_has_ended_is_not_up_again_when_its_process_is() -> None:
+    realtime, emulation = started(fault("kill", 0.5, 0.2))
+    realtime.receive(
+        100 * MS, "v02", wire.Frames(b"n", 0, 1, [], wire.Traffic((), (), [wire.Ending("v02", "finished")]))
+    )
+    realtime.due(900 * MS)
+    assert [(a.stop, a.start) for a in realtime.take_actions()] == [({}, []), ({}, [])]
+    assert not emulation.welcome("v02", b"n").runs
+    assert emulation.welcome("v01", b"n").runs

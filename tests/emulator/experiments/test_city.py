@@ -1,0 +1,88 @@
+"""The experiment of vehicles that drive: its cells, its table, its pictures, and that it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from emulator.experiments import city
+from tests.emulator.world.maps.test_city_map import driving
+
+
+def run_small(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str) -> str:
+    monkeypatch.setenv("PYTHONHASHSEED", "0")
+    files = ["--trips", str(folder / "trips.csv"), "--map", str(folder / "cross.npz")]
+    result = CliRunner().invoke(
+        app,
+        ["experiment", "city", *files, "--seeds", "1", "--duration", "2", "--out", str(folder / "out"), *options],
+    )
+    assert result.exit_code == 0, result.output
+    return (folder / "out" / "city.md").read_text()
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """Trips and a map, both in metres."""
+    driving(tmp_path)
+    result = CliRunner().invoke(
+        app,
+        [
+            "map",
+            "convert",
+            str(tmp_path / "cross.geojson"),
+            str(tmp_path / "cross.npz"),
+            "--origin",
+            "42.28,-83.74",
+        ],
+    )
+    assert result.exit_code == 0, result.output
+    return tmp_path
+
+
+def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
+    files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(city, "MECHANISMS", {name: city.MECHANISMS[name] for name in ("optimized", "none")})
+    text = run_small(monkeypatch, files)
+    for name in ("centralized", "optimized", "none", "raw fixes"):
+        assert f"| {name}" in text
+    rows = {row["mechanism"]: row for row in pq.read_table(files / "out" / "city.parquet").to_pylist()}
+    assert rows["none"]["metrics_sha256"] != rows["optimized"]["metrics_sha256"]
+    assert rows["optimized"]["position_rmse_m"] > 0
+    for name in ("city_against_time.png", "city_errors.png"):
+        assert (files / "out" / name).read_bytes().startswith(b"\x89PNG")
+    monkeypatch.setattr("emulator.cells.cells._run_all", lambda missing, *_: iter((missing and 1 / 0) or []))
+    assert run_small(monkeypatch, files) == text, "what is finished is not run again"
+
+
+def test_errors_are_those_of_the_place() -> None:
+    position = [[10.0, 10.0], [20.0, 20.0], [130.0, 10.0], None]
+    estimate = [[13.0, 14.0], [20.0, 20.0], [130.0, 12.0], [0.0, 0.0]]
+    point = pa.list_(pa.float64(), 2)
+    states = pa.table({"position_m": pa.array(position, point), "estimate_m": pa.array(estimate, point)})
+    corner, error = city.errors_by_place(states)
+    assert corner.tolist() == [[0.0, 0.0], [100.0, 0.0]]
+    assert error == pytest.approx([np.sqrt(25 / 2), 2.0])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--trips", "trips.csv"], "--map is needed"),
+        (["--map", "cross.npz"], "--trips is needed"),
+        (["--trips", "nowhere.csv", "--map", "cross.npz"], "--trips nowhere.csv: no such file"),
+    ],
+)
+def test_trips_and_maps_come_together(
+    files: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
+) -> None:
+    monkeypatch.chdir(files)
+    result = CliRunner().invoke(app, ["experiment", "city", *options])
+    assert result.exit_code == 2
+    assert said in result.output

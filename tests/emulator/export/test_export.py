@@ -1,0 +1,275 @@
+"""A run in other tools' formats, read back by readers that know nothing of vnet; and the commands for it."""
+
+import csv
+import io
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from emulator.checks.judge import Evidence, read_evidence
+from emulator.cli.commands import app
+from emulator.export.mcap_file import SCHEMAS, write_mcap
+from emulator.export.pcapng import write_pcapng
+from emulator.export.tables import write_csv
+from tests.emulator.checks.test_judge import run_scenario
+from tests.support.motion import along, scenario_of_trips, still, write_trips
+
+VEHICLES = {
+    "v1": [(0, 5, along(0, 10))],
+    "v2": [(0, 5, still(50))],
+    "v3": [(1, 5, still(80))],  # enters
+    "v4": [(0, 2, still(20))],  # leaves
+}
+FAULTS: list[dict[str, Any]] = [
+    {"kind": "DoS", "at_s": 1.0, "duration_s": 1.0, "factor": 3, "nodes": {"ids": ["v2"]}},
+    {"kind": "duplicate", "at_s": 0.5, "duration_s": 3.0, "probability": 0.5},
+    {"kind": "gnss_outage", "at_s": 2.0, "duration_s": 0.7, "nodes": {"ids": ["v1"]}},
+    {"kind": "block", "at_s": 3.0, "duration_s": 0.6, "senders": {"ids": ["v1"]}},
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with everything: vehicles that come and go, outcomes of several kinds, copies."""
+    folder = tmp_path_factory.mktemp("export")
+    scenario = scenario_of_trips(
+        write_trips(folder / "t.csv", VEHICLES), 4.0, program=f"{__name__}:reports", faults=FAULTS
+    )
+    run_scenario(folder / "run", scenario)
+    return folder / "run"
+
+
+async def reports(node: Any) -> None:
+    """Say a few bytes and report numbers of all shapes."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(node.id.encode() * 10)
+        node.report(fix.position_m, fix.covariance_m2, several=[1.0, 2.0], one=float("inf"))
+
+
+@pytest.fixture(scope="module")
+def evidence(folder: Path) -> Evidence:
+    return read_evidence(folder)
+
+
+# pcapng, as its draft describes it.
+
+
+def blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place < len(data):
+        kind, length = struct.unpack_from("<II", data, place)
+        assert length % 4 == 0 and struct.unpack_from("<I", data, place + length - 4)[0] == length
+        yield kind, data[place + 8 : place + length - 4]
+        place += length
+    assert place == len(data)
+
+
+def options(data: bytes) -> dict[int, bytes]:
+    found, place = {}, 0
+    while True:
+        code, length = struct.unpack_from("<HH", data, place)
+        if code == 0:
+            assert length == 0 and place + 4 == len(data)
+            return found
+        found[code] = data[place + 4 : place + 4 + length]
+        place += 4 + length + -length % 4
+
+
+def packets(data: bytes) -> list[dict[str, Any]]:
+    found = []
+    for kind, body in list(blocks(data)):
+        if kind != 6:
+            continue
+        interface, high, low, captured, length = struct.unpack_from("<IIIII", body)
+        end = 20 + captured + -captured % 4
+        said = options(body[end:])
+        found.append(
+            {
+                "interface": interface,
+                "time_ns": (high << 32) + low,
+                "bytes": body[20 : 20 + captured],
+                "length": length,
+                "comment": said[1].decode(),
+                "direction": struct.unpack("<I", said[2])[0],
+            }
+        )
+    return found
+
+
+@pytest.fixture(scope="module")
+def capture(evidence: Evidence) -> bytes:
+    file = io.BytesIO()
+    count = write_pcapng(evidence, file)
+    assert count == len(packets(file.getvalue()))
+    return file.getvalue()
+
+
+def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, evidence: Evidence) -> None:
+    (first, section), *rest = blocks(capture)
+    assert first == 0x0A0D0D0A and struct.unpack_from("<IHH", section) == (0x1A2B3C4D, 1, 0)
+    interfaces = [body for kind, body in rest if kind == 1]
+    assert [options(body[8:])[2].decode() for body in interfaces] == evidence.node_ids
+    assert {struct.unpack_from("<H", body)[0] for body in interfaces} == {127}
+    assert {options(body[8:])[9] for body in interfaces} == {b"\x09"}, "nanoseconds"
+
+
+def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
+    capture: bytes, evidence: Evidence
+) -> None:
+    found = packets(capture)
+    assert [packet["time_ns"] for packet in found] == sorted(packet["time_ns"] for packet in found)
+    inbound = sorted((p["interface"], p["time_ns"]) for p in found if p["direction"] == 1)
+    rows = evidence.trace.to_pylist()
+    number = evidence.number
+    heard = [(number[r["receiver"]], r["arrival_ns"]) for r in rows if r["outcome"] == "delivered"]
+    assert inbound == sorted(heard)
+    outbound = sorted((p["interface"], p["time_ns"]) for p in found if p["direction"] == 2)
+    sent = {
+        (number[r["sender"]], r["sent_ns"], r["seq"], r["copy"])
+        for r in rows
+        if not (r["copy"] and r["cause"].startswith("duplicate"))
+    }
+    assert outbound == sorted(emission[:2] for emission in sent)
+
+
+def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, evidence: Evidence) -> None:
+    for packet in packets(capture):
+        data = packet["bytes"]
+        version, length, present = struct.unpack_from("<BxHI", data)
+        assert (version, length, present) == (0, 14, 0b1110)
+        flags, rate, channel_mhz, channel = struct.unpack_from("<BBHH", data, 8)
+        assert (flags, rate / 2, channel_mhz) == (0, evidence.scenario.radio.bitrate_mbps, 5900)
+        assert channel & 0x4000, "10 MHz"
+        mac, llc = data[14:40], data[40:]
+        assert mac[:2] == b"\x88\x00", "QoS data, to and from no distribution system"
+        assert mac[4:10] == mac[16:22] == b"\xff" * 6, "to all, in no BSS"
+        assert llc == b"\xaa\xaa\x03\x00\x00\x00\x88\xb5"
+        assert packet["length"] == len(data) + 20, "20 bytes of payload, which no run keeps"
+        sender, seq = packet["comment"].split(";")[0].replace(",", "").split(" frame ")
+        assert mac[10:16] == b"\x02\x00\0\0\0" + bytes([evidence.number[sender] + 1])
+        assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
+
+
+def test_comments_tell_what_became_of_a_frame(capture: bytes, evidence: Evidence) -> None:
+    for packet in packets(capture):
+        fields = packet["comment"].split("; ")
+        if packet["direction"] == 1:
+            continue
+        told = dict(part.rsplit(" ", 1) for part in fields[-1].split(", "))
+        name, seq = fields[0].split(", ")[0].split(" frame ")
+        copy = int(fields[0].split("copy ")[1]) if "copy" in fields[0] else 0
+        rows = [
+            row["outcome"]
+            for row in evidence.trace.to_pylist()
+            if (row["sender"], row["seq"], row["copy"]) == (name, int(seq), copy)
+        ]
+        assert {outcome: int(count) for outcome, count in told.items()} == {o: rows.count(o) for o in set(rows)}
+
+
+# MCAP.
+
+
+def test_mcap_has_every_period_frame_and_event_in_order(evidence: Evidence) -> None:
+    file = io.BytesIO()
+    count = write_mcap(evidence, file)
+    file.seek(0)
+    reader = make_reader(file)
+    messages: dict[str, list[tuple[int, dict[str, Any]]]] = {topic: [] for topic in SCHEMAS}
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        assert schema is not None and schema.encoding == "jsonschema" and channel.message_encoding == "json"
+        assert json.loads(schema.data)["title"] == schema.name == SCHEMAS[channel.topic][0]
+        messages[channel.topic].append((message.log_time, json.loads(message.data)))
+    assert sum(map(len, messages.values())) == count
+    for told in messages.values():
+        assert [time_ns for time_ns, _ in told] == sorted(time_ns for time_ns, _ in told)
+    assert len(messages["/states"]) == len(messages["/metrics"]) == 20
+    rows = evidence.trace.to_pylist()
+    frames = {(row["sender"], row["seq"], row["copy"]) for row in rows}
+    told_frames = {(m["sender"], m["seq"], m["copy"]): m for _, m in messages["/frames"]}
+    assert told_frames.keys() == frames
+    listed = {
+        (*frame, receiver, outcome)
+        for frame, told in told_frames.items()
+        for outcome, receivers in told["outcomes"].items()
+        for receiver in receivers
+    }
+    assert listed == {(r["sender"], r["seq"], r["copy"], r["receiver"], r["outcome"]) for r in rows}
+    assert [m["kind"] for _, m in messages["/events"] if m["node"]] == ["entered", "left"]
+    (attachment,) = reader.iter_attachments()
+    assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
+
+
+def test_mcap_shows_who_is_there_where_it_is(evidence: Evidence) -> None:
+    file = io.BytesIO()
+    write_mcap(evidence, file)
+    file.seek(0)
+    reader = make_reader(file)
+    truth, fixes = ([json.loads(m.data) for _, _, m in reader.iter_messages(topics=[topic])] for topic in TOPICS)
+    assert [t["child_frame_id"] for t in truth[0]["transforms"]] == ["v1", "v2", "v4"]
+    assert [t["child_frame_id"] for t in truth[-1]["transforms"]] == ["v1", "v2", "v3"]
+    assert truth[5]["transforms"][0]["translation"] == {"x": pytest.approx(10.0), "y": 0.0, "z": 0.0}
+    assert len(fixes[0]["poses"]) == 3 and len(fixes[12]["poses"]) == 2, "v4 has left, v1 has no fix"
+
+
+TOPICS = ("/tf", "/vehicles/fix")
+
+
+# CSV.
+
+
+def test_csv_has_every_row_of_every_table_in_plain_columns(evidence: Evidence, tmp_path: Path) -> None:
+    tables = {}
+    for name in write_csv(evidence, tmp_path):
+        with (tmp_path / name).open(newline="") as file:
+            tables[name.removesuffix(".csv")] = list(csv.DictReader(file))
+    assert len(tables["trace"]) == len(evidence.trace) and len(tables["metrics"]) == 20
+    for told, row in zip(tables["trace"], evidence.trace.to_pylist(), strict=True):
+        assert {key: value or None for key, value in told.items() if key != "cause"} == {
+            key: None if value is None else str(value) for key, value in row.items() if key != "cause"
+        }
+    state = tables["states"][0]
+    assert float(state["fix_m_x"]) == evidence.vectors("fix_m")[0, 0, 0]
+    assert float(state["covariance_m2_yy"]) == 1.0
+    assert json.loads(state["values"])["several"] == [1.0, 2.0]
+    assert {"links", "vehicles", "distances", "events"} <= tables.keys()
+
+
+# The commands.
+
+RUNNER = CliRunner()
+
+
+@pytest.mark.parametrize("to", ["pcapng", "mcap", "csv"])
+def test_an_export_goes_where_it_is_told_and_never_over_something_else(
+    folder: Path, tmp_path: Path, to: str
+) -> None:
+    out = tmp_path / "out"
+    done = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out)])
+    assert done.exit_code == 0 and str(out) in done.stdout.replace("\n", "")
+    again = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out)])
+    assert again.exit_code == 2 and "exists; remove it" in again.stderr
+    nowhere = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out / "no" / "no")])
+    assert nowhere.exit_code == 2 or to == "csv"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "nothing half-written is left"
+
+
+def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
+    for command in (["export", str(tmp_path)], ["radio", str(tmp_path)]):
+        done = RUNNER.invoke(app, command)
+        assert done.exit_code == 2 and done.stderr.count("\n") == 1 and "not a run's folder" in done.stderr
+
+
+def test_radio_prints_its_figures_and_keeps_its_tables(folder: Path, tmp_path: Path) -> None:
+    done = RUNNER.invoke(app, ["radio", str(folder), "--bin", "25", "--out", str(tmp_path / "tables")])
+    assert done.exit_code == 0, done.stderr
+    assert "pairs on" in done.stdout and "the worst links" in done.stdout
+    names = sorted(path.name for path in (tmp_path / "tables").iterdir())
+    assert names == ["distances.parquet", "links.parquet", "vehicles.parquet"]
+    assert pq.read_table(tmp_path / "tables" / "distances.parquet")["to_m"].to_pylist()[0] in (25.0, 50.0)

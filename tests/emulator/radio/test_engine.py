@@ -1,0 +1,298 @@
+"""The engine and its channel: one outcome for every pair, and luck that depends only on what it decides."""
+
+import tracemalloc
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import binom
+
+from emulator.radio.engine import Delivery, Engine
+from emulator.radio.outcomes import Outcome
+from emulator.radio.trace import Trace
+from emulator.scenario.scenario import Radio
+
+PERIOD_NS = 100_000_000
+seeds = st.integers(0, 2**63 - 1)
+
+
+def place(count: int, seed: int, side_m: float = 8000.0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0, side_m, (count, 2))
+
+
+def engine(position_m: np.ndarray, seed: int = 1, links: np.ndarray | None = None, **radio: float) -> Engine:
+    ids = [f"v{number}" for number in range(len(position_m))]
+    return Engine(ids, Radio.model_validate(radio), seed, position_m, links)
+
+
+def rows(of: Engine) -> list[dict]:
+    return of.trace.to_table().to_pylist()
+
+
+def in_range(position_m: np.ndarray, range_m: float = 3000.0) -> np.ndarray:
+    distance = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
+    return (distance <= range_m) & ~np.eye(len(position_m), dtype=bool)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 12), seeds, st.floats(0, 1), st.lists(st.integers(0, 1600), min_size=1, max_size=8))
+def test_every_pair_has_exactly_one_outcome(count: int, seed: int, loss: float, sizes: list[int]) -> None:
+    position = place(count, seed % 1000)
+    subject = engine(position, seed, loss=loss, max_peers=3, queue_frames=2)
+    for number, size in enumerate(sizes):
+        subject.transmit(number * 1_000_000, number % count, [bytes(size)] * 2)
+        if number == 3 and count > 1:
+            subject.set_up(0, False)
+    subject.drain()
+    table = rows(subject)
+    sent = Counter((row["sender"], row["seq"]) for row in table)
+    degree = in_range(position).sum(axis=1)
+    assert all(number == degree[int(sender[1:])] for (sender, _), number in sent.items())
+    keys = [(row["sender"], row["seq"], row["receiver"]) for row in table]
+    assert len(set(keys)) == len(keys)
+    assert all(row["outcome"] != "pending" for row in table)
+    counted = Counter(row["outcome"] for row in table)
+    listed = {o.name: n for o, n in subject.counts.items() if n and o is not Outcome.out_of_range}
+    assert counted == listed
+    frames = sum(subject._next_seq)
+    assert len(table) + subject.counts[Outcome.out_of_range] == frames * (count - 1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(1, 6), st.integers(2, 15), st.sets(st.integers(0, 14), max_size=4))
+def test_the_cap_admits_exactly_the_nearest_live_senders(seed: int, cap: int, count: int, down: set[int]) -> None:
+    position = place(count, seed % 1000, side_m=4000)
+    subject = engine(position, seed, max_peers=cap)
+    live = [node for node in range(count) if node not in down]
+    for node in sorted(down & set(range(count))):
+        subject.set_up(node, False)
+    for node in live:
+        subject.transmit(0, node, [b"x"])
+    subject.drain()
+    distance = np.linalg.norm(position[:, None] - position[None], axis=2)
+    near = in_range(position)
+    for row in rows(subject):
+        sender, receiver = int(row["sender"][1:]), int(row["receiver"][1:])
+        candidates = sorted((s for s in live if near[s, receiver]), key=lambda s: (distance[s, receiver], s))
+        assert (row["outcome"] == "peer_cap") == (sender not in candidates[:cap])
+
+
+def test_loss_lies_in_its_binomial_band() -> None:
+    subject = engine(np.zeros((20, 2)), seed=5, loss=0.3)
+    for period in range(50):
+        for node in range(20):
+            subject.transmit(period * PERIOD_NS, node, [b"x"])
+    subject.drain()
+    low, high = binom.interval(0.999, 20 * 19 * 50, 0.3)
+    assert low <= subject.counts[Outcome.lost] <= high
+    lost_of = Counter(row["receiver"] for row in rows(subject) if row["outcome"] == "lost")
+    assert len(lost_of) == 20, "nobody is spared"
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.integers(0, 5000), st.floats(0.001, 50), st.floats(0, 50))
+def test_arrivals_are_later_and_on_the_tick(seed: int, tick_us: int, latency_ms: float, jitter_ms: float) -> None:
+    subject = engine(np.zeros((3, 2)), seed, delivery_tick_us=tick_us, latency_ms=latency_ms, jitter_ms=jitter_ms)
+    subject.transmit(123_456_789, 0, [b"", bytes(100)])
+    deliveries = subject.advance(10**12)
+    assert len(deliveries) == 4
+    for delivery in deliveries:
+        assert delivery.packet.received_ns >= 123_456_789 + 1000
+        assert tick_us == 0 or delivery.packet.received_ns % (tick_us * 1000) == 0
+
+
+def test_oversize_and_a_full_queue_are_outcomes_of_their_own() -> None:
+    subject = engine(np.zeros((2, 2)), max_payload_bytes=100, queue_frames=3, bitrate_mbps=0.08, access_jitter_ms=0)
+    subject.transmit(0, 0, [bytes(101), *[bytes(100)] * 6])  # 10 ms on the air each
+    subject.transmit(40_000_000, 0, [bytes(100)])
+    subject.drain()
+    outcomes = [row["outcome"] for row in rows(subject)]
+    # One on the air and three waiting; the rest finds the queue full until it has drained.
+    assert outcomes == ["oversize", *["delivered"] * 4, *["queue_full"] * 2, "delivered"]
+    arrivals = [row["arrival_ns"] for row in rows(subject) if row["outcome"] == "delivered"]
+    assert arrivals[1] - arrivals[0] >= 9_000_000, "one after the other, at the bit rate"
+
+
+def run_all(subject: Engine, order: list[int], steps: int) -> list[Delivery]:
+    deliveries = []
+    for period in range(4):
+        for node in order:
+            subject.transmit(period * PERIOD_NS, node, [bytes([node, period])])
+        for step in range(1, steps + 1):
+            deliveries += subject.advance(period * PERIOD_NS + step * PERIOD_NS // steps)
+    subject.drain()
+    return deliveries
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds, st.permutations(range(6)), st.integers(1, 7))
+def test_neither_the_order_of_calls_nor_the_size_of_steps_matters(seed: int, order: list[int], steps: int) -> None:
+    position = place(6, seed % 100, 5000)
+    one, other = (engine(position, seed, loss=0.2, max_peers=3) for _ in range(2))
+    first, second = run_all(one, list(range(6)), 1), run_all(other, order, steps)
+    assert one.trace.sha256() == other.trace.sha256()
+    assert [(d.receiver, d.packet) for d in first] == [(d.receiver, d.packet) for d in second]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds)
+def test_one_more_vehicle_far_away_changes_nobodys_luck(seed: int) -> None:
+    position = place(6, seed % 100, 5000)
+    far = np.vstack([position, [[1e6, 1e6]]])
+    one, other = engine(position, seed, loss=0.3), engine(far, seed, loss=0.3)
+    run_all(one, list(range(6)), 1)
+    run_all(other, list(range(7)), 1)
+    assert one.trace.sha256() == other.trace.sha256()
+
+
+def test_a_receiver_that_is_down_at_the_instant_of_arrival_hears_nothing() -> None:
+    subject = engine(np.zeros((3, 2)))
+    subject.transmit(0, 0, [b"x"])
+    subject.set_up(1, False)
+    assert [d.receiver for d in subject.advance(PERIOD_NS)] == [2]
+    subject.set_up(1, True)
+    subject.transmit(PERIOD_NS, 0, [b"x"])
+    assert sorted(d.receiver for d in subject.advance(2 * PERIOD_NS)) == [1, 2]
+    assert [row["outcome"] for row in rows(subject)] == ["receiver_down", "delivered", "delivered", "delivered"]
+
+
+def test_a_sender_that_is_down_sends_nothing_and_goes_on_counting() -> None:
+    subject = engine(np.zeros((2, 2)))
+    subject.transmit(0, 0, [b"x"])
+    subject.set_up(0, False)
+    subject.transmit(1, 0, [b"x"])
+    subject.set_up(0, True)
+    subject.transmit(2, 0, [b"x"])
+    subject.drain()
+    assert [row["seq"] for row in rows(subject)] == [0, 1]
+
+
+def test_what_the_transport_lost_is_said_so() -> None:
+    subject = engine(np.zeros((2, 2)))
+    subject.transmit(0, 0, [b"x"])
+    (delivery,) = subject.advance(PERIOD_NS)
+    subject.lose(delivery)
+    assert subject.counts[Outcome.transport] == 1
+    assert subject.counts[Outcome.delivered] == 0
+    assert [row["outcome"] for row in rows(subject)] == ["transport"]
+
+
+def test_next_times_are_those_of_the_earliest_arrival() -> None:
+    subject = engine(place(5, 3, 2000))
+    assert subject.next_time() is None
+    subject.transmit(0, 0, [b"x"])
+    arrivals = {row["receiver"]: row["arrival_ns"] for row in rows(subject)}
+    assert subject.next_time() == min(arrivals.values())
+    assert all(subject.next_arrival_ns(int(r[1:])) == t for r, t in arrivals.items())
+    assert subject.next_arrival_ns(0) is None
+
+
+def test_moving_changes_who_hears_from_then_on() -> None:
+    subject = engine(np.array([[0.0, 0.0], [1e4, 0.0]]))
+    subject.transmit(0, 0, [b"x"])
+    subject.set_positions(np.zeros((2, 2)))
+    subject.transmit(1, 0, [b"x"])
+    subject.drain()
+    assert subject.counts[Outcome.out_of_range] == 1
+    assert subject.counts[Outcome.delivered] == 1
+
+
+def heard(subject: Engine) -> set[tuple[str, str]]:
+    """Which (sender, receiver) pairs came to a delivery."""
+    return {(row["sender"], row["receiver"]) for row in rows(subject) if row["outcome"] == "delivered"}
+
+
+def test_in_a_directed_ring_frames_go_one_way_only() -> None:
+    """Vehicle i hears only vehicle i - 1, though all stand in one place, and as little when they have moved."""
+    links = np.roll(np.eye(4, dtype=bool), -1, axis=1)
+    subject = engine(np.zeros((4, 2)), links=links)
+    for time_ns in (0, PERIOD_NS):
+        for node in range(4):
+            subject.transmit(time_ns, node, [b"x"])
+        subject.set_positions(place(4, 1, side_m=1e6))
+    subject.drain()
+    assert heard(subject) == {("v0", "v1"), ("v1", "v2"), ("v2", "v3"), ("v3", "v0")}
+    assert subject.counts[Outcome.delivered] == 2 * 4
+    assert subject.counts[Outcome.out_of_range] == 2 * 4 * 2
+
+
+def test_in_a_matrix_a_row_is_what_a_receiver_hears_and_the_cap_goes_by_distance() -> None:
+    links = np.zeros((4, 4), dtype=bool)
+    links[0] = [False, True, True, True]  # vehicle 0 hears all others, and is heard by none
+    position = np.array([[0.0, 0.0], [9e3, 0.0], [7e3, 0.0], [8e3, 0.0]])
+    subject = engine(position, links=links, max_peers=2)
+    for time_ns, down in ((0, []), (PERIOD_NS, [2])):
+        for node in down:
+            subject.set_up(node, False)
+        for node in range(4):
+            subject.transmit(time_ns, node, [b"x"])
+        subject.advance(time_ns + PERIOD_NS)
+        live = {("v2", "v0"), ("v3", "v0")} if not down else {("v1", "v0"), ("v2", "v0"), ("v3", "v0")}
+        assert heard(subject) == live
+    assert subject.counts[Outcome.peer_cap] == 1, "vehicle 1, as long as vehicle 2 lived"
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 8), seeds)
+def test_any_matrix_decides_who_hears_whom(count: int, seed: int) -> None:
+    links = np.random.default_rng(seed % 1000).random((count, count)) < 0.5
+    np.fill_diagonal(links, False)
+    subject = engine(place(count, seed % 1000), seed, links)
+    for node in range(count):
+        subject.transmit(0, node, [b"x"])
+    subject.drain()
+    assert heard(subject) == {(f"v{j}", f"v{i}") for i in range(count) for j in range(count) if links[i, j]}
+
+
+@pytest.mark.parametrize("change", ["payload", "time", "loss"])
+def test_the_hash_sees_every_change(change: str) -> None:
+    def digest(**changes: object) -> str:
+        subject = engine(np.zeros((3, 2)), loss=changes.get("loss", 0.0))
+        subject.transmit(changes.get("time", 0), 0, [changes.get("payload", b"x")])
+        subject.drain()
+        return subject.trace.sha256()
+
+    assert digest() == digest()
+    assert digest() != digest(**{change: {"payload": b"y", "time": 1, "loss": 1.0}[change]})
+
+
+def trace_of(count: int) -> Trace:
+    """Frames of one receiver each, whose digests are their numbers."""
+    trace = Trace(["v0", "v1"])
+    trace.append(
+        {"payload_digest": np.arange(count, dtype=np.uint64), "sent_ns": np.arange(count)},
+        np.ones(count, np.intp),
+        np.ones(count, np.intp),
+        np.full(count, Outcome.delivered, np.uint8),
+        np.zeros(count, np.int16),
+        np.zeros(count, np.int64),
+    )
+    return trace
+
+
+@pytest.mark.parametrize(
+    "which",
+    [slice(None), slice(3, 9), slice(8, 2, -2), slice(-4, None), np.array([7, 1, 1, 11]), np.array([], int)],
+)
+def test_what_arrives_with_other_bytes_has_another_digest_whichever_rows_are_asked_for(
+    which: slice | np.ndarray,
+) -> None:
+    trace = trace_of(12)
+    for row, payload_digest in ((1, 501), (7, 507), (8, 500), (8, 508)):
+        trace.alter(row, payload_digest)
+    expected = np.arange(12)
+    expected[[1, 7, 8]] += 500
+    assert trace.rows(which)["payload_digest"].tolist() == expected[which].tolist()
+
+
+def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of_a_short_one() -> None:
+    """By what is allocated for it: deliveries look a few rows up at each of their instants."""
+    trace = trace_of(100_000)
+    trace.alter(5, 1)
+    tracemalloc.start()
+    trace.rows(np.array([3, 5]))
+    _, most_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most_bytes < 20_000

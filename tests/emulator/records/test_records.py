@@ -1,0 +1,260 @@
+"""What is kept of a run and how it is judged: damage to a trace is found by the check whose business it is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+
+from emulator.checks.judge import CheckResult, Evidence, Judgement, NotExercised, Verdict, check_run, judge
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.radio.trace import read_trace, sha256_of_table
+from emulator.records.metrics import Metrics, summarize
+from emulator.records.run_folder import Event, RunFolder, read_events
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import Instant, build_world
+from vnet.errors import VnetError
+from vnet.node import Report
+
+
+def beacons(folder: Path, **radio: float) -> Evidence:
+    """A small simulated run."""
+    scenario = Scenario.model_validate(
+        {"run": {"duration_s": 2.0}, "network": {"vehicles": 6, "layout": "dense"}, "radio": radio}
+    )
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    wall_s, _ = simulate(emulation)
+    conclude(emulation, wall_s, "simulate")
+    return Evidence(
+        scenario,
+        read_trace(folder / "trace.parquet"),
+        pq.read_table(folder / "states.parquet"),
+        pq.read_table(folder / "metrics.parquet"),
+        read_events(folder),
+    )
+
+
+@pytest.fixture(scope="module")
+def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    return beacons(tmp_path_factory.mktemp("observe") / "run", loss=0.2, max_peers=2)
+
+
+def verdicts(evidence: Evidence, **changes: object) -> dict[str, Verdict]:
+    fields = {name: getattr(evidence, name) for name in ("scenario", "trace", "states", "metrics", "events")}
+    return {check.name: check.verdict for check in judge(Evidence(**{**fields, **changes})).checks}
+
+
+def only_invalid(evidence: Evidence, trace: pa.Table) -> set[str]:
+    return {name for name, verdict in verdicts(evidence, trace=trace).items() if verdict is Verdict.INVALID}
+
+
+def outcome_set(table: pa.Table, mask: np.ndarray, outcome: str) -> pa.Table:
+    names = np.array(table["outcome"].cast(pa.string()).to_pylist(), dtype=object)
+    names[mask] = outcome
+    column = pa.array(names.tolist(), pa.string()).dictionary_encode()
+    table = table.set_column(table.column_names.index("outcome"), "outcome", column)
+    arrived = pc.is_in(column.cast(pa.string()), pa.array(["delivered", "receiver_down", "transport"]))
+    usual_ns = pc.add(table["sent_ns"], 3_020_000)
+    arrival_ns = pc.if_else(arrived, pc.coalesce(table["arrival_ns"], usual_ns), pa.scalar(None, pa.int64()))
+    return table.set_column(table.column_names.index("arrival_ns"), "arrival_ns", arrival_ns)
+
+
+def is_outcome(table: pa.Table, outcome: str) -> np.ndarray:
+    return np.array(pc.equal(table["outcome"].cast(pa.string()), outcome).to_pylist())
+
+
+def test_an_honest_run_is_valid(evidence: Evidence) -> None:
+    assert set(verdicts(evidence).values()) == {Verdict.VALID}
+    assert {"conservation", "range", "peer_cap", "loss_rate", "transport", "agents_alive", "finite"} <= set(
+        verdicts(evidence)
+    )
+
+
+def test_a_missing_row_breaks_conservation(evidence: Evidence) -> None:
+    assert only_invalid(evidence, evidence.trace.slice(1)) == {"conservation"}
+
+
+def test_a_repeated_row_breaks_conservation(evidence: Evidence) -> None:
+    assert "conservation" in only_invalid(evidence, pa.concat_tables([evidence.trace, evidence.trace.slice(0, 1)]))
+
+
+def test_a_missing_frame_breaks_conservation(evidence: Evidence) -> None:
+    first = evidence.trace.slice(0, 1).to_pylist()[0]
+    same = pc.and_(
+        pc.equal(evidence.trace["sender"].cast(pa.string()), first["sender"]),
+        pc.equal(evidence.trace["seq"], first["seq"]),
+    )
+    assert only_invalid(evidence, evidence.trace.filter(pc.invert(same))) == {"conservation"}
+
+
+def test_an_undecided_pair_breaks_conservation(evidence: Evidence) -> None:
+    mask = np.arange(len(evidence.trace)) == 3
+    assert "conservation" in only_invalid(evidence, outcome_set(evidence.trace, mask, "pending"))
+
+
+def test_a_delivery_beyond_the_cap_is_found(evidence: Evidence) -> None:
+    capped = np.flatnonzero(is_outcome(evidence.trace, "peer_cap"))[:1]
+    mask = np.isin(np.arange(len(evidence.trace)), capped)
+    assert only_invalid(evidence, outcome_set(evidence.trace, mask, "delivered")) == {"peer_cap"}
+
+
+def test_a_delivery_beyond_the_range_is_found(evidence: Evidence) -> None:
+    narrow = evidence.scenario.model_copy(
+        update={"radio": evidence.scenario.radio.model_copy(update={"range_m": 500.0})}
+    )
+    assert verdicts(evidence, scenario=narrow)["range"] is Verdict.INVALID
+
+
+def test_too_much_loss_is_found(evidence: Evidence) -> None:
+    mask = is_outcome(evidence.trace, "delivered") & (np.arange(len(evidence.trace)) % 3 == 0)
+    assert only_invalid(evidence, outcome_set(evidence.trace, mask, "lost")) == {"loss_rate"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "details", "check", "verdict"),
+    [
+        ("died", {"how": "SIGKILL"}, "agents_alive", Verdict.INVALID),
+        ("crashed", {"error": "ValueError"}, "agents_alive", Verdict.INVALID),
+        ("spun", {"error": "spin"}, "progress", Verdict.INVALID),
+        ("stalled", {"error": "no yield"}, "progress", Verdict.UNKNOWN),
+        ("interrupted", {}, "progress", Verdict.UNKNOWN),
+        ("transport_gap", {"count": 2}, "transport", Verdict.UNKNOWN),
+    ],
+)
+def test_events_decide_their_checks(
+    evidence: Evidence, kind: str, details: dict, check: str, verdict: Verdict
+) -> None:
+    event = Event(1_999_000_000, kind, "v01", details)
+    assert verdicts(evidence, events=[*evidence.events, event])[check] is verdict
+
+
+def test_a_program_that_sends_nothing_leaves_checks_unknown(evidence: Evidence) -> None:
+    empty = verdicts(evidence, trace=evidence.trace.slice(0, 0))
+    assert {name for name, verdict in empty.items() if verdict is Verdict.UNKNOWN} == {
+        "conservation",
+        "range",
+        "peer_cap",
+        "loss_rate",
+        "latency",
+        "isolation",
+    }
+
+
+def test_a_cap_that_cannot_act_is_left_out_with_its_reason(tmp_path: Path) -> None:
+    judgement = judge(beacons(tmp_path / "run"))
+    assert judgement.verdict is Verdict.VALID
+    assert NotExercised("peer_cap", "no receiver has more than 30 senders in range (at most 5)") in (
+        judgement.not_exercised
+    )
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "together", "status"),
+    [
+        (["valid"], "valid", 0),
+        (["valid", "unknown"], "unknown", 3),
+        (["unknown", "invalid", "valid"], "invalid", 1),
+    ],
+)
+def test_invalid_wins_over_unknown_over_valid(verdicts: list[str], together: str, status: int) -> None:
+    judgement = Judgement([CheckResult("x", Verdict(v), "") for v in verdicts], [], "")
+    assert (judgement.verdict, judgement.exit_status) == (together, status)
+
+
+def test_a_folder_judges_itself_again_and_notices_tampering(tmp_path: Path) -> None:
+    evidence = beacons(tmp_path / "run", loss=0.1)
+    assert check_run(tmp_path / "run").verdict is Verdict.VALID
+    table = evidence.trace
+    digest = pa.array([0] * len(table), pa.uint64())
+    pq.write_table(
+        table.set_column(table.column_names.index("payload_digest"), "payload_digest", digest),
+        tmp_path / "run" / "trace.parquet",
+    )
+    judgement = check_run(tmp_path / "run")
+    assert judgement.verdict is Verdict.INVALID
+    assert judgement.checks[-1].name == "trace_sha256"
+
+
+def test_the_hash_survives_the_file_and_sees_every_cell(evidence: Evidence, tmp_path: Path) -> None:
+    pq.write_table(evidence.trace, tmp_path / "again.parquet", compression="none")
+    assert sha256_of_table(read_trace(tmp_path / "again.parquet")) == sha256_of_table(evidence.trace)
+    mask = np.arange(len(evidence.trace)) == 0
+    for column in ("sent_ns", "seq", "size_bytes", "copy"):
+        values = np.array(evidence.trace[column].to_pylist())
+        values[mask] += 1
+        index = evidence.trace.column_names.index(column)
+        changed = evidence.trace.set_column(index, column, pa.array(values, evidence.trace[column].type))
+        assert sha256_of_table(changed) != sha256_of_table(evidence.trace)
+
+
+def instant(position: np.ndarray, common: list[float]) -> Instant:
+    count = len(position)
+    fix = position + np.array(common)
+    return Instant(0, 0, position, np.zeros(count), np.array(common), fix, np.zeros(count))
+
+
+def test_metrics_are_the_figures_by_hand() -> None:
+    position = np.array([[0.0, 0.0], [10.0, 0.0], [500.0, 0.0]])
+    metrics = Metrics(["a", "b", "c"], np.array([0, 0, 1]), 100_000_000)
+    estimates = {"a": [1.0, 0.0], "b": [3.0, 0.0], "c": [2.0, 2.0]}
+    unit = [1.0, 0.0, 0.0, 1.0]
+    reports = [
+        Report(0, node, (x + 1.0, 0.0), (1.0, 0.0, 0.0, 1.0), {
+            "common_error_m": estimates[node], "common_error_covariance_m2": unit, "mean_m": [2.0, 0.0],
+        })
+        for node, x in (("a", 0.0), ("b", 10.0), ("c", 500.0))
+    ]  # fmt: skip
+    figures = metrics.record(instant(position, [2.0, 0.0]), reports)
+    assert figures.common_error_rmse_m == pytest.approx(np.sqrt((1 + 1 + 4) / 3))
+    mean = np.array([2.0, 2 / 3])
+    assert figures.bias_m == pytest.approx(2 / 3)
+    spread = [np.sum((np.array(e) - mean) ** 2) for e in estimates.values()]
+    assert figures.deviation_m == pytest.approx(np.sqrt(np.mean(spread)))
+    assert figures.component_rmse_m == pytest.approx([1.0, 2.0])
+    assert figures.component_deviation_m == pytest.approx([1.0, 0.0])
+    assert figures.consensus_error_m == pytest.approx(np.sqrt((0 + 0 + 4) / 3))
+    assert figures.position_rmse_m == pytest.approx(1.0)
+    assert figures.fix_rmse_m == pytest.approx(2.0)
+    assert figures.common_error_anees == pytest.approx(6 / 3 / 2)
+    assert figures.not_finite == 0
+    assert summarize(metrics.rows)["bias_m"] == pytest.approx(2 / 3)
+
+
+def test_who_reports_nothing_leaves_nulls_and_nan_is_counted() -> None:
+    position = np.array([[0.0, 0.0], [10.0, 0.0]])
+    metrics = Metrics(["a", "b"], np.array([0, 0]), 100_000_000)
+    figures = metrics.record(instant(position, [2.0, 0.0]), [])
+    assert figures.common_error_rmse_m is None
+    assert figures.position_rmse_m is None
+    assert figures.reporting == 0
+    broken = Report(0, "a", (float("nan"), 0.0), None, {"x": [float("inf")], "common_error_m": [1.0]})
+    assert metrics.record(instant(position, [2.0, 0.0]), [broken]).not_finite == 1
+    assert metrics.states_table().num_rows == 4
+    assert metrics.metrics_table()["not_finite"].to_pylist() == [0, 1]
+
+
+def test_a_run_folder_never_takes_anothers_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenario = Scenario()
+    first, second = (RunFolder.create(None, scenario) for _ in range(2))
+    assert first.path != second.path
+    assert (tmp_path / "runs" / "latest").resolve() == second.path.resolve()
+    with pytest.raises(VnetError, match="is not an empty folder"):
+        RunFolder.create(first.path, scenario)
+    (tmp_path / "file").touch()
+    with pytest.raises(VnetError, match="cannot write"):
+        RunFolder.create(tmp_path / "file" / "run", scenario)
+
+
+def test_events_are_on_disk_at_once_and_a_torn_line_is_no_harm(tmp_path: Path) -> None:
+    folder = RunFolder.create(tmp_path / "run", Scenario())
+    folder.event(5, "died", "v01", how="SIGKILL")
+    with (folder.path / "events.jsonl").open("a") as file:
+        file.write('{"time_ns": 6, "ki')
+    assert read_events(folder.path) == [Event(5, "died", "v01", {"how": "SIGKILL"})]
+    assert json.loads((folder.path / "events.jsonl").read_text().splitlines()[0])["kind"] == "died"

@@ -1,0 +1,259 @@
+"""Reports, the index and comparisons: what stands in the pages, and what must not."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from emulator.checks.judge import read_evidence
+from emulator.cli import report as report_cli
+from emulator.cli.commands import app
+from emulator.records.radio_metrics import radio_metrics
+from emulator.records.verdict_file import read_record
+from emulator.report.compare_page import comparison_page
+from emulator.report.comparison import Comparison
+from emulator.report.index import write_index
+from emulator.report.write import key_figures, write_report
+from tests.support.paths import ROOT
+from vnet.errors import VnetError
+
+EVIL = "<script>alert(1)</script>"
+
+
+class Page(HTMLParser):
+    """The text of a page, its ids, and all that it refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.tags: list[str] = []
+        self.feed(text)
+        self.text = " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            if name in ("href", "src", "data", "action"):
+                self.references.append(value or "")
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def vnet(arguments: list[str]) -> Any:
+    """Run a command in this process; without a fixed hash seed, it would start itself anew."""
+    return CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
+
+
+def simulate(folder: Path, *options: str, scenario: str = "faults.toml") -> Path:
+    arguments = ["simulate", str(ROOT / "scenarios" / scenario), "--out", str(folder), *options]
+    done = vnet(arguments)
+    assert (folder / "verdict.json").exists(), done.output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def cooperative(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run of the flagship."""
+    options = ("--duration", "2", "--no-report", "--set", "program.options.particles=50")
+    return simulate(tmp_path_factory.mktemp("runs") / "coop", *options, scenario="twelve.toml")
+
+
+@pytest.fixture(scope="module")
+def beacon_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("beacon") / "runs" / "beacon-1"
+    return simulate(folder, "--duration", "2", "--no-report", scenario="beacon.toml")
+
+
+@pytest.fixture
+def beacon(beacon_run: Path, tmp_path: Path) -> Path:
+    """A copy that a test may break."""
+    return Path(shutil.copytree(beacon_run, tmp_path / "runs" / "beacon-1"))
+
+
+def page_of(folder: Path) -> Page:
+    return Page(write_report(folder).read_text())
+
+
+def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: Path) -> None:
+    page = page_of(cooperative)
+    for label in ("common error (m)", "RMSE of position (m)", "emulated time (s)", "latency (ms)", "distance (km)"):
+        assert label in page.text
+    record = read_record(cooperative)
+    assert f"{record.figures['common_error_rmse_m']:.3f} m" in page.text
+    for name, value in key_figures(record).items():
+        assert f"{name} {value}" in page.text
+    assert record.trace_sha256 in page.text and record.reproduce in page.text
+    assert "common-error" in page.ids and len(page.ids) == len(set(page.ids))
+
+
+def test_a_report_needs_nothing_from_elsewhere(cooperative: Path) -> None:
+    page = page_of(cooperative)
+    assert page.references and all(reference.startswith("#") for reference in page.references)
+    assert "script" not in page.tags
+    assert "url(http" not in (cooperative / "report.html").read_text()
+
+
+def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path) -> None:
+    page = page_of(beacon)
+    assert "common-error" not in page.ids and "latency" in page.ids
+    assert re.search(r"Not shown, and why .*Common error.*: no program reported what it needs", page.text)
+
+
+def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
+    run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
+    page = page_of(run)
+    assert "busy ratio (%)" in page.text and "expected: " not in page.text
+    figures = radio_metrics(read_evidence(run))
+    assert f"delivered {100 * figures.totals['delivery_ratio']:.1f} %" in page.text
+    assert f"busy ratio {100 * figures.totals['busy_ratio_mean']:.1f} %" in page.text
+    assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text
+    worst = figures.worst_links(1).to_pylist()[0]
+    assert f"{worst['sender']} {worst['receiver']} {worst['pairs']}" in page.text
+    assert "time (ms)" in page.text and "all frames, by 200 m" in page.text
+    (run / "busy.parquet").unlink()
+    assert "busy" not in page_of(run).ids
+    reason = r"Not shown, and why .*Busy ratio of the medium.*: .*no busy\.parquet in it"
+    assert re.search(reason, page_of(run).text)
+    assert "age of information" in page_of(run).text, "the rest of the radio's figures stay"
+
+
+def test_what_others_wrote_is_text(beacon: Path) -> None:
+    verdict = json.loads((beacon / "verdict.json").read_text())
+    check = {"name": EVIL, "verdict": "invalid", "text": EVIL, "figures": {"rows": [{"sender": EVIL}], EVIL: EVIL}}
+    verdict["checks"].append(check)
+    verdict["reproduce"] = EVIL
+    (beacon / "verdict.json").write_text(json.dumps(verdict))
+    with (beacon / "events.jsonl").open("a") as events:
+        events.write(json.dumps({"time_ns": 1, "kind": "crashed", "node": EVIL, "error": EVIL}) + "\n")
+    (beacon / "scenario.toml").write_text((beacon / "scenario.toml").read_text() + f"# {EVIL}\n")
+    evil = beacon.rename(beacon.with_name("<img src=x>"))
+    text = write_report(evil).read_text()
+    index = write_index(evil.parent).read_text()
+    assert EVIL not in text and "<img" not in text + index
+    page = Page(text)
+    assert "script" not in page.tags and page.text.count(EVIL) >= 7
+    assert "the first offending rows" in page.text
+
+
+@pytest.mark.parametrize(
+    "lost", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
+)
+def test_a_run_that_lost_a_file_has_a_report_that_says_so(beacon: Path, lost: str) -> None:
+    (beacon / lost).unlink()
+    page = page_of(beacon)
+    assert lost.removesuffix(".parquet") in page.text
+    if lost == "verdict.json":
+        assert "no verdict" in page.text and "Nothing was judged" in page.text
+
+
+def test_figures_that_need_no_metrics_are_drawn_without_them(beacon: Path) -> None:
+    (beacon / "metrics.parquet").write_bytes(b"no table")
+    page = page_of(beacon)
+    assert {"outcomes", "totals", "links", "latency", "ages", "degrees"} <= set(page.ids)
+    assert "metrics.parquet cannot be read" in page.text
+
+
+def test_a_verdict_that_cannot_be_read_is_not_taken_for_a_run_that_goes_on(beacon: Path) -> None:
+    (beacon / "verdict.json").write_text("{")
+    page = page_of(beacon)
+    assert "The verdict of this run cannot be read." in page.text and "still going on" not in page.text
+    assert "verdict.json: not JSON" in page.text
+
+
+def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
+    done = vnet(["report", str(tmp_path)])
+    assert done.exit_code == 2 and "not a run's folder" in done.output and done.output.count("\n") == 1
+
+
+def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Path) -> None:
+    runs = beacon.parent
+    (runs / "latest").symlink_to("beacon-1")
+    (runs / "broken-1").mkdir()
+    (runs / "broken-1" / "verdict.json").write_text("{")
+    (runs / "half-1").mkdir()
+    shutil.copy(beacon / "scenario.toml", runs / "half-1")
+    (runs / "notes").mkdir()
+    write_report(beacon)
+    page = Page((runs / "index.html").read_text())
+    assert "3 runs" in page.text and "notes" not in page.text
+    assert page.text.count("beacon-1") == 1 and "beacon-1 · latest" in page.text.replace("  ", " ")
+    assert "broken verdict.json: not JSON" in page.text.replace("broken-1 ", "broken ", 1)
+    assert "no verdict.json: it is still going on" in page.text
+    assert "./beacon-1/report.html" in page.references and "./half-1/" in page.references
+    assert not list(runs.glob(".*.part"))
+    share = read_record(beacon).share_of("delivered")
+    assert share is not None and f"{100 * share:.2f}" in page.text
+
+
+def test_simulate_writes_the_report_and_a_failure_leaves_the_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenario = str(ROOT / "scenarios" / "beacon.toml")
+    arguments = ["simulate", scenario, "--duration", "2", "--out"]
+    written = vnet([*arguments, str(tmp_path / "one")])
+    assert (tmp_path / "one" / "report.html").exists() and "report.html" in written.output.replace("\n", "")
+
+    def fail(folder: Path) -> Path:
+        raise RuntimeError("no ink")
+
+    monkeypatch.setattr(report_cli, "_write_report", fail)
+    failed = vnet([*arguments, str(tmp_path / "two")])
+    assert failed.exit_code == written.exit_code == 0
+    assert "the report could not be written" in failed.output and "no ink" in failed.output
+    left_out = vnet([*arguments, str(tmp_path / "three"), "--no-report"])
+    assert left_out.exit_code == 0 and "could not be written" not in left_out.output
+
+
+def test_compare_finds_a_planted_difference(beacon_run: Path, beacon: Path, tmp_path: Path) -> None:
+    same = vnet(["compare", str(beacon_run), str(beacon)])
+    assert same.exit_code == 0 and "two runs agree" in same.output
+    trace = pq.read_table(beacon / "trace.parquet")
+    size = trace["size_bytes"].to_pylist()
+    size[7] += 1
+    place = trace.column_names.index("size_bytes")
+    planted = trace.set_column(place, "size_bytes", pa.array(size, trace.schema.field(place).type))
+    pq.write_table(planted, beacon / "trace.parquet")
+    out = tmp_path / "both.html"
+    done = vnet(["compare", str(beacon_run), str(beacon), "--out", str(out)])
+    assert done.exit_code == 1
+    assert "first in row 7 of the trace: size_bytes" in done.output
+    page = Page(out.read_text())
+    assert (
+        "first in row 7 of the trace: size_bytes" in page.text
+        and f"size_bytes {size[7] - 1} {size[7]}" in page.text
+    )
+    assert "latency (ms)" in page.text
+    assert all(reference.startswith("#") for reference in page.references)
+
+
+def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(cooperative, tmp_path / "other"))
+    text = (other / "scenario.toml").read_text()
+    (other / "scenario.toml").write_text(text.replace("seed = 1\n", "seed = 5\n", 1))
+    verdict = json.loads((other / "verdict.json").read_text())
+    verdict["figures"]["common_error_rmse_m"] += 0.25
+    (other / "verdict.json").write_text(json.dumps(verdict))
+    comparison = Comparison.of(cooperative, other)
+    assert comparison.same_trace
+    assert comparison.scenario == [{"key": "run.seed", "A": "1", "B": "5"}]
+    assert comparison.figures[0]["B − A"] == "+0.250"
+    page = Page(comparison_page(comparison))
+    assert "RMSE of the common error (m)" in page.text and "run.seed 1 5" in page.text
+
+
+def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> None:
+    (beacon / "states.parquet").unlink()
+    with pytest.raises(VnetError, match=r"states\.parquet"):
+        Comparison.of(beacon_run, beacon)

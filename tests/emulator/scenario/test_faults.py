@@ -1,0 +1,280 @@
+"""Faults as data: what may be written down, what is said where it may not, and that it survives being written."""
+
+import json
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.faults.plan import FaultPlan
+from emulator.faults.selectors import Nodes
+from emulator.scenario import faults
+from emulator.scenario.faults import KINDS, Fault, parse_fault
+from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
+from vnet.errors import ScenarioError
+
+REQUIRED: dict[str, dict[str, Any]] = {
+    "loss": {"probability": 0.5},
+    "delay": {"delay_ms": 20.0},
+    "jitter": {"jitter_ms": 30.0},
+    "throttle": {"bitrate_mbps": 0.1},
+    "range": {"range_m": 500.0},
+    "gnss_jump": {"offset_m": (3.0, -4.0)},
+    "gnss_ramp": {"rate_m_s": (1.0, 0.5)},
+    "skew": {"offset_ms": 250.0},
+    "drift": {"rate_ppm": 300.0},
+}
+"""What a kind cannot do without."""
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "partition": {"groups": "halves"},
+    "burst_loss": {"enter": 0.05, "leave": 0.3, "loss_bad": 1.0, "loss_good": 0.0},
+    "reorder": {"probability": 0.2, "delay_ms": 150.0},
+    "duplicate": {"probability": 0.2, "copies": 1, "delay_ms": 10.0},
+    "corrupt": {"probability": 0.2, "flips": 1},
+    "swizzle": {"over_s": None},
+    "ConstPosOffset": {"offset_m": (50.0, 0.0)},
+    "RandomPos": {"radius_m": 300.0},
+    "DataReplay": {"age_s": 1.0},
+    "StaleMessages": {"age_s": 1.0},
+    "DoS": {"factor": 10},
+    "Sybil": {"ghosts": 3},
+    "emulator_restart": {"down_s": 1.0, "duration_s": 0.001},
+    "router_restart": {"down_s": 1.0, "duration_s": 0.001},
+}
+NODES = Nodes([f"v{n}" for n in range(1, 7)], np.arange(12.0).reshape(6, 2), np.array([0, 1, 2, 3, 4, 5]))
+
+
+def minimal(kind: str, **more: Any) -> dict[str, Any]:
+    return {"kind": kind, "duration_s": 2.0, **REQUIRED.get(kind, {}), **more}
+
+
+def plan(written: list[dict[str, Any]], together: int = 1, duration_s: float = 30.0) -> FaultPlan:
+    run = {"nodes_per_process": together, "duration_s": duration_s}
+    return FaultPlan(Scenario.model_validate({"run": run, "fault": written}), NODES)
+
+
+def test_the_kinds_are_those_of_the_module() -> None:
+    models = [m for m in vars(faults).values() if isinstance(m, type) and "kind" in getattr(m, "model_fields", {})]
+    assert sorted(KINDS) == sorted(get_args(m.model_fields["kind"].annotation)[0] for m in models)
+    assert len(KINDS) >= 29
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_has_its_defaults_and_says_what_it_lacks(kind: str) -> None:
+    fault = parse_fault(minimal(kind))
+    for key, value in {"at_s": 0.0, "duration_s": 2.0, **DEFAULTS.get(kind, {}), **REQUIRED.get(kind, {})}.items():
+        assert getattr(fault, key) == (2.0 if key == "duration_s" else value)
+    needed = [*REQUIRED.get(kind, {}), *([] if kind.endswith("r_restart") else ["duration_s"])]
+    for key in needed:
+        less = minimal(kind)
+        del less[key]
+        with pytest.raises(ScenarioError, match=rf"^fault: {kind}\.{key}: field required$"):
+            parse_fault(less)
+
+
+WRONG = [
+    ("kill", {"duration_s": 0}, ["kill.duration_s = 0", "greater than 0"]),
+    ("kill", {"duration_s": 1e9}, ["kill.duration_s = 1000000000.0", "less than or equal to 86400"]),
+    ("kill", {"at_s": -1}, ["kill.at_s = -1", "greater than or equal to 0"]),
+    ("kill", {"at_s": float("nan")}, ["kill.at_s = nan", "finite"]),
+    ("kill", {"duration_s": "long"}, ["kill.duration_s = 'long'", "number"]),
+    ("kill", {"senders": {}}, ["kill.senders: unknown key", "at_s, duration_s, kind, nodes"]),
+    ("kill", {"nodes": ["v1"]}, ["kill.nodes = ['v1']", "dictionary"]),
+    ("kill", {"nodes": {"rando": 2}}, ["kill.nodes.rando: unknown key", "degree, disc, fraction, ids"]),
+    ("kill", {"nodes": {"ids": ["v1"], "random": 1}}, ["kill.nodes: ids and random exclude each other"]),
+    ("kill", {"nodes": {"fraction": 0}}, ["kill.nodes.fraction = 0", "greater than 0"]),
+    ("kill", {"nodes": {"fraction": 1.1}}, ["kill.nodes.fraction = 1.1", "less than or equal to 1"]),
+    ("kill", {"nodes": {"random": 0}}, ["kill.nodes.random = 0", "greater than or equal to 1"]),
+    ("kill", {"nodes": {"disc": [0, 0, -1]}}, ["kill.nodes.disc.2 = -1", "greater than 0"]),
+    ("kill", {"nodes": {"polygon": [[0, 0], [1, 1]]}}, ["kill.nodes.polygon", "at least 3"]),
+    ("kill", {"nodes": {"degree": [3, 2]}}, ["kill.nodes: degree = [least, most] is upside down"]),
+    ("kill", {"nodes": {"degree": [-1, 2]}}, ["kill.nodes.degree.0 = -1", "greater than or equal to 0"]),
+    ("partition", {"groups": "thirds"}, ["partition.groups = 'thirds': write halves, one, ring, or lists of ids"]),
+    ("partition", {"groups": [["v1"], 3]}, ["partition.groups = [['v1'], 3]: write halves"]),
+    ("partition", {"groups": [["v1"], [3]]}, ["partition.groups = [['v1'], [3]]: write halves"]),
+    ("partition", {"groups": [["v1"], ["v1"]]}, ["partition.groups", "'v1' is in two groups"]),
+    ("partition", {"nodes": {}}, ["partition.nodes: unknown key", "groups"]),
+    ("loss", {"probability": 1.01}, ["loss.probability = 1.01", "less than or equal to 1"]),
+    ("burst_loss", {"leave": 0}, ["burst_loss.leave = 0", "greater than 0"]),
+    ("delay", {"delay_ms": 0}, ["delay.delay_ms = 0", "greater than 0"]),
+    ("duplicate", {"copies": 21}, ["duplicate.copies = 21", "less than or equal to 20"]),
+    ("corrupt", {"flips": 1.5}, ["corrupt.flips = 1.5", "integer"]),
+    ("throttle", {"bitrate_mbps": 0}, ["throttle.bitrate_mbps = 0", "greater than or equal to 0.0001"]),
+    ("gnss_jump", {"offset_m": [1]}, ["gnss_jump.offset_m.1", "required"]),
+    ("gnss_jump", {"offset_m": [1, "east"]}, ["gnss_jump.offset_m.1 = 'east'", "number"]),
+    ("skew", {"offset_ms": 1e9}, ["skew.offset_ms", "less than or equal to 3600000"]),
+    ("drift", {"rate_ppm": -1e6}, ["drift.rate_ppm = -1000000.0", "greater than or equal to -500000"]),
+    ("DoS", {"factor": 1}, ["DoS.factor = 1", "greater than or equal to 2"]),
+]
+
+
+@pytest.mark.parametrize(("kind", "wrong", "parts"), WRONG, ids=lambda part: str(part)[:40])
+def test_what_is_wrong_is_one_line_here_and_in_a_scenario(
+    tmp_path: Path, kind: str, wrong: dict[str, Any], parts: list[str]
+) -> None:
+    data = minimal(kind, **wrong)
+    with pytest.raises(ScenarioError) as caught:
+        parse_fault(data)
+    assert all(part in str(caught.value) for part in parts), caught.value
+    assert str(caught.value).startswith(f"fault: {kind}.")
+    assert "\n" not in str(caught.value)
+    if "nan" in str(wrong):
+        return
+    path = tmp_path / "s.toml"
+    inline = json.dumps(data).replace('":', '" =')
+    path.write_text(f"fault = [{inline}]\n")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert all(part in str(caught.value) for part in parts), caught.value
+    assert str(caught.value).startswith(f"{path}: fault.0.{kind}.")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("data", "part"),
+    [
+        ({"duration_s": 1}, "a kind is needed"),
+        ({"kind": "quake", "duration_s": 1}, "kind = 'quake': must be one of ConstPosOffset, DataReplay, "),
+        ({"kind": "Kill", "duration_s": 1}, "kind = 'Kill' (did you mean kill?): must be one of "),
+        ([], "dictionary"),
+        (None, "dictionary"),
+        ("kill", "dictionary"),
+    ],
+)
+def test_what_is_no_fault_is_one_line(data: object, part: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        parse_fault(data)
+    assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+points = st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
+selectors = st.one_of(
+    st.just({}),
+    st.fixed_dictionaries({"ids": st.lists(st.sampled_from(NODES.ids), max_size=4, unique=True)}),
+    st.fixed_dictionaries({"fraction": st.floats(0, 1, exclude_min=True)}),
+    st.fixed_dictionaries({"random": st.integers(1, 9)}),
+    st.fixed_dictionaries({"disc": st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(1e-3, 99))}),
+    st.fixed_dictionaries({"polygon": st.lists(points, min_size=3, max_size=6)}),
+    st.fixed_dictionaries({"degree": st.tuples(st.integers(0, 3), st.integers(3, 9))}),
+)
+
+
+@st.composite
+def written_faults(draw: st.DrawFn) -> dict[str, Any]:
+    kind = draw(st.sampled_from(KINDS))
+    fault = minimal(kind, at_s=draw(st.floats(0, 24)), duration_s=draw(st.floats(1e-9, 86_400)))
+    fields = type(parse_fault(fault)).model_fields
+    for name in ("nodes", "senders", "receivers"):
+        if name in fields:
+            fault[name] = draw(selectors)
+    if kind == "partition":
+        groups = st.sampled_from(["halves", "one", "ring", [["v1", "v2"], ["v3"]], [["v2"]], []])
+        fault["groups"] = draw(groups)
+    if kind == "swizzle" and draw(st.booleans()):
+        fault["over_s"] = draw(st.floats(1e-6, 10))
+    return fault
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(written_faults(), max_size=5))
+def test_any_faults_survive_being_written_and_read(
+    tmp_path_factory: pytest.TempPathFactory, written: list[dict[str, Any]]
+) -> None:
+    original = Scenario.model_validate({"fault": written})
+    path = tmp_path_factory.mktemp("dump") / "s.toml"
+    path.write_text(dump_scenario(original))
+    assert load_scenario(path) == original
+    assert tuple(parse_fault(json.loads(fault.model_dump_json(exclude_none=True))) for fault in original.fault) == (
+        original.fault
+    )
+
+
+def same(one: FaultPlan, other: FaultPlan) -> bool:
+    """Whether two plans do the same at all times, by the same names and with the same luck."""
+    return [(p.label, p.start_ns, p.end_ns, p.nodes.tolist()) for p in one.faults] == [
+        (p.label, p.start_ns, p.end_ns, p.nodes.tolist()) for p in other.faults
+    ]
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(written_faults(), max_size=5), st.data())
+def test_a_plan_as_it_is_written_down_is_the_same_plan_whatever_was_healed(
+    tmp_path_factory: pytest.TempPathFactory, written: list[dict[str, Any]], data: st.DataObject
+) -> None:
+    original = plan(written)
+    for _ in range(data.draw(st.integers(0, 3))):
+        if original.faults:
+            label = data.draw(st.sampled_from([planned.label for planned in original.faults]))
+            original.heal(label, data.draw(st.integers(0, 26 * 10**9)))
+    scenario = Scenario.model_validate({"fault": original.as_written()})
+    path = tmp_path_factory.mktemp("dump") / "s.toml"
+    path.write_text(dump_scenario(scenario))
+    again = FaultPlan(load_scenario(path), NODES)
+    assert same(original, again)
+    instants = [t for p in original.faults for t in (p.start_ns, p.end_ns)]
+    for time_ns in [t + d for t in instants for d in (-1, 0, 1)]:
+        assert [p.label for p in original.active(time_ns)] == [p.label for p in again.active(time_ns)]
+
+
+def test_a_fault_that_was_healed_before_it_began_never_acts_in_the_replay_either() -> None:
+    """It stays in the list, because the numbers of the others depend on it."""
+    first = plan([minimal("kill", at_s=5.0), minimal("loss", at_s=6.0)])
+    first.heal("kill-0", 1_000_000_000)
+    again = FaultPlan(Scenario.model_validate({"fault": first.as_written()}), NODES)
+    assert all(not again.faults[0].acts_at(5_000_000_000 + d) for d in range(-2, 3))
+    assert again.faults[1].label == "loss-1"
+
+
+def test_unknown_ids_are_one_line_that_names_the_fault_and_who_there_is() -> None:
+    for key in ("ids", "groups"):
+        fault = (
+            minimal("kill", nodes={"ids": ["v1", "w9"]}) if key == "ids" else minimal("partition", groups=[["w9"]])
+        )
+        with pytest.raises(ScenarioError, match=r"-1: 'w9' is no vehicle of the network; they are v1, v2, .*v6$"):
+            plan([minimal("kill"), fault])
+    for key in ("nodes", "senders", "receivers"):
+        with pytest.raises(ScenarioError, match=r"^block-0: 'w9' is no vehicle"):
+            plan([minimal("block", **{key: {"ids": ["w9"]}})])
+
+
+@pytest.mark.parametrize("at_s", [25.0, 26.0, 24.9999999999])
+def test_a_fault_beyond_the_time_at_which_all_is_healed_is_refused(at_s: float) -> None:
+    with pytest.raises((ScenarioError, ValueError), match=r"at_s = 2\d(\.\d+)?: must be less than 25"):
+        plan([minimal("kill", at_s=at_s)])
+
+
+def test_all_faults_end_where_the_network_must_be_at_rest() -> None:
+    planned = plan([minimal("kill", at_s=20.0) | {"duration_s": 1000.0}, minimal("loss", at_s=22.0)]).faults
+    assert [p.end_ns for p in planned] == [25_000_000_000, 24_000_000_000]
+
+
+@pytest.mark.parametrize("kind", ["kill", "restart", "pause"])
+def test_parts_of_a_process_are_refused_with_the_names_of_the_others(kind: str) -> None:
+    with pytest.raises(
+        ScenarioError, match=rf"^{kind}-0: v3 shares a process with v4: name them all, or set run\."
+    ):
+        plan([minimal(kind, nodes={"ids": ["v1", "v2", "v3"]})], together=2)
+    assert plan([minimal(kind, nodes={"ids": ["v4", "v3"]})], together=2).faults[0].nodes.sum() == 2
+    assert plan([minimal(kind, nodes={"ids": ["v5", "v6"]})], together=4).faults[0].nodes.sum() == 2
+
+
+@pytest.mark.parametrize("kind", ["skew", "gnss_outage", "DoS", "throttle", "swizzle"])
+def test_other_faults_may_act_on_parts_of_a_process(kind: str) -> None:
+    assert plan([minimal(kind, nodes={"ids": ["v3"]})], together=2).faults[0].nodes.sum() == 1
+
+
+def test_no_fault_is_healed_that_is_not_there() -> None:
+    with pytest.raises(ScenarioError, match=r"^no fault 'loss-3'; there are: kill-0, loss-1$"):
+        plan([minimal("kill"), minimal("loss")]).heal("loss-3", 0)
+    with pytest.raises(ScenarioError, match=r"there are: none$"):
+        plan([]).heal("loss-3", 0)
+
+
+def test_a_fault_cannot_be_changed() -> None:
+    fault: Fault = parse_fault(minimal("loss"))
+    with pytest.raises(ValueError, match="frozen"):
+        fault.at_s = 3.0

@@ -1,0 +1,335 @@
+"""Scenario files: what is wrong is said in one line that names file, key, value and what is allowed."""
+
+import math
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from emulator.scenario.scenario import Scenario, dump_scenario, input_digests, load_scenario
+from tests.support.paths import ROOT
+from vnet.errors import ScenarioError, did_you_mean
+
+CSV = "id,x_m,y_m,heading_rad\na,0,0,0\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "s.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("[radio]\nlos = 0.1", ["radio.los", "unknown key", "loss", "max_peers"]),
+        ("[radoi]\nloss = 0.1", ["radoi", "unknown key", "radio"]),
+        ("[world.gnss]\nrate = 1", ["world.gnss.rate", "unknown key", "rate_hz"]),
+        ("[radio]\nloss = 2", ["radio.loss = 2", "less than or equal to 1"]),
+        ("[radio]\nloss = nan", ["radio.loss = nan", "finite"]),
+        ("[radio]\nloss = 'much'", ["radio.loss = 'much'", "number"]),
+        ("[run]\npacing = 'fast'", ["run.pacing = 'fast'", "'lockstep' or 'realtime'"]),
+        ("[run]\nname = 'a/b'", ["run.name = 'a/b'", "pattern"]),
+        ("[network]\nkind = 'file'", ["network", "path is required"]),
+        ("[network]\nkind = 'file'\npath = 'no.csv'", ["network.path = 'no.csv'", "no such file"]),
+        ("radio = 3", ["radio = 3"]),
+        ("[radio]\nloss = [0.1]", ["radio.loss = [0.1]", "number"]),
+        ("[radio]\nmax_peers = 2.5", ["radio.max_peers = 2.5", "integer"]),
+        ("[radio]\nmax_peers = 0", ["radio.max_peers = 0", "greater than or equal to 1"]),
+        ("[radio]\nloss = -0.1", ["radio.loss = -0.1", "greater than or equal to 0"]),
+        ("[run]\nduration_s = 0", ["run.duration_s = 0", "greater than 0"]),
+        ("[run]\nduration_s = inf", ["run.duration_s = inf", "finite"]),
+        ("[run]\nseed = 9223372036854775808", ["run.seed = 9223372036854775808", "less than"]),
+        ("[run]\nname = 3", ["run.name = 3", "string"]),
+        ("[world.gnss]\nheading = 'north'", ["world.gnss.heading = 'north'", "boolean"]),
+        ("[world]\ngnss = 1", ["world.gnss = 1"]),
+        ("[network]\nlayout = 'rural'", ["network.layout = 'rural'", "'urban' or 'dense'"]),
+        ("[network]\npath = 'n.csv'\nkind = 'generated'", ["network", "path is required"]),
+        ("[network]\nkind = 'file'\npath = '.'", ["network.path = '.'", "no such file"]),
+        ("[program]\noptions = 3", ["program.options = 3", "dictionary"]),
+        ("[program]\nentry = 'a.b:c; import d'", ["program.entry = 'a.b:c; import d'", "package.module:function"]),
+        ("[radio]\nlinks = 'no.csv'", ["radio.links = 'no.csv'", "no such file"]),
+        ("[radio]\nlinks = '.'", ["radio.links = '.'", "no such file"]),
+        ("[radio]\nlinks = 1", ["radio.links = 1", "name of a CSV file", "square matrix of 0 and 1"]),
+        ("[radio]\nlinks = []", ["radio.links = []", "name of a CSV file"]),
+        ("[radio.links]\na = 1", ["radio.links: ", "name of a CSV file"]),
+        ("[radio]\nlinks = [0, 1]", ["radio.links = [0, 1]", "not square: row 1 of 2"]),
+        ("[radio]\nlinks = [[0, 1], [1]]", ["radio.links = [[0, 1], [1]]", "not square: row 2 of 2"]),
+        ("[radio]\nlinks = [[0, 1]]", ["radio.links = [[0, 1]]", "not square: row 1 of 1"]),
+        ("[radio]\nlinks = [[0, 1], [2, 0]]", ["radio.links = [[0, 1], [2, 0]]", "row 2 holds 2", "0 or 1"]),
+        ("[radio]\nlinks = [[0, 'x'], [1, 0]]", ["radio.links = ", "row 1 holds 'x'", "0 or 1"]),
+        ("[radio]\nlinks = [[0, true], [1, 0]]", ["radio.links = ", "row 1 holds True", "0 or 1"]),
+        ("[radio", ["not valid TOML"]),
+        ("[run]\nseed = " + "9" * 5000, ["not valid TOML"]),
+        ("[run]\nseed = 0x" + "f" * 5000, ["run.seed = (int)", "64 bits"]),
+        ("[program.options]\na = " + "[" * 1000, ["not valid TOML", "nested more than 32 deep"]),
+        ("[program.options]\na = " + "[" * 40 + "]" * 40, ["program.options.a", "nested more than 32 deep"]),
+        ("a" + ".a" * 100_000 + " = 1", ["not valid TOML", "a key of more than 32 parts"]),
+        ("[program.options]\na = nan", ["program.options.a = nan", "a finite number is needed"]),
+        ("[program.options]\na = 1979-05-27", ["program.options.a = datetime.date(", "written as text"]),
+        ("[program.options]\na = 18446744073709551616", ["program.options.a = 18446744073709551616", "64 bits"]),
+        ("inputs = 3", ["inputs = 3", "a table of digests"]),
+        (
+            "[network]\nkind = 'file'\npath = \"\\u0000\"",
+            ["network.path = '\\x00'", "cannot be the name of a file"],
+        ),
+        ("[radio]\nlinks = '" + "a" * 5000 + "'", ["radio.links = 'aaa", "cannot be the name of a file"]),
+        ('"a\\nb" = 1', ["a\\nb: unknown key", "radio"]),
+        ("[[program.exceptions]]\nnodes = ['a']\nx = 1", ["program.exceptions.0.x: unknown key", "entry, nodes"]),
+        ("[world.gnss]\nrate_hz = 1e-300", ["world.gnss.rate_hz = 1e-300"]),
+        ("[radio]\nlatency_ms = 1e300", ["radio.latency_ms = 1e+300", "less than or equal to"]),
+        ("#" * (4 * 2**20 + 1), ["not valid TOML", "larger than"]),
+        ("[radio]\nloss = 0.1\nloss = much\n", ["not valid TOML", "line 3"]),
+        ("[program]\nentry = 'beacon'", ["program.entry = 'beacon'", "package.module:function"]),
+    ],
+)
+def test_what_is_wrong_is_one_line(tmp_path: Path, text: str, parts: list[str]) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(path))
+    assert all(part in message for part in parts), message
+
+
+def test_a_missing_scenario_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"no\.toml: cannot be read: No such file"):
+        load_scenario(tmp_path / "no.toml")
+
+
+def test_overrides_win_and_bare_words_are_strings(tmp_path: Path) -> None:
+    path = write(tmp_path, "[radio]\nloss = 0.1")
+    scenario = load_scenario(path, ["radio.loss=0.3", "program.options.fusion=random", "run.seed=7"])
+    assert scenario.radio.loss == 0.3
+    assert scenario.program.options == {"fusion": "random"}
+    assert scenario.run.seed == 7
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_bytes_that_are_no_scenario_are_one_line(tmp_path: Path, folder: bool) -> None:
+    path = tmp_path / "s.toml"
+    path.mkdir() if folder else path.write_bytes(b"\xff\xfe")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert str(caught.value).startswith(f"{path}: {'cannot be read' if folder else 'not valid TOML'}")
+
+
+@pytest.mark.parametrize(
+    ("override", "parts"),
+    [
+        ("radio.loss=2", ["radio.loss = 2", "less than or equal to 1"]),
+        ("radio.loss=", ["radio.loss = ''", "number"]),
+        ("radio.loss=much", ["radio.loss = 'much'", "number"]),
+        ("radio.los=0.1", ["radio.los", "unknown key", "loss"]),
+        ("raido.loss=0.1", ["raido", "unknown key", "radio"]),
+        ("run.pacing=fast", ["run.pacing = 'fast'", "'lockstep' or 'realtime'"]),
+    ],
+)
+def test_an_override_is_checked_like_the_file(tmp_path: Path, override: str, parts: list[str]) -> None:
+    path = write(tmp_path, "[radio]\nloss = 0.1")
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path, [override])
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(part in message for part in [str(path), *parts]), message
+
+
+def test_the_last_of_two_overrides_wins(tmp_path: Path) -> None:
+    assert load_scenario(write(tmp_path, ""), ["run.seed=2", "run.seed=3"]).run.seed == 3
+
+
+@pytest.mark.parametrize("override", ["radio", "radio.loss", "loss=3", ".x=1", "radio.loss.x=1"])
+def test_a_wrong_override_says_how_it_is_written(tmp_path: Path, override: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(write(tmp_path, "[radio]\nloss = 0.1"), [override])
+    assert override in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_dumped_scenario_is_the_same_scenario(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    original = load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'\n[radio]\nloss = 0.123"))
+    again = tmp_path / "elsewhere.toml"
+    again.write_text(dump_scenario(original))
+    assert load_scenario(again) == original
+
+
+def keys(section: BaseModel, prefix: str = "") -> list[str]:
+    """Every key of a scenario, as it stands after --set; those that have no default are left out."""
+    found: list[str] = []
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        inner = keys(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else [f"{prefix}{name}"]
+        found += inner if value is not None else []
+    return found
+
+
+def test_a_dump_spells_out_every_default(tmp_path: Path) -> None:
+    dumped = tomllib.loads(dump_scenario(Scenario()))
+    for key in keys(Scenario()):
+        value = dumped
+        for part in key.split("."):
+            assert part in value, key
+            value = value[part]
+
+
+OPTIONS = st.recursive(
+    st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**63 - 1),
+    loss=st.floats(0, 1),
+    duration_s=st.floats(0, 86_400, exclude_min=True),
+    layout=st.sampled_from(["urban", "dense"]),
+    options=st.dictionaries(st.text(), OPTIONS, max_size=4),
+)
+def test_any_scenario_survives_its_dump(
+    tmp_path_factory: pytest.TempPathFactory,
+    seed: int,
+    loss: float,
+    duration_s: float,
+    layout: str,
+    options: dict[str, object],
+) -> None:
+    original = Scenario.model_validate(
+        {
+            "run": {"seed": seed, "duration_s": duration_s},
+            "network": {"layout": layout},
+            "radio": {"loss": loss},
+            "program": {"options": options},
+        }
+    )
+    path = tmp_path_factory.mktemp("dump") / "s.toml"
+    path.write_bytes(dump_scenario(original).encode())
+    again = load_scenario(path)
+    assert again == original
+    assert math.copysign(1, again.radio.loss) == math.copysign(1, loss)
+
+
+def test_a_changed_input_file_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    original = load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'"))
+    recorded = tmp_path / "recorded.toml"
+    recorded.write_text(dump_scenario(original))
+    (tmp_path / "n.csv").write_text(CSV.replace("0,0,0", "0,1,0"))
+    with pytest.raises(ScenarioError, match=r"n\.csv has changed"):
+        load_scenario(recorded)
+
+
+def test_an_input_file_that_is_gone_is_noticed(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    recorded = tmp_path / "recorded.toml"
+    recorded.write_text(dump_scenario(load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'"))))
+    (tmp_path / "n.csv").unlink()
+    with pytest.raises(ScenarioError, match=r"n\.csv'?: no such file"):
+        load_scenario(recorded)
+
+
+def test_a_digest_is_the_sha256_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_bytes(b"abc")
+    scenario = load_scenario(write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'"))
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2's own example
+    assert input_digests(scenario) == {str((tmp_path / "n.csv").resolve()): known}
+
+
+def test_a_network_file_is_looked_for_beside_its_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    path = write(tmp_path, "[network]\nkind = 'file'\npath = 'n.csv'")
+    (tmp_path / "else").mkdir()
+    monkeypatch.chdir(tmp_path / "else")
+    assert load_scenario(path).network.path == (tmp_path / "n.csv").resolve()
+
+
+def test_links_of_a_file_are_found_recorded_and_held_to_their_digest(tmp_path: Path) -> None:
+    (tmp_path / "n.csv").write_text(CSV)
+    links = tmp_path / "links.csv"
+    links.write_text("0\n")
+    text = "[network]\nkind = 'file'\npath = 'n.csv'\n[radio]\nlinks = 'links.csv'"
+    original = load_scenario(write(tmp_path, text))
+    assert original.radio.links == links.resolve()
+    assert set(input_digests(original)) == {str((tmp_path / name).resolve()) for name in ("n.csv", "links.csv")}
+    (tmp_path / "else").mkdir()
+    recorded = write(tmp_path / "else", dump_scenario(original))
+    assert load_scenario(recorded) == original
+    links.write_text("1\n")
+    with pytest.raises(ScenarioError, match=r"links\.csv has changed"):
+        load_scenario(recorded)
+
+
+def test_a_links_file_that_may_not_be_read_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "links.csv").write_text("0\n")
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may read whatever it likes
+    with pytest.raises(ScenarioError, match=r"s\.toml: radio\.links = 'links\.csv': not readable: .*links\.csv$"):
+        load_scenario(write(tmp_path, "[radio]\nlinks = 'links.csv'"))
+
+
+@pytest.mark.parametrize("by", ["file", "override"])
+def test_links_written_out_survive_their_dump(tmp_path: Path, by: str) -> None:
+    key = "links = [[0, 1], [0, 0]]"
+    text, overrides = (f"[radio]\n{key}", []) if by == "file" else ("", [f"radio.{key.replace(' = ', '=')}"])
+    original = load_scenario(write(tmp_path, text), overrides)
+    assert original.radio.links == ((0, 1), (0, 0))
+    assert input_digests(original) == {}
+    assert load_scenario(write(tmp_path, dump_scenario(original))) == original
+
+
+def test_a_long_wrong_value_is_shown_by_its_beginning(tmp_path: Path) -> None:
+    links = [[0] * 50 for _ in range(49)]
+    with pytest.raises(ScenarioError, match="not square: row 1 of 49") as caught:
+        load_scenario(write(tmp_path, f"[radio]\nlinks = {links}"))
+    assert len(str(caught.value)) < len(str(tmp_path)) + 250
+
+
+def test_a_scenario_cannot_be_changed(tmp_path: Path) -> None:
+    scenario = load_scenario(write(tmp_path, ""))
+    with pytest.raises(ValueError, match="frozen"):
+        scenario.radio.loss = 1.0
+
+
+@pytest.mark.parametrize(("rate_hz", "period_ns"), [(10, 100_000_000), (3, 333_333_333), (1000, 1_000_000)])
+def test_times_are_whole_nanoseconds(rate_hz: float, period_ns: int) -> None:
+    scenario = Scenario.model_validate({"run": {"duration_s": 0.3}, "world": {"gnss": {"rate_hz": rate_hz}}})
+    assert scenario.period_ns == period_ns
+    assert scenario.duration_ns == 300_000_000
+
+
+def test_an_empty_file_is_a_valid_scenario(tmp_path: Path) -> None:
+    assert load_scenario(write(tmp_path, "")) == Scenario()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda path: path.stem)
+def test_every_scenario_that_is_shipped_loads(path: Path) -> None:
+    assert load_scenario(path).run.name == path.stem
+
+
+def test_some_vehicles_may_run_another_program(tmp_path: Path) -> None:
+    text = '[program]\nentry = "a:b"\n[[program.exceptions]]\nnodes = ["v1"]\nentry = "c:d"\noptions = {x = 1}\n'
+    program = load_scenario(write(tmp_path, text)).program
+    assert (program.of("v1").entry, program.of("v1").options) == ("c:d", {"x": 1})
+    assert (program.of("v2").entry, program.of("v2").options) == ("a:b", {})
+    with pytest.raises(ScenarioError, match="'v1' is in two exceptions"):
+        load_scenario(write(tmp_path, text + '[[program.exceptions]]\nnodes = ["v1"]\nentry = "c:d"\n'))
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("partion", " (did you mean partition?)"),
+        ("DOS", " (did you mean DoS?)"),
+        ("quake", ""),
+        ("", ""),
+        ("partition" * 100_000, ""),
+        (7, ""),
+    ],
+)
+def test_what_may_have_been_meant(word: object, meant: str) -> None:
+    assert did_you_mean(word, ["kill", "partition", "DoS", "range"]) == meant

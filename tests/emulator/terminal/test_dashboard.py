@@ -1,0 +1,304 @@
+"""The picture of a run: it says what is so, fits whatever terminal there is, and stays where it is."""
+
+import io
+import math
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
+from emulator.radio.outcomes import Outcome
+from emulator.records.run_folder import Event
+from emulator.report import figures as report_figures
+from emulator.terminal.dashboard import BAD_EVENTS, OUTCOMES, Dashboard, describe, is_bad, sparkline
+from emulator.viewer import drawing
+
+SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
+FAULTS = (
+    FaultState("kill-0", "ended", 4.0, 6.0, ("v02",)),
+    FaultState("ConstPosOffset-1", "acting", 9.0, 12.0, ("v01", "v03")),
+    FaultState("emulator_restart-12", "to come", 15.0, 15.001, ()),
+)
+EVENTS = (
+    Event(0, "started", None, {"start_up_s": 3.25}),
+    Event(4_000_000_000, "fault_started", None, {"fault": "kill-0", "nodes": ["v02"]}),
+    Event(9_200_000_000, "died", "v04", {"how": "SIGKILL", "log_tail": "a page\nof text"}),
+)
+
+
+def make(**changes: object) -> Snapshot:
+    """Twelve vehicles after ten of twenty seconds."""
+    falling = tuple(5.0 * 0.9**n for n in range(BINS // 2))
+    shot = Snapshot(
+        run="town",
+        pacing="realtime",
+        seed=7,
+        node_ids=tuple(f"v{n:02}" for n in range(1, 13)),
+        phase="running",
+        missing=(),
+        down=("v04",),
+        emulated_s=10.0,
+        duration_s=20.0,
+        join_timeout_s=60.0,
+        real_time_factor=2.5,
+        remaining_s=4.0,
+        idle_s=0.0,
+        wall_s=4.0,
+        common_error_rmse_m=0.21,
+        deviation_m=0.05,
+        position_rmse_m=0.43,
+        fix_rmse_m=6.31,
+        over_time=dict.fromkeys(FIGURES, falling),
+        frames_by_outcome={"delivered": 900, "lost": 100, "out_of_range": 77},
+        frames_per_s={"delivered": 60.0, "lost": 30.0, "receiver_down": 10.0, "out_of_range": 7.0},
+        faults=FAULTS,
+        events=EVENTS,
+        emulator_memory_mb=151.2,
+    )
+    return replace(shot, **changes)
+
+
+def render(
+    dashboard: Dashboard, width: int = 100, height: int = 30, color_system: str | None = "truecolor"
+) -> Console:
+    console = Console(
+        record=True,
+        width=width,
+        height=height,
+        force_terminal=True,
+        file=io.StringIO(),
+        color_system=color_system,
+        _environ={},
+    )
+    console.print(dashboard, end="")
+    return console
+
+
+def rows(shot: Snapshot, width: int = 100, height: int = 30) -> list[str]:
+    return render(Dashboard(shot), width, height).export_text().splitlines()
+
+
+def row(shot: Snapshot, label: str, width: int = 100, height: int = 30) -> str:
+    (found,) = [line for line in rows(shot, width, height) if line.startswith(label)]
+    return " ".join(found.split())
+
+
+def test_it_says_how_the_run_gets_on() -> None:
+    shot = make()
+    title = row(shot, "town")
+    assert title == "town realtime · seed 7 · 12 vehicles · emulator 151 MB 2.5× real time · 4 s left"
+    assert row(shot, "time").endswith("10.0 of 20 s 50%")
+    assert row(shot, "vehicles") == "vehicles ●●●○●●●●●●●● 11 up 1 down: v04"
+    assert row(shot, "common error").endswith("0.21 m RMSE")
+    assert row(shot, "deviation").endswith("0.05 m between vehicles")
+    assert row(shot, "position").endswith("0.43 m raw fixes 6.31 m")
+    assert row(shot, "frames").endswith("100 a second, in range")
+    shares = "■ delivered 60.0% 60/s ■ lost 30.0% 30/s ■ receiver down 10.0% 10/s"
+    assert shares in [" ".join(line.split()) for line in rows(shot)]
+    assert row(shot, "kill-0").endswith("over")
+    assert row(shot, "ConstPosOffset-1").endswith("acting, 2.0 s more")
+    assert row(shot, "emulator_rest…-12").endswith("in 5.0 s"), "the number is not cut off"
+    assert row(shot, "events") == "events 0.0 s started: all have joined in 3.2 s"
+    assert "  9.2 s  v04 died: SIGKILL" in "\n".join(rows(shot))
+
+
+def test_what_has_a_course_stands_over_one_axis() -> None:
+    def axis(label: str) -> str:
+        (line,) = [line for line in rows(make()) if line.startswith(label)]
+        return line[18:64]
+
+    assert axis("time") == "━" * 23 + "─" * 23
+    assert axis("common error").rstrip() == sparkline(make().over_time["common_error_rmse_m"], 46)
+    assert len(axis("common error").rstrip()) == 23
+    assert axis("kill-0").rstrip() == " " * 9 + "─" * 5, "from 4 to 6 of 20 s"
+    assert axis("ConstPos").rstrip() == " " * 20 + "━" * 8
+    assert axis("emulator").rstrip() == " " * 34 + "┄", "as short as it may be, it is to be seen"
+    assert axis("frames") == "█" * 46
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"phase": "joining", "missing": ("v02", "v03")},
+        {"phase": "starting"},
+        {"phase": "judging", "emulated_s": 20.0},
+        {"node_ids": tuple(f"vehicle-{n}" for n in range(500)), "down": tuple(f"vehicle-{n}" for n in range(90))},
+        {"faults": (), "events": (), "frames_per_s": {}},
+        {"faults": FAULTS * 20, "events": EVENTS * 3, "run": "r" * 64},
+        {"events": (Event(10**14, "crashed", "v01", {"error": "x\n\x1b[2J\r\ttab" + "漢字" * 200}),)},
+        {"common_error_rmse_m": math.inf, "deviation_m": 1e300, "real_time_factor": None, "remaining_s": None},
+        {"emulator_memory_mb": None, "idle_s": 86_400.0},
+    ],
+)
+def test_it_fits_whatever_terminal_there_is(width: int, height: int, changes: dict[str, object]) -> None:
+    console = render(Dashboard(make(**changes)), width, height)
+    text = console.export_text(clear=False)
+    lines = text.splitlines()
+    assert 0 < len(lines) < height, "the last line is the cursor's"
+    assert max(map(len, lines)) <= width
+    assert lines[0].startswith(("town"[:width], "r" * width, "rrrr"))
+    assert "\x1b[2J" not in text
+    assert not set(text) & set("\r\t\v\f")
+
+
+@pytest.mark.parametrize("height", [8, 12, 15, 24, 30, 60])
+def test_nothing_moves_while_events_and_frames_come(height: int) -> None:
+    shots = [make(), make(events=()), make(events=EVENTS[:1]), make(frames_per_s={}), make(down=())]
+    shots += [make(emulated_s=seconds) for seconds in (1.0, 19.9)]
+    places = set()
+    for shot in shots:
+        lines = rows(shot, height=height)
+        labels = [line.split()[0] if line[:1].strip() else "" for line in lines]
+        places.add(
+            (len(lines), *(labels.index(name) for name in ("time", "vehicles", "common", "frames", "events")))
+        )
+    assert len(places) == 1
+
+
+def test_a_short_terminal_keeps_what_is_worth_most() -> None:
+    labels = [line[:12].strip() for line in rows(make(), 60, 12)]
+    assert labels[:4] == ["town  realti", "time", "vehicles", "common error"]
+    assert len(labels) == 11
+    assert [line[:12].strip() for line in rows(make(), 60, 5)] == [
+        "town  realti",
+        "time",
+        "vehicles",
+        "common error",
+    ]
+
+
+def test_of_many_faults_those_that_act_are_shown_and_then_the_next() -> None:
+    ended = tuple(FaultState(f"loss-{n}", "ended", n, n + 1.0, ()) for n in range(8))
+    to_come = tuple(FaultState(f"delay-{n}", "to come", 12.0 + n, 14.0 + n, ()) for n in range(5))
+    shot = make(faults=(*ended, FAULTS[1], *to_come))
+    shown = [line.split()[0] for line in rows(shot, 100, 18) if line.startswith(("loss", "delay", "Const"))]
+    assert shown == ["ConstPosOffset-1", "delay-0", "delay-1", "delay-2"]
+    assert row(shot, "delay-2", 100, 18).endswith("+10")
+
+
+def test_what_nobody_reports_has_no_row() -> None:
+    nothing: dict[str, tuple[float | None, ...]] = {"common_error_rmse_m": (None,) * 60, "deviation_m": ()}
+    shot = make(over_time={**make().over_time, **nothing}, common_error_rmse_m=None, deviation_m=None)
+    text = "\n".join(rows(shot))
+    assert "common error" not in text
+    assert "deviation" not in text
+    assert "position" in text
+    assert "common error" in "\n".join(rows(replace(shot, emulated_s=0.5))), "it may still come"
+    fixes_only = replace(shot, over_time={**shot.over_time, "position_rmse_m": (None,)}, position_rmse_m=None)
+    assert row(fixes_only, "raw fixes").endswith("6.31 m RMSE")
+
+
+def test_joining() -> None:
+    shot = make(phase="joining", missing=("v02", "v11"), down=(), wall_s=12.0)
+    assert row(shot, "town").endswith("joining …")
+    assert row(shot, "joined").endswith("10 of 12 12 s, at most 60 s")
+    assert row(shot, "vehicles") == "vehicles ●○●●●●●●●●○●"
+    assert row(shot, "missing") == "missing v02, v11"
+
+
+@pytest.mark.parametrize(
+    ("changes", "later_s", "said"),
+    [
+        ({"idle_s": 3.0}, 1.0, "2.5× real time · 4 s left"),
+        ({"idle_s": 3.0}, 9.0, "no period for 12 s"),
+        ({"remaining_s": 0.0}, 0.0, "2.5× real time · ending"),
+        ({"remaining_s": 600.0}, 0.0, "2.5× real time · 10 min left"),
+        ({"remaining_s": 9000.0}, 0.0, "2.5× real time · 2 h 30 min left"),
+        ({"phase": "judging", "idle_s": 60.0}, 0.0, "judging the run"),
+    ],
+)
+def test_the_headline_says_how_fast_it_is_or_that_it_stands(
+    changes: dict[str, object], later_s: float, said: str
+) -> None:
+    lines = render(Dashboard(make(**changes), later_s)).export_text().splitlines()
+    assert lines[0].endswith(said)
+
+
+def test_colours_and_none() -> None:
+    output = render(Dashboard(make())).file.getvalue()
+    assert "\x1b[1;38;2;213;94;0mv04 died: SIGKILL\x1b[0m" in output, "what is bad is red"
+    assert "\x1b[1;38;2;213;94;0m  1 down: \x1b[0m" in output
+    plain = render(Dashboard(make()), color_system=None).file.getvalue()
+    assert "\x1b" not in plain
+    (bar,) = [line for line in plain.splitlines() if line.startswith("frames")]
+    assert bar.split()[1] == "█" * 28 + "▒" * 13 + "▤" * 5, "signs tell outcomes apart"
+
+
+@pytest.mark.parametrize(
+    ("width", "legend"),
+    [
+        (200, "■ delivered 80.0% 800/s ■ lost 10.0% 100/s ■ peer cap 3.0% 30/s ■ fault 7.0% 70/s"),
+        (80, "■ delivered 80.0% ■ lost 10.0% ■ peer cap 3.0% ■ fault 7.0%"),
+        (60, "■ delivered 80.0% ■ lost 10.0% …"),
+        (40, "■ delivered 80.0% …"),
+        (20, "…"),
+    ],
+)
+def test_the_legend_leaves_out_rates_and_then_the_least(width: int, legend: str) -> None:
+    shot = make(frames_per_s={"delivered": 800.0, "lost": 100.0, "peer_cap": 30.0, "fault": 70.0})
+    assert legend in [" ".join(line.split()) for line in rows(shot, width, 15)]
+
+
+def test_many_vehicles_share_a_dot_and_whoever_is_down_shows() -> None:
+    shot = make(node_ids=tuple(f"n{n}" for n in range(460)), down=("n459",))
+    assert row(shot, "vehicles") == f"vehicles {'●' * 45}○ 459 up 1 down: n459"
+    down = tuple(f"n{n}" for n in range(100))
+    assert row(replace(shot, down=down), "vehicles").endswith("360 up 100 down: n0, n1, … (100)")
+
+
+def test_a_status_has_no_room_for_what_is_to_come() -> None:
+    steady = render(Dashboard(make())).export_text().splitlines()
+    fleeting = render(Dashboard(make(), steady=False)).export_text().splitlines()
+    assert fleeting == steady[: len(fleeting)]
+    assert fleeting[-1].endswith("SIGKILL")
+    assert set(steady[len(fleeting) :]) == {""}
+
+
+@pytest.mark.parametrize("width", [1, 7, 46, 60, 119, 120])
+def test_a_sparkline_rises_and_falls_with_its_values(width: int) -> None:
+    rising = sparkline(tuple(1.1**n for n in range(BINS)), width)
+    assert len(rising) == width
+    assert list(rising) == sorted(rising)
+    if width > 6:
+        assert (rising[0], rising[-1]) == ("▁", "▇")
+    assert set(sparkline((0.3,) * BINS, width)) == {"▄"}, "what is steady does not look wild"
+    assert len(sparkline((1.0,) * (BINS // 2), width)) == math.ceil(width / 2)
+
+
+def test_a_sparkline_of_odd_values() -> None:
+    assert sparkline((None,) * 50, 20) == ""
+    assert sparkline((), 20) == ""
+    assert sparkline((None,) * 60 + (1.0,) * 60, 4) == "  ▄▄"
+    assert sparkline((1.0,) * 60 + (math.inf,) * 60, 4) == "▄▄▇▇"
+    assert sparkline((0.0,) * 60 + (1.0,) * 60, 4) == "▁▁▇▇"
+
+
+@pytest.mark.parametrize(
+    ("event", "said"),
+    [
+        (Event(0, "started", None, {"start_up_s": 0.0}), "started"),
+        (Event(0, "restarted", "v01", {"incarnation": 2}), "v01 restarted: incarnation 2"),
+        (Event(0, "fault_ended", None, {"fault": "loss-3"}), "loss-3 ended"),
+        (Event(0, "fault_started", None, {"fault": "loss-3", "nodes": []}), "loss-3 started"),
+        (Event(0, "refused", "v01", {"key": "k", "reason": "not its own"}), "v01 refused: not its own"),
+        (Event(0, "transport_gap", None, {"count": 3}), "transport gap: count 3"),
+        (Event(0, "crashed", "v01", {"error": "a\nb", "where": "line 1"}), "v01 crashed: a\\nb"),
+        (Event(0, "observer_ended", "recorder", {"how": "SIGTERM"}), "recorder observer ended: SIGTERM"),
+        (Event(0, "interrupted", None, {}), "interrupted"),
+    ],
+)
+def test_events_in_words(event: Event, said: str) -> None:
+    assert describe(event) == said
+    assert is_bad(event) is (event.kind in BAD_EVENTS)
+
+
+def test_every_outcome_of_a_pair_in_range_has_its_colour_and_its_sign_everywhere() -> None:
+    names = {outcome.name for outcome in Outcome} - {"pending", "out_of_range"}
+    assert set(OUTCOMES) == set(report_figures.OUTCOME_COLOURS) == names
+    assert {outcome.name for outcome in drawing.OUTCOME_COLOURS} == names
+    assert len({sign for _, sign in OUTCOMES.values()}) == len(names)
+    for colours in (OUTCOMES, report_figures.OUTCOME_COLOURS, drawing.OUTCOME_COLOURS):
+        assert len({str(colour) for colour in colours.values()}) == len(names)

@@ -1,0 +1,200 @@
+"""Campaigns find what is planted, shrink it, keep it, and go on whatever happens."""
+
+import io
+import json
+import signal
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from emulator.checks.judge import Verdict
+from emulator.scenario.faults import Pause
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.testing import campaign
+from emulator.testing.campaign import Plan, run_campaign
+from emulator.testing.matrix import column_of, count_verdicts, page
+from tests.support.paths import ROOT
+from vnet.errors import ProgramError, ScenarioError, VnetError
+
+
+def planted(program: str) -> Scenario:
+    return Scenario.model_validate(
+        {
+            "run": {"name": "planted", "duration_s": 2.0, "settle_s": 0.5},
+            "network": {"vehicles": 4},
+            "program": {"entry": f"tests.emulator.testing.programs:{program}"},
+        }
+    )
+
+
+def results_of(folder: Path) -> list[dict]:
+    return json.loads((folder / "campaign.json").read_text())["results"]
+
+
+def run(plan: Plan, folder: Path) -> tuple[int, str]:
+    """The exit status of a campaign, and what it said."""
+    said = io.StringIO()
+    return run_campaign(plan, folder, Console(width=200, file=said)), said.getvalue()
+
+
+def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    plan = Plan.of(planted("impatient"), "pause,loss,duplicate", 5, seed=1)
+    status, said = run(plan, folder)
+    assert status == 1
+    results = results_of(folder)
+    assert [row["seed"] for row in results] == list(range(1, 6))
+    failed = [row for row in results if "failed" in row]
+    assert failed
+    for row in failed:
+        assert list(row["failed"]) == ["agents_alive"]
+        assert "RuntimeError: where has the time gone?" in row["failed"]["agents_alive"]
+        shrunk = load_scenario(Path(row["folder"]) / "scenario.toml")
+        (fault,) = shrunk.fault
+        assert isinstance(fault, Pause)
+        assert len(fault.nodes.ids or ()) == 1
+        assert fault.duration_s <= 0.4
+        assert row["steps"] <= 50
+        again = json.loads((Path(row["folder"]) / "verdict.json").read_text())
+        assert again["verdict"] == "invalid"
+        assert row["folder"] in again["reproduce"]
+        assert 'kind = "pause"' in said
+    spared = [row for row in results if "failed" not in row]
+    assert all("pause" not in {fault["kind"] for fault in row["faults"]} for row in spared)
+    text = (folder / "campaign.html").read_text()
+    assert f"<h2>Failures: {len(failed)}</h2>" in text
+    assert "vnet simulate" in text
+
+
+def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    plan = Plan.of(planted("stubborn"), "kill", 1, seed=1, limit_s=2.0, shrink_steps=0)
+    assert run(plan, folder)[0] == 1
+    (row,) = results_of(folder)
+    assert row["failed"] == {"hung": "not over within 2 s of wall clock; logs/stacks.txt says where it stood"}
+    assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
+
+
+def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
+    plan = Plan.of(planted("proud"), "partition,block", 3, seed=1, shrink_steps=4)
+    run(plan, tmp_path / "proud")
+    assert any("finite" in row.get("failed", {}) for row in results_of(tmp_path / "proud"))
+    status, _ = run(Plan.of(planted("growing"), "loss", 1, seed=1, shrink_steps=2), tmp_path / "growing")
+    assert status == 1
+    (row,) = results_of(tmp_path / "growing")
+    assert list(row["failed"]) == ["growth"]
+    assert row["shrunk"] == "", "it grows without any fault"
+
+
+def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(futures: list) -> Iterator:
+        futures[0].result()
+        yield futures[0]
+        signal.raise_signal(signal.SIGTERM)
+
+    def write_under_fire(self: campaign.Campaign) -> None:
+        signal.raise_signal(signal.SIGINT)  # a second one
+        write(self)
+
+    write = campaign.Campaign.write
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(campaign, "as_completed", interrupted)
+    monkeypatch.setattr(campaign.Campaign, "write", write_under_fire)
+    status, _ = run(Plan.of(planted("impatient"), "loss", 40, seed=1, jobs=1), tmp_path / "campaign")
+    assert status == 130
+    assert signal.getsignal(signal.SIGTERM) == before
+    results = results_of(tmp_path / "campaign")
+    assert 1 <= len(results) < 40
+    assert results[0]["seed"] == 1
+    assert f"{len(results)} of 40 runs" in (tmp_path / "campaign" / "campaign.html").read_text()
+
+
+def test_what_cannot_be_a_campaign_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match="a campaign's runs take 20 s at most"):
+        Plan.of(Scenario(), "random", 1, 1)
+    with pytest.raises(ScenarioError, match="fault 'router_restart': must be one of"):
+        Plan.of(planted("impatient"), "router_restart", 1, 1)
+    with pytest.raises(ProgramError, match="has no 'missing'"):
+        Plan.of(planted("missing"), "random", 1, 1)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    with pytest.raises(VnetError, match="exists and is not an empty folder"):
+        run_campaign(Plan.of(planted("impatient"), "random", 1, 1), tmp_path / "full", Console(quiet=True))
+
+
+def test_the_command_says_by_its_status_whether_anything_failed(tmp_path: Path) -> None:
+    command = [sys.executable, "-P", "-m", "emulator.cli", "campaign", str(ROOT / "scenarios" / "beacon.toml")]
+    options = ["--runs", "2", "--duration", "1", "--set", "run.settle_s=0.2", "--set", "network.vehicles=3"]
+    out = tmp_path / "campaign"
+    done = subprocess.run(
+        [*command, *options, "--out", str(out)], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert "2 runs, 0 failed" in done.stderr
+    assert "Warning" not in done.stderr
+    assert len(results_of(out)) == 2
+
+
+class Reader(HTMLParser):
+    """Rows of a page's table, and whatever it would load from elsewhere."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.cells: list[str] = []
+        self.foreign: list[str] = []
+        self.feed(text)
+
+    inside = False
+
+    def handle_starttag(self, tag: str, attributes: list) -> None:
+        if tag in ("script", "link", "img", "iframe") or any("//" in (value or "") for _, value in attributes):
+            self.foreign.append(tag)
+        if tag == "td":
+            self.cells.append("")
+            self.inside = True
+
+    def handle_endtag(self, tag: str) -> None:
+        self.inside = self.inside and tag != "td"
+
+    def handle_data(self, data: str) -> None:
+        if self.inside:
+            self.cells[-1] += data
+
+
+def test_the_matrix_counts_by_kind_and_check() -> None:
+    valid, invalid, unknown = Verdict.VALID, Verdict.INVALID, Verdict.UNKNOWN
+    runs = [
+        (["kill", "loss"], {"range": valid, "bit:kill-0": valid, "bit:loss-1": unknown}),
+        (["kill", "kill"], {"range": invalid, "bit:kill-0": valid, "bit:kill-1": invalid}),
+    ]
+    assert column_of("bit:kill-0") == ("bit (its own)", "kill")
+    assert column_of("loss_rate") == ("loss_rate", None)
+    matrix = count_verdicts(runs)
+    assert matrix == {
+        "kill": {"range": Counter({valid: 1, invalid: 1}), "bit (its own)": Counter({valid: 2, invalid: 1})},
+        "loss": {"range": Counter({valid: 1}), "bit (its own)": Counter({unknown: 1})},
+    }
+
+
+def test_the_page_needs_nothing_else_and_escapes_what_programs_say() -> None:
+    matrix = count_verdicts([(["kill"], {"range": Verdict.VALID}), (["loss"], {"finite": Verdict.INVALID})])
+    failure = {
+        "number": "001",
+        "seed": 3,
+        "checks": {"finite": "<script>alert(1)</script>"},
+        "schedule": '[[fault]]\nkind = "loss"',
+        "command": "vnet simulate 'a & b'",
+        "folder": "failures/001",
+    }
+    text = page("Campaign <b>", ["2 of 2 runs"], matrix, [failure])
+    reader = Reader(text)
+    assert reader.foreign == []
+    assert [cell.replace("\xa0", " ") for cell in reader.cells] == ["1 ✓", "·", "·", "1 ✗"]
+    assert "Campaign &lt;b&gt;" in text
+    assert "http" not in text.replace("http-equiv", "")

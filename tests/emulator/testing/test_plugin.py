@@ -1,0 +1,289 @@
+"""The pytest plugin: tests that pass, fail, step, break and judge runs, as users write them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+pytest_plugins = "pytester"
+
+BEACON = ROOT / "scenarios" / "beacon.toml"
+TWELVE = ROOT / "scenarios" / "twelve.toml"
+
+
+def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.RunResult:
+    """Run a test module in a session of its own."""
+    header = f"import pytest\nBEACON = {str(BEACON)!r}\nTWELVE = {str(TWELVE)!r}\n"
+    pytester.makepyfile(header + code)
+    return pytester.runpytest(*options)
+
+
+def verdict_of(folder: Path) -> dict:
+    return json.loads((folder / "verdict.json").read_text())
+
+
+def test_a_coroutine_test_steps_a_run_and_checks_it(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+async def test_steps(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=4, duration=3) as emu:
+        assert emu.nodes == ["v01", "v02", "v03", "v04"]
+        assert emu.figures is None
+        await emu.run_until(1.0)
+        assert (emu.now_s, emu.figures.period) == (1.0, 9)
+        await emu.run_for(0.55)
+        assert emu.figures.period == 14
+        assert emu.states().num_rows == 15 * 4
+        assert {event.kind for event in emu.events} == {"started"}
+        first, second = emu.halves()
+        assert sorted(first + second) == emu.nodes and len(first) == len(second)
+        judgement = emu.check("conservation", "loss_rate")
+        assert judgement.trace_sha256
+""",
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_a_failed_check_names_the_folder_and_the_command(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+async def test_fails(vnet_emulation):
+    changes = dict(duration=2, settle=0.5, program="tests.emulator.testing.programs:impatient")
+    async with vnet_emulation(BEACON, vehicles=3, **changes) as emu:
+        await emu.run_until(1.0)
+        with emu.fault("pause", nodes=["v02"]):
+            await emu.run_for(0.5)
+        await emu.run_until(2.0)
+        emu.check()
+""",
+    )
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            "*agents_alive is invalid: 1 of 3 nodes: v02 crashed at 1.500 s: RuntimeError: where has*",
+            "*files: */vnet-1",
+            "*again: vnet simulate */vnet-1/scenario.toml",
+            "*- vnet -*",
+            "files  */vnet-1",
+            "again  vnet simulate */vnet-1/scenario.toml",
+        ]
+    )
+
+
+WRONG_STEPS = {
+    "emu.check('peer_cap')": "*peer_cap is unknown: not exercised: *",
+    "emu.check('speed')": "*VnetError: no check is called 'speed'; there are: conservation, *",
+    "emu.check('conservation', within_s=1)": "*none of these checks measured a recovery",
+    "await emu.run_until(3)": "*run_until(3): the run takes 2 s; give it a longer duration=",
+    "await emu.run_until(1); await emu.run_until(0.5)": "*run_until(0.5): it is 1 s already",
+    "emu.end(); await emu.run_for(1)": "*run_until: the run is over",
+    "with emu.fault('rain'): pass": "*ScenarioError: fault: *'rain'*must be one of*",
+    "with emu.fault('kill', nodes=['v9']): pass": "*'v9' is no vehicle of the network*",
+    "with emu.fault('emulator_restart'): pass": "*there is nothing here to restart",
+    "with emu.fault('partition'): await emu.run_until(2)": "*partition-0 would be healed at 1 s*",
+    "await emu.run_until(1)\n        with emu.fault('partition'): pass": "*all have healed by 1 s, *",
+}
+WRONG_SCENARIOS = {
+    "BEACON, speed=3": "*ScenarioError: speed: unknown; write section.key, or one of vehicles, *",
+    "BEACON, **{'radio.lost': 1}": "*ScenarioError: radio.lost: unknown key (did you mean loss?); allowed here:*",
+    "BEACON, **{'run.pacing': 'realtime'}": "*a test steps a run in lockstep*",
+    "{'network': {'vehicles': 0}}": "*ScenarioError: network.vehicles = 0:*",
+    "'nowhere.toml'": "*ScenarioError: nowhere.toml: cannot be read*",
+    "BEACON, program='nothing:main'": "*ProgramError: program.entry = 'nothing:main': cannot import*",
+}
+
+
+def test_what_cannot_be_is_said(pytester: pytest.Pytester) -> None:
+    steps = [
+        f"""
+async def test_step_{number}(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=2, duration=2, settle=1) as emu:
+        await emu.run_until(0.2)
+        {body}
+"""
+        for number, body in enumerate(WRONG_STEPS)
+    ]
+    scenarios = [
+        f"""
+async def test_scenario_{number}(vnet_emulation):
+    async with vnet_emulation({arguments}):
+        pass
+"""
+        for number, arguments in enumerate(WRONG_SCENARIOS)
+    ]
+    result = run_tests(pytester, "".join(steps + scenarios))
+    result.assert_outcomes(failed=len(WRONG_STEPS) + len(WRONG_SCENARIOS))
+    result.stdout.fnmatch_lines([*WRONG_STEPS.values(), *WRONG_SCENARIOS.values()])
+
+
+def test_a_program_that_crashes_the_test_itself_leaves_a_judged_run(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+async def test_stops(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=2, duration=9) as emu:
+        await emu.run_until(0.5)
+        assert emu.figures.reporting == 99
+""",
+    )
+    result.assert_outcomes(failed=1)
+    (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
+    assert verdict_of(folder)["emulated_s"] == 0.5
+
+
+def test_plain_tests_may_use_the_fixture_and_leave_others_alone(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+import asyncio
+
+def test_plain(vnet_emulation):
+    async def steps():
+        async with vnet_emulation(BEACON, vehicles=2, duration=1) as emu:
+            await emu.run_until(0.1)
+    asyncio.run(steps())
+
+def test_never_started(vnet_emulation):
+    emu = vnet_emulation(BEACON, vehicles=2)
+    for use in (emu.end, emu.check, lambda: asyncio.run(emu.run_until(1)), emu.fault("kill").__enter__):
+        with pytest.raises(Exception, match="the run has not started"):
+            use()
+
+async def test_of_nobody():
+    pass
+""",
+    )
+    result.assert_outcomes(passed=2, failed=1)
+    result.stdout.fnmatch_lines(["*async def functions are not natively supported*"])
+
+
+def test_a_test_that_another_plugin_has_taken_stays_with_it(pytester: pytest.Pytester) -> None:
+    pytester.makeconftest(
+        """
+import asyncio, pytest
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "asyncio: taken")
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    if pyfuncitem.get_closest_marker("asyncio"):
+        print("taken by the other")
+        asyncio.run(pyfuncitem.obj(**{n: pyfuncitem.funcargs[n] for n in pyfuncitem._fixtureinfo.argnames}))
+        return True
+"""
+    )
+    result = run_tests(
+        pytester,
+        """
+@pytest.mark.asyncio
+async def test_taken(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=2, duration=1) as emu:
+        await emu.run_until(0.1)
+""",
+        "-s",
+    )
+    result.assert_outcomes(passed=1)
+    result.stdout.fnmatch_lines(["*taken by the other*"])
+
+
+def test_a_step_that_was_cancelled_goes_on_and_the_next_waits_for_it(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+import asyncio
+
+async def test_cancelled(vnet_emulation):
+    async with vnet_emulation(TWELVE, vehicles=3, duration=2, settle=0.2) as emu:
+        step = asyncio.ensure_future(emu.run_until(0.5))
+        await asyncio.sleep(0)
+        step.cancel()
+        with pytest.raises(Exception, match="the run is on its way to 0.5 s"), emu.fault("kill"):
+            pass
+        await emu.run_until(1.0)
+        assert emu.figures.period == 9
+
+async def test_left_on_its_way(vnet_emulation):
+    async with vnet_emulation(TWELVE, vehicles=3, duration=2) as emu:
+        step = asyncio.ensure_future(emu.run_until(0.5))
+        await asyncio.sleep(0)
+        step.cancel()
+    assert emu.end().trace_sha256
+    assert emu.now_s == 0.5
+""",
+    )
+    result.assert_outcomes(passed=2)
+
+
+def test_hypothesis_calls_a_coroutine_test_again_and_again(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+from hypothesis import HealthCheck, given, settings, strategies
+
+@given(at_s=strategies.integers(1, 20))
+@settings(
+    deadline=None, derandomize=True, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+async def test_many(vnet_emulation, at_s):
+    async with vnet_emulation(BEACON, vehicles=2, duration=3) as emu:
+        await emu.run_until(at_s / 10)
+        assert at_s < 7
+""",
+    )
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*at_s=7*"])
+
+
+LIVE_OR_NOT = """
+@pytest.mark.parametrize("live", [False, True])
+async def test_both(vnet_emulation, live):
+    async with vnet_emulation(TWELVE, vehicles=3, duration=4, settle=0.5, live=live) as emu:
+        with emu.fault("block", senders=["v02"]):
+            await emu.run_until(0.5)
+        with emu.fault("kill", nodes=["v03"]), emu.fault("skew", nodes=["v01"], offset_ms=40):
+            await emu.run_for(0.3)
+        with emu.fault("partition", groups=emu.halves()):
+            await emu.run_for(0.25)
+            with emu.fault("pause"):
+                pass
+        await emu.run_for(0.3)
+        emu.check("conservation")
+    print(emu.folder)
+"""
+
+
+def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) -> None:
+    """What the test did, instant by instant, is in the scenario that it leaves."""
+    run_tests(pytester, LIVE_OR_NOT).assert_outcomes(passed=2)
+    folders = sorted((pytester.path.parent / "basetemp").glob("**/vnet-1"))
+    again = pytester.path / "again"
+    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(folders[0] / "scenario.toml")]
+    subprocess.run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, check=False, timeout=120)
+    fingerprints = [
+        (verdict["trace_sha256"], verdict["metrics_sha256"], verdict["emulated_s"])
+        for verdict in map(verdict_of, [*folders, again])
+    ]
+    assert len(folders) == 2
+    assert len(set(fingerprints)) == 1, fingerprints
+    assert "restarted" in (again / "events.jsonl").read_text()
+
+
+def test_the_plugin_is_installed_with_vnet() -> None:
+    text = (ROOT / "pyproject.toml").read_text()
+    assert '[project.entry-points.pytest11]\nvnet = "emulator.testing.plugin"' in text
+
+
+def test_the_plugin_imports_nothing_heavy() -> None:
+    """It is loaded into every session of the environment."""
+    code = (
+        "import sys, emulator.testing.plugin; print([m for m in ('numpy', 'zenoh', 'pyarrow') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

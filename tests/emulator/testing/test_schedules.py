@@ -1,0 +1,134 @@
+"""Random schedules fit their scenario, and hypothesis shrinks them to what was planted."""
+
+import tomllib
+
+import pytest
+from hypothesis import HealthCheck, Phase, find, given, settings
+from hypothesis.errors import NoSuchExample
+
+from emulator.faults.plan import FaultPlan
+from emulator.faults.selectors import Nodes
+from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Selector
+from emulator.scenario.scenario import Scenario
+from emulator.testing.campaign import Plan, schedule_toml
+from emulator.testing.schedules import SIMULATED_KINDS, known_kinds
+from emulator.testing.shrinking import Schedule, shrink
+from emulator.testing.strategies import faults
+from emulator.world.world import build_world
+from vnet.errors import ScenarioError
+
+SMALL = {"run": {"duration_s": 6.0, "settle_s": 1.0}, "network": {"vehicles": 6}}
+QUIET = settings(
+    deadline=None,
+    derandomize=True,
+    database=None,
+    max_examples=400,
+    phases=[Phase.generate, Phase.shrink],
+    suppress_health_check=list(HealthCheck),
+)
+
+
+def planned(schedule: Schedule, groups: int = 1) -> FaultPlan:
+    """The plan of a schedule in the small scenario. Raises ScenarioError if it does not fit."""
+    data = SMALL | {"run": SMALL["run"] | {"nodes_per_process": groups}, "fault": schedule}
+    scenario = Scenario.model_validate(data)
+    world = build_world(scenario)
+    start = world.at(0)
+    return FaultPlan(scenario, Nodes(world.node_ids, start.position_m, (start.position_m < 0).sum(axis=1)))
+
+
+@given(schedule=faults(SMALL))
+@settings(QUIET, max_examples=100)
+def test_what_is_drawn_fits_the_scenario(schedule: Schedule) -> None:
+    assert len(schedule) <= 4
+    for fault in planned(schedule).faults:
+        assert fault.end_ns <= 5e9
+        assert fault.end_ns - fault.start_ns == round(fault.fault.duration_s * 1e9)
+
+
+@given(schedule=faults(SMALL, kinds=["kill", "pause"], **{"run.nodes_per_process": 2}))
+@settings(QUIET, max_examples=40)
+def test_the_vehicles_of_a_process_are_hit_together(schedule: Schedule) -> None:
+    planned(schedule, groups=2)
+
+
+def test_a_pause_in_a_crowd_shrinks_to_the_shortest_of_one_vehicle() -> None:
+    def falls(schedule: Schedule) -> bool:
+        return any(
+            f.kind == "pause" and f.duration_s >= 0.7 and f.at_s >= 1 and "v03" in f.nodes.ids for f in schedule
+        )
+
+    smallest = find(faults(SMALL), falls, settings=settings(QUIET, max_examples=5000))
+    assert smallest == (Pause(kind="pause", at_s=1.0, duration_s=0.7, nodes=Selector(ids=("v03",))),)
+
+
+def test_two_faults_that_only_fail_together_both_stay() -> None:
+    def falls(schedule: Schedule) -> bool:
+        return {"loss", "partition"} <= {fault.kind for fault in schedule}
+
+    smallest = find(faults(SMALL, kinds=["partition", "loss"]), falls, settings=QUIET)
+    assert sorted(fault.kind for fault in smallest) == ["loss", "partition"]
+    assert all((fault.at_s, fault.duration_s) == (0.0, 0.1) for fault in smallest)
+
+
+def test_what_fails_without_faults_shrinks_to_none() -> None:
+    assert find(faults(SMALL), lambda schedule: True, settings=QUIET) == ()
+
+
+def test_only_the_kinds_that_were_asked_for_are_drawn() -> None:
+    with pytest.raises(NoSuchExample):
+        find(faults(SMALL, kinds=["kill"]), lambda s: any(fault.kind != "kill" for fault in s), settings=QUIET)
+    with pytest.raises(ScenarioError, match="fault 'rain': must be one of block, "):
+        faults(SMALL, kinds=["rain"])
+    assert set(KINDS) - set(SIMULATED_KINDS) == {"emulator_restart", "router_restart"}
+    assert known_kinds(None) == SIMULATED_KINDS
+
+
+def test_no_time_for_faults_is_said() -> None:
+    with pytest.raises(ScenarioError, match="leaves no time for faults"):
+        Plan.of(Scenario.model_validate({"run": {"duration_s": 3.0}}), "random", 1, 1)
+
+
+def test_a_campaign_draws_the_same_for_a_seed_and_every_kind_at_last() -> None:
+    scenario = Scenario.model_validate(SMALL)
+    plan = Plan.of(scenario, "random", 120, 5)
+    drawn = [plan.draw(number) for number in range(120)]
+    assert [plan.draw(number).fault for number in range(5)] == [run.fault for run in drawn[:5]]
+    assert Plan.of(scenario, "random", 1, 9).draw(0) == drawn[4], "a failure is had again by its seed alone"
+    assert {fault.kind for run in drawn for fault in run.fault} == set(SIMULATED_KINDS)
+    assert {len(run.fault) for run in drawn} == {1, 2, 3, 4}
+
+
+EVERYBODY = Selector(ids=("v01", "v02", "v03", "v04"))
+CROWD: Schedule = (
+    Kill(kind="kill", at_s=1.0, duration_s=4.0, nodes=EVERYBODY),
+    Loss(kind="loss", at_s=0.5, duration_s=3.2, probability=0.5, senders=EVERYBODY),
+    Partition(kind="partition", at_s=2.0, duration_s=2.0, groups=(("v01", "v02", "v03"),)),
+)
+
+
+def test_shrinking_drops_halves_and_shortens() -> None:
+    def falls(schedule: Schedule) -> bool:
+        return any(f.kind == "loss" and f.duration_s >= 0.5 and "v03" in (f.senders.ids or ()) for f in schedule)
+
+    smallest, steps = shrink(CROWD, falls)
+    assert smallest == (CROWD[1].model_copy(update={"senders": Selector(ids=("v03",)), "duration_s": 0.8}),)
+    assert steps <= 12
+
+
+def test_shrinking_stops_after_so_many_steps() -> None:
+    asked = []
+    smallest, steps = shrink(CROWD, lambda schedule: bool(asked.append(schedule)), most=3)
+    assert (smallest, steps, len(asked)) == (CROWD, 3, 3)
+
+
+def test_a_group_of_a_partition_shrinks_too() -> None:
+    smallest, _ = shrink(CROWD[2:], lambda schedule: bool(schedule) and "v03" in schedule[0].groups[0])
+    assert smallest[0].groups == (("v03",),)
+
+
+def test_a_schedule_is_printed_as_a_scenario_states_it() -> None:
+    text = schedule_toml(CROWD)
+    assert Scenario.model_validate({"run": {"duration_s": 20.0}} | tomllib.loads(text)).fault == CROWD
+    assert 'nodes.ids = ["v01", "v02", "v03", "v04"]' in text
+    assert schedule_toml(()) == ""

@@ -1,0 +1,365 @@
+"""Where recordings go: what may be chosen, what is listened at, and that all sinks get everything."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rerun as rr
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from emulator.viewer import sinks as sinks_module
+from emulator.viewer import watch
+from emulator.viewer.recorder import Recorder
+from emulator.viewer.sinks import (
+    ServeAt,
+    Sinks,
+    choose_sinks,
+    is_closed,
+    mend,
+    mending_command,
+    open_recording,
+    place_to_serve,
+    viewer_command,
+)
+from emulator.viewer.watch import Inbox, _record_all, _Taker
+from tests.support.paths import ROOT
+from tests.support.recordings import descendants, listening_addresses, read_back, rrd
+from vnet.errors import VnetError
+from vnet.transport import wire
+
+TIMEOUT_S = 60
+
+
+@pytest.fixture
+def no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@contextmanager
+def listening(port: int = 0) -> Iterator[int]:
+    """Something that listens at a port of the loopback interface."""
+    with socket.create_server(("127.0.0.1", port)) as server:
+        yield server.getsockname()[1]
+
+
+def wait_for(condition: object) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_what_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DISPLAY", ":0")
+    assert choose_sinks([]) is None
+    assert choose_sinks(["off"]) is None
+    assert choose_sinks(["save"]) == Sinks(Path("recording.rrd"))
+    served = choose_sinks(["serve"])
+    assert served is not None
+    assert (served.save, served.spawn) == (Path("recording.rrd"), False)
+    assert served.serve is not None
+    assert served.serve.address == "127.0.0.1"
+    spawned = choose_sinks(["save,spawn", "serve"], vehicle="v02")
+    assert spawned is not None
+    assert (spawned.save, spawned.spawn, spawned.vehicle) == (Path("recording.rrd"), True, "v02")
+    assert spawned.serve is not None
+    assert spawned.inside(Path("runs/x")).save == Path("runs/x/recording.rrd")
+
+
+@pytest.mark.parametrize(
+    ("words", "address", "port", "live", "told"),
+    [
+        (["sve"], None, None, True, "--rerun sve: one or more of spawn, serve, save, off are allowed"),
+        (["off", "save"], None, None, True, "--rerun off,save: off excludes the others"),
+        (["spawn"], None, None, True, "--rerun spawn: there is no display here"),
+        (["serve"], "localhost", None, True, "--rerun-bind localhost: an IP address of this machine is wanted"),
+        (["serve"], "203.0.113.7", None, True, "cannot listen at 203.0.113.7"),
+        (["serve"], None, 65535, True, "--rerun-port 65535: cannot listen at 127.0.0.1, this port and the next"),
+        (["serve"], None, 0, True, "0 is no port"),
+        (["save"], "0.0.0.0", None, True, "are for --rerun serve"),
+        (["serve"], None, None, False, "a simulation is not watched: save it, and look at it with vnet view"),
+    ],
+)
+def test_what_is_refused(
+    no_display: None, words: list[str], address: str | None, port: int | None, live: bool, told: str
+) -> None:
+    with pytest.raises(VnetError) as refused:
+        choose_sinks(words, address, port, live=live)
+    assert told in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_port_that_is_taken_is_passed_by_or_said() -> None:
+    with listening() as port, pytest.raises(VnetError, match=f"--rerun-port {port}: .*already in use"):
+        place_to_serve(port=port)
+    first = place_to_serve()
+    with listening(first.port + 1):
+        assert place_to_serve().port == first.port + 2
+
+
+@pytest.mark.parametrize("command", ["run", "emulator"])
+def test_spawn_without_a_display_is_said_before_anything_has_started(
+    no_display: None, tmp_path: Path, command: str
+) -> None:
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text("")
+    out = tmp_path / "run"
+    result = CliRunner().invoke(app, [command, str(scenario), "--out", str(out), "--rerun", "spawn"])
+    assert result.exit_code == 2
+    assert "there is no display here" in result.output
+    assert "--rerun serve" in result.output
+    assert result.output.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_vehicle_that_is_not_there_is_said_before_anything_has_started(tmp_path: Path) -> None:
+    scenario = tmp_path / "scenario.toml"
+    scenario.write_text("")
+    arguments = ["--out", str(tmp_path / "run"), "--rerun", "save", "--rerun-vehicle", "v99"]
+    result = CliRunner().invoke(app, ["run", str(scenario), *arguments])
+    assert (result.exit_code, result.output) == (2, "vnet: --rerun-vehicle v99: no vehicle is called so\n")
+    assert not (tmp_path / "run").exists()
+
+
+def test_addresses_as_they_are_told() -> None:
+    here = ServeAt("127.0.0.1", 9000)
+    assert here.told() == (
+        "viewer: rerun --connect rerun+http://127.0.0.1:9000/proxy\n"
+        "browser: http://127.0.0.1:9001/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9000%2Fproxy"
+    )
+    everywhere = ServeAt("0.0.0.0", 9000)
+    assert everywhere.url == f"rerun+http://{socket.gethostname()}:9000/proxy"
+    assert everywhere.told().endswith("whoever can reach port 9000 of this machine can watch")
+    assert everywhere.origin == "http://*:9001"
+    assert ServeAt("::1", 9000).web_url.startswith("http://[::1]:9001/")
+
+
+def draw(recording: rr.RecordingStream, count: int) -> None:
+    for number in range(count):
+        recording.set_time("emulated time", duration=number)
+        recording.log("line", rr.Scalars(number))
+
+
+def test_all_sinks_get_everything_and_none_listens_beyond_the_loopback_interface(tmp_path: Path) -> None:
+    place = place_to_serve()
+    with open_recording(Sinks(tmp_path / "saved.rrd", place), "both") as recording:
+        draw(recording, 5)
+        recording.flush(timeout_sec=TIMEOUT_S)
+        # someone who comes when it has begun
+        command = viewer_command("--port", "auto", "--save", str(tmp_path / "served.rrd"), "--connect", place.url)
+        viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            wait_for(lambda: _numbers(tmp_path / "served.rrd"))
+            draw(recording, 50)
+            recording.flush(timeout_sec=TIMEOUT_S)
+            wait_for(lambda: len(_numbers(tmp_path / "served.rrd")) == 50)
+            wait_for(lambda: f"127.0.0.1:{place.web_port}" in everything_of_ours())
+            mine = everything_of_ours()
+        finally:
+            viewer.kill()
+            viewer.wait()
+    assert {f"127.0.0.1:{place.port}", f"127.0.0.1:{place.web_port}"} <= mine
+    assert {address for address in mine if not address.startswith("127.0.0.1:")} == set()
+    assert _numbers(tmp_path / "saved.rrd") == {float(number): [float(number)] for number in range(50)}
+    assert _numbers(tmp_path / "served.rrd") == _numbers(tmp_path / "saved.rrd")
+    wait_for(lambda: not everything_of_ours() & mine)  # nothing is left that listens
+    assert is_closed(tmp_path / "saved.rrd")
+
+
+def everything_of_ours() -> set[str]:
+    found = set()
+    for pid in descendants(os.getpid()):
+        try:
+            found |= listening_addresses(pid)
+        except OSError:
+            continue
+    return found
+
+
+def _numbers(path: Path) -> dict[float, list[float]]:
+    """What has been drawn so far; none while the last message is half written or the file is not there."""
+    try:
+        drawn = read_back(path)
+    except (ValueError, RuntimeError):
+        return {}
+    return dict(drawn["/line"].at["Scalars:scalars"]) if "/line" in drawn else {}
+
+
+def test_a_viewer_is_opened_on_what_is_served_and_outlives_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    noted = tmp_path / "noted"
+    noting = "import pathlib, sys; pathlib.Path(sys.argv[1]).write_text(' '.join(sys.argv[2:]))"
+
+    def command(*arguments: str, bind: str = "127.0.0.1") -> list[str]:
+        name = "web" if "--serve-web" in arguments else "native"
+        return [sys.executable, "-c", noting, f"{noted}-{name}", "--bind", bind, *arguments]
+
+    monkeypatch.setattr(sinks_module, "viewer_command", command)
+    place = place_to_serve()
+    with open_recording(Sinks(serve=place, spawn=True), "spawned"):
+        wait_for(Path(f"{noted}-native").exists)
+        wait_for(Path(f"{noted}-web").exists)
+    wait_for(lambda: Path(f"{noted}-native").read_text() != "")
+    assert Path(f"{noted}-native").read_text().startswith(f"--bind 127.0.0.1 --connect {place.url} ")
+    assert Path(f"{noted}-web").read_text().startswith("--bind 127.0.0.1 --serve-web ")
+
+
+def test_the_viewers_own_port_is_bound_to_the_loopback_interface() -> None:
+    assert viewer_command("x")[1:] == ["--bind", "127.0.0.1", "x"]
+    assert Path(viewer_command("x")[0]).exists()
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import rerun as rr
+from emulator.viewer.sinks import Sinks, open_recording
+with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
+    for number in range(200):
+        recording.set_time("emulated time", duration=number)
+        recording.log("line", rr.Scalars(number))
+        if number % 20 == 0:
+            recording.flush(timeout_sec=60)
+    recording.flush(timeout_sec=60)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_recording_whose_writer_was_killed_can_be_read_and_mended(tmp_path: Path) -> None:
+    path = tmp_path / "torn.rrd"
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=ROOT)
+    assert done.returncode == -9
+    assert not is_closed(path)
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size - 7)  # a write that was cut short
+    program, *arguments = mending_command(path).split()
+    assert program == "rerun"
+    assert rrd(*arguments[1:]).returncode == 0
+    mended = path.with_name("torn-mended.rrd")
+    assert is_closed(mended)
+    assert rrd("verify", str(mended)).returncode == 0
+    assert len(_numbers(mended)) >= 180
+
+
+@pytest.mark.parametrize("left", [20, 100, 150, 600, 1400])
+def test_a_recording_of_nothing_but_its_name_is_not_shown(tmp_path: Path, left: int) -> None:
+    path = tmp_path / "recording.rrd"
+    with open_recording(Sinks(path), "cut") as recording:
+        draw(recording, 5)
+    assert path.stat().st_size > 3000
+    with path.open("r+b") as file:
+        file.truncate(left)
+    with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} makes it anew"):
+        mend(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def all_of(inbox: Inbox) -> list[tuple[str, bytes]]:
+    return [inbox.take() for _ in range(inbox.gather(0))]
+
+
+def test_an_inbox_is_bounded_and_counts_what_it_drops() -> None:
+    inbox = Inbox(limit_bytes=100)
+    for number in range(10):
+        inbox.put("period", bytes([number]) * 30)
+    inbox.put("end")
+    assert inbox.dropped == 7
+    assert all_of(inbox) == [*(("period", bytes([number]) * 30) for number in range(3)), ("end", b"")]
+    assert all_of(inbox) == []
+    inbox.put("period", b"x" * 100)
+    assert all_of(inbox) == [("period", b"x" * 100)]
+
+
+FOR_EVER_S = 2 * TIMEOUT_S
+
+
+@pytest.mark.parametrize("urgent", [("end", b""), ("scene", b"s"), ("lost", b""), ("period", b"x" * 60)])
+def test_an_inbox_gathers_periods_until_something_comes_that_must_not_wait(urgent: tuple[str, bytes]) -> None:
+    inbox = Inbox(limit_bytes=100)
+    with ThreadPoolExecutor() as pool:
+        gathered = pool.submit(inbox.gather, None, FOR_EVER_S)
+        for _ in range(3):
+            inbox.put("period", b"a")
+        inbox.put(*urgent)
+        assert gathered.result(TIMEOUT_S) == 4
+    assert all_of(inbox) == [*[("period", b"a")] * 3, urgent]
+    inbox.put("period", b"b")
+    assert inbox.gather(0, 0.0) == 1, "what was urgent is no longer"
+
+
+@pytest.mark.parametrize("waiting", [0, 3])
+def test_an_inbox_that_is_closed_waits_for_nothing(waiting: int) -> None:
+    inbox = Inbox()
+    for _ in range(waiting):
+        inbox.put("period", b"a")
+    with ThreadPoolExecutor() as pool:
+        gathered = pool.submit(inbox.gather, None, FOR_EVER_S)
+        inbox.close()
+        assert gathered.result(TIMEOUT_S) == waiting
+
+
+class Drawn(Recorder):
+    """Notes what it has drawn, and is ended by a signal when it takes a period for the third time."""
+
+    def __init__(self, inbox: Inbox) -> None:
+        self.missed = 0
+        self.taken: list[int] = []
+        self.drawn: list[int] = []
+        self._inbox = inbox
+
+    def take(self, stream: str, message: Mapping[str, Any]) -> None:
+        self.taken.append(message["period"])
+        if len(self.taken) == 3:
+            signal.raise_signal(signal.SIGTERM)
+
+    def draw(self) -> None:
+        self.drawn = self.taken.copy()
+
+
+def test_what_waits_is_drawn_by_an_observer_that_a_signal_ends() -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    for number in range(5):
+        inbox.put("period", wire.encode_observation({"period": number}))
+    before = signal.signal(signal.SIGTERM, lambda *_: inbox.close())
+    try:
+        _record_all(inbox, recorder)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert recorder.drawn == [0, 1, 2, 3, 4]
+
+
+def test_an_observer_that_is_ended_with_much_to_draw_draws_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    for number in range(5):
+        inbox.put("period", wire.encode_observation({"period": number}))
+    inbox.close()
+    monkeypatch.setattr(watch, "CLOSING_S", -1.0)
+    _record_all(inbox, recorder)
+    assert recorder.drawn == []
+
+
+def test_what_a_lost_emulator_said_last_does_not_make_it_be_waited_for() -> None:
+    inbox = Inbox()
+    recorder = Drawn(inbox)
+    taker = _Taker(inbox, recorder)
+    period = ("period", wire.encode_observation({"period": 1}))
+    for stream, data, is_there in (("lost", b"", False), (*period, False), ("found", b"", True), (*period, True)):
+        inbox.put(stream, data)
+        taker.take(inbox.gather(0))
+        assert (taker.left_s is None) == is_there, stream
+    assert recorder.drawn == [1, 1]

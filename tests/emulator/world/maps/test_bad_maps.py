@@ -1,0 +1,355 @@
+"""Maps that cannot be used: each is refused in one line that names the file, and the line or the feature."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.world.maps import roads as roads_module
+from emulator.world.maps.files import READERS, read_roads, write_roads
+from tests.support import maps
+from vnet.errors import ScenarioError
+
+
+def refusal(path: Path, origin_deg: tuple[float, float] | None = None) -> str:
+    """What is said of a file: one line, which begins with its name; the rest is returned."""
+    with pytest.raises(ScenarioError) as refused:
+        read_roads(path, origin_deg)
+    text = str(refused.value)
+    assert text.startswith(f"{path}: ") and text.isprintable()
+    return text.removeprefix(f"{path}: ")
+
+
+def write(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+# All kinds.
+
+
+@pytest.mark.parametrize("ending", READERS)
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "empty"),
+        (b"\0" * 5000, ""),
+        (b"\x89PNG\r\n\x1a\n" + b"x" * 100, ""),
+        (b"PK\x03\x04" + b"x" * 100, ""),
+        (b"<html></html>", ""),
+        (b"{}", ""),
+    ],
+    ids=["empty", "zeros", "a picture", "an archive", "a page", "an object"],
+)
+def test_what_is_no_map_is_refused(tmp_path: Path, ending: str, content: bytes, said: str) -> None:
+    assert said in refusal(write(tmp_path, f"town{ending}", content))
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_a_file_that_is_not_there(tmp_path: Path, ending: str) -> None:
+    assert refusal(tmp_path / f"town{ending}") == "cannot be read: No such file or directory"
+    (tmp_path / f"folder{ending}").mkdir()
+    assert refusal(tmp_path / f"folder{ending}") == "not a file"
+
+
+def test_a_kind_that_nobody_knows(tmp_path: Path) -> None:
+    assert "allowed are *.osm, " in refusal(write(tmp_path, "town.shp", "x"))
+    with pytest.raises(ScenarioError, match=r"allowed are \*.geojson"):
+        write_roads(read_roads(write(tmp_path, "t.geojson", maps.geojson())), tmp_path / "town.osm")
+
+
+@pytest.mark.parametrize("kind", ["osm", "osm.pbf", "net.xml", "geojson", "npz"])
+def test_a_file_that_is_cut_off_is_not_half_read(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / f"town.{kind}"
+    if kind == "npz":
+        np.savez_compressed(path, **maps.arrays())
+    elif kind == "osm.pbf":
+        maps.write_pbf(path)
+    else:
+        path.write_text({"osm": maps.osm_xml, "net.xml": maps.sumo_net, "geojson": maps.geojson}[kind]())
+    whole = path.read_bytes()
+    for share in (0.3, 0.6, 0.9, 0.99):
+        refusal(write(tmp_path, f"cut.{kind}", whole[: int(share * len(whole))]))
+
+
+@pytest.mark.parametrize("kind", ["osm", "geojson", "npz"])
+def test_an_origin_that_is_far_away(tmp_path: Path, kind: str) -> None:
+    if kind == "npz":
+        np.savez(tmp_path / "town.npz", **maps.arrays())
+    else:
+        write(tmp_path, f"town.{kind}", maps.osm_xml() if kind == "osm" else maps.geojson())
+    said = refusal(tmp_path / f"town.{kind}", (-83.74, 42.28))  # swapped
+    assert "km from the origin -83.7400, 42.2800: at most 200 km" in said
+
+
+def test_a_map_of_more_points_than_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(roads_module, "MOST_POINTS", 4)
+    said = refusal(write(tmp_path, "town.osm", maps.osm_xml()))
+    assert said == "way 11: more than 4 points; cut out a part first"
+
+
+# OpenStreetMap.
+
+
+def node(place: str) -> str:
+    """The town, whose first node is at `place`."""
+    first, rest = maps.osm_xml().split('<node id="1" ')
+    return f'{first}<node id="1" {place} version="1"/>{rest.partition("/>")[2]}'
+
+
+BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]>'
+BAD_OSM = {
+    "a node that is missing": (maps.osm_xml(nodes=(1, 2, 3)), "way 10: node 4 is not in the file"),
+    "no node at all": (maps.osm_xml(nodes=()), "way 10: node 1 is not in the file"),
+    "a way of one node": (maps.osm_xml({5: ((1,), {"highway": "primary"})}), "way 5: 1 nodes; a road needs two"),
+    "a way of no node": (maps.osm_xml({5: ((), {"highway": "primary"})}), "way 5: 0 nodes; a road needs two"),
+    "a way along one point": (
+        maps.osm_xml({5: ((1, 1), {"highway": "primary"})}),
+        "no roads that vehicles may use",
+    ),
+    "no road": (maps.osm_xml({5: ((1, 2), {"highway": "footway"})}), "no roads that vehicles may use"),
+    "a latitude that is none": (node('lat="north" lon="-83.7"'), "line 3: wrong format for coordinate: 'north'"),
+    "a latitude that is not a number": (node('lat="nan" lon="-83.7"'), "line 3: "),
+    "a latitude beyond the pole": (node('lat="95" lon="-83.7"'), "way 10: node 1 is not in the file, or not on"),
+    "metres": (node('lat="4682000" lon="271000"'), "line 3: wrong format for coordinate: '4682000'"),
+    "a node of the other side": (node('lat="-83.74" lon="42.28"'), "way 10: 9,341 km from the origin"),
+    "a node at 0°, 0°": (node('lat="0" lon="0"'), "way 10: 5,146 km from the origin"),
+    "no place": (node(""), "way 10: node 1 is not in the file, or not on the earth"),
+    "entities": (maps.osm_xml().replace("<osm ", BOMB + "<osm "), "XML entities are not"),
+    "text that is not closed": (maps.osm_xml().replace("</osm>", ""), ""),
+    "a network of SUMO": (maps.sumo_net(), ""),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OSM)
+def test_a_wrong_openstreetmap_file(tmp_path: Path, name: str) -> None:
+    text, said = BAD_OSM[name]
+    assert said in refusal(write(tmp_path, "town.osm", text))
+
+
+def test_a_line_that_is_no_xml_is_named(tmp_path: Path) -> None:
+    text = maps.osm_xml().replace('<nd ref="2"/>', "<nd ref=2/>", 1)
+    line = text[: text.index("<nd ref=2/>")].count("\n") + 1
+    assert f"line {line}" in refusal(write(tmp_path, "town.osm", text))
+
+
+def test_a_pbf_file_with_a_missing_node(tmp_path: Path) -> None:
+    path = maps.write_pbf(tmp_path / "town.osm.pbf", {7: ((1, 99), {"highway": "primary"})})
+    assert "way 7: node 99 is not in the file" in refusal(path)
+
+
+def test_without_pyosmium_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "osmium", None)
+    assert "pip install 'vnet-emulator[maps]'" in refusal(write(tmp_path, "town.osm", maps.osm_xml()))
+
+
+# GeoJSON.
+
+HERE, THERE = [-83.74, 42.28], [-83.73, 42.28]
+
+
+def lines(*features: Any) -> str:
+    """A line that is right, and then these features."""
+    return maps.collection(maps.line([HERE, THERE]), *features)
+
+
+BAD_GEOJSON = {
+    "no JSON": ("{", "not a GeoJSON feature collection: "),
+    "a feature alone": (json.dumps(maps.line([HERE, THERE])), "not a GeoJSON feature collection: "),
+    "another type": (json.dumps({"type": "Topology", "features": []}), "type = 'Topology'"),
+    "no feature": (maps.collection(), "no roads"),
+    "no line": (maps.collection({"type": "Feature", "geometry": None}), "no roads"),
+    "a feature that is none": (lines(3), "$.features[1]"),
+    "nested without end": ('{"type": "FeatureCollection", "features": ' + "[" * 100_000, ""),
+    "metres": (lines(maps.line([[271000.0, 4682000.0], HERE])), "feature 1: longitude = 271000: not within ±180"),
+    "swapped": (lines(maps.line([[42.28, -93.74], HERE])), "feature 1: latitude = -93.74: not within ±90"),
+    "swapped, though on the earth": (
+        lines(maps.line([HERE, [-83.72, 42.28]]), maps.line([HERE[::-1], THERE[::-1]])),
+        "feature 2: 9,341 km",
+    ),
+    "one point": (lines(maps.line([HERE])), "feature 1: its coordinates are no line"),
+    "a point of one number": (lines(maps.line([HERE, [1.0]])), "feature 1: its coordinates are no line"),
+    "text": (lines(maps.line([HERE, ["-83.7", "42"]])), "feature 1: its coordinates are no line"),
+    "null": (lines(maps.line([HERE, [None, 42.0]])), "feature 1: its coordinates are no line"),
+    "a number without end": (lines(maps.line([HERE, [10**400, 42]])), "feature 1: its coordinates are no line"),
+    "NaN": (lines(maps.line([HERE, [float("nan"), 42.0]])), "not a GeoJSON feature collection: "),
+    "no length": (maps.collection(maps.line([HERE, HERE])), "no roads"),
+    "a class": (
+        lines(maps.line([HERE, THERE], **{"class": "path"})),
+        "feature 1: class = 'path': allowed are motorway",
+    ),
+    "a class that is a list": (lines(maps.line([HERE, THERE], **{"class": []})), "feature 1: class = []"),
+    "lanes": (lines(maps.line([HERE, THERE], lanes_forward=17)), "feature 1: lanes_forward = 17: 0 to 16 allowed"),
+    "half a lane": (lines(maps.line([HERE, THERE], lanes_forward=0.5)), "feature 1: lanes_forward, lanes_backward"),
+    "no lane": (lines(maps.line([HERE, THERE], lanes_forward=0, lanes_backward=0)), "feature 1: lanes_forward, "),
+    "a width": (lines(maps.line([HERE, THERE], lane_width_m=1)), "feature 1: lane_width_m = 1: 2 to 20 allowed"),
+    "another projection": (
+        json.dumps({"type": "FeatureCollection", "features": [], "crs": {"properties": {"name": "EPSG:3857"}}}),
+        "convert it to WGS-84 first",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_GEOJSON)
+def test_a_wrong_geojson_file(tmp_path: Path, name: str) -> None:
+    text, said = BAD_GEOJSON[name]
+    assert said in refusal(write(tmp_path, "town.geojson", text))
+
+
+# SUMO.
+
+LOCATION = '<location netOffset="{}" projParameter="{}"/>'
+BAD_LANE = '<edge id="e" from="1" to="2"><lane id="e_0" index="0" {}/></edge>'
+BAD_SUMO = {
+    "not XML": (maps.sumo_net(more="<edge>"), "line 22: not XML: mismatched tag"),
+    "another file of SUMO": ("<routes>\n</routes>", "line 1: <routes>: a network of SUMO starts with <net>"),
+    "an unknown encoding": ('<?xml version="1.0" encoding="klingon"?><net/>', "not XML: "),
+    "an encoding of two bytes": ('<?xml version="1.0" encoding="shift_jis"?><net/>', "not XML: "),
+    "entities": (maps.sumo_net().replace("<net ", BOMB + "\n<net "), "line 2: a document type"),
+    "no lane": ("<net/>", "no roads that vehicles may use"),
+    "a lane outside of an edge": ("<net>\n<lane id='a'/></net>", "line 2: <lane> outside of an <edge>"),
+    "no shape": (maps.sumo_net(more=BAD_LANE.format("")), "line 21: lane e_0: a shape of two points or more"),
+    "a shape of one point": (
+        maps.sumo_net(more=BAD_LANE.format('shape="1,2"')),
+        "line 21: lane e_0: a shape of two",
+    ),
+    "a shape of text": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 a,b"')), "line 21: lane e_0: shape: 'a,b'"),
+    "not a number": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 nan,3"')), "line 21: lane e_0: shape: 'nan,3'"),
+    "an infinite place": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 inf,3"')), "line 21: lane e_0: shape"),
+    "one coordinate": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3"')), "line 21: lane e_0: shape: '3'"),
+    "a width": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3,4" width="-1"')), "line 21: width = '-1'"),
+    "no length": (
+        '<net><edge id="e"><lane id="e_0" shape="1,2 1,2"/></edge></net>',
+        "no roads that vehicles may use",
+    ),
+    "mixed projections": (
+        maps.sumo_net(more=BAD_LANE.format('shape="1,2 4682000,3"')),
+        "lane e_0: the map spans 4682 km",
+    ),
+    "an offset": (maps.sumo_net(LOCATION.format("a", maps.UTM)), "line 3: netOffset: 'a'"),
+    "two offsets": (maps.sumo_net(LOCATION.format("1,2 3,4", maps.UTM)), "line 3: netOffset: one x,y"),
+    "a projection": (maps.sumo_net(LOCATION.format("0,0", "+proj=flat")), "line 3: projection +proj=flat: not one"),
+    "a projection in degrees": (
+        maps.sumo_net(LOCATION.format("0,0", "+proj=longlat")),
+        "line 3: projection +proj=lon",
+    ),
+    "a projection from a file": (
+        maps.sumo_net(LOCATION.format("0,0", "+init=/etc/passwd:a")),
+        "line 3: projection",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_SUMO)
+def test_a_wrong_network_of_sumo(tmp_path: Path, name: str) -> None:
+    text, said = BAD_SUMO[name]
+    assert said in refusal(write(tmp_path, "town.net.xml", text))
+
+
+def test_an_origin_for_a_network_that_does_not_say_where_it_is(tmp_path: Path) -> None:
+    said = refusal(write(tmp_path, "town.net.xml", maps.sumo_net()), maps.ORIGIN)
+    assert said == "does not say where on the earth its metres are; leave out the origin"
+
+
+# Nodes and edges.
+
+LON = maps.arrays()["node_lon_deg"]
+METRES = {"node_lon_deg": None, "node_lat_deg": None, "node_x_m": np.arange(4.0) * 100, "node_y_m": np.zeros(4)}
+BAD_NPZ: dict[str, tuple[dict[str, Any], str]] = {
+    "no nodes": ({"node_lon_deg": None}, "neither 'node_lon_deg' nor 'node_x_m' is among its arrays"),
+    "no latitudes": ({"node_lat_deg": None}, "no array 'node_lat_deg'"),
+    "no edges": ({"edges": None}, "no array 'edges'"),
+    "no node": ({"node_lon_deg": np.zeros(0), "node_lat_deg": np.zeros(0)}, "no nodes"),
+    "no edge": ({"edges": np.zeros((0, 2), dtype=int)}, "no roads that vehicles may use"),
+    "one node": (
+        {"node_lon_deg": LON[:1], "node_lat_deg": np.array([42.0]), "edges": np.array([[0, 0]])},
+        "no roads that vehicles may use",
+    ),
+    "fewer latitudes": ({"node_lat_deg": np.zeros(3)}, "node_lat_deg: numbers of shape (4,) are needed"),
+    "longitudes as text": ({"node_lon_deg": np.array(["a"] * 4)}, "node_lon_deg: numbers"),
+    "longitudes as a matrix": ({"node_lon_deg": LON.reshape(2, 2)}, "node_lon_deg: numbers"),
+    "not a number": (
+        {"node_lon_deg": np.where(np.arange(4) == 2, np.nan, LON)},
+        "node_lon_deg[2]: a finite number",
+    ),
+    "infinite": ({"node_lon_deg": np.where(np.arange(4) == 1, np.inf, LON)}, "node_lon_deg[1]: a finite number"),
+    "metres as degrees": ({"node_lon_deg": LON * 1000}, "node_lon_deg[0] = -83740: -180 to 180 allowed"),
+    "swapped": (
+        {"node_lon_deg": np.full(4, 42.3), "node_lat_deg": LON - 10},
+        "node_lat_deg[0] = -93.74: -90 to 90",
+    ),
+    "mixed hemispheres": ({"node_lon_deg": np.where(np.arange(4) == 1, -LON, LON)}, "node 1: 6,003 km from"),
+    "an edge to nowhere": (
+        {"edges": np.array([(0, 1), (1, 4)])},
+        "edges[1]: node 4 does not exist; nodes are 0 to 3",
+    ),
+    "an edge from below": ({"edges": np.array([(0, 1), (-1, 2)])}, "edges[1]: node -1 does not exist"),
+    "edges of three": ({"edges": np.zeros((4, 3), dtype=int)}, "edges: pairs of integers"),
+    "edges in fractions": ({"edges": np.zeros((4, 2))}, "edges: pairs of integers"),
+    "loops only": ({"edges": np.array([(1, 1), (2, 2)])}, "no roads that vehicles may use"),
+    "classes that are numbers": ({"edge_class": np.zeros(5)}, "edge_class: texts of shape (5,)"),
+    "a class": ({"edge_class": np.array(["road"] * 4 + ["path"])}, "edge_class[4] = 'path': allowed are motorway"),
+    "lanes": ({"edge_lanes": np.array([1, 1, 0, 1, 1])}, "edge_lanes[2] = 0: 1 to 16 allowed"),
+    "a width": ({"edge_lane_width_m": np.array([3, 3, 3, 99, 3])}, "edge_lane_width_m[3] = 99: 2 to 20 allowed"),
+    "objects": ({"edges": np.array([{}, {}])}, "not an NPZ file: "),
+    "metres without north": ({**METRES, "node_y_m": None}, "no array 'node_y_m'"),
+    "metres far away": ({**METRES, "node_x_m": np.full(4, 1e9)}, "node_x_m[0] = 1e+09: -2e+07 to 2e+07 allowed"),
+    "metres far from each other": (
+        {**METRES, "node_x_m": np.arange(4) * 1e6},
+        "node 0: the map spans 3000 km, and at most 400",
+    ),
+    "a projection": (
+        {**METRES, "frame_proj": np.array("+proj=flat"), "frame_offset_m": np.zeros(2)},
+        "frame_proj: projection +proj=flat: not one that PROJ knows",
+    ),
+    "a projection that is a number": ({**METRES, "frame_proj": np.array(3.0)}, "frame_proj: one text is needed"),
+    "a projection without offset": ({**METRES, "frame_proj": np.array(maps.UTM)}, "no array 'frame_offset_m'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_NPZ)
+def test_wrong_arrays(tmp_path: Path, name: str) -> None:
+    changes, said = BAD_NPZ[name]
+    np.savez(tmp_path / "town.npz", **maps.arrays(**changes))
+    assert said in refusal(tmp_path / "town.npz")
+
+
+def claims_much(file: zipfile.ZipFile) -> None:
+    """An array that says it is larger than it is."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    file.writestr("node_lon_deg.npy", header.getvalue())
+
+
+def is_much(file: zipfile.ZipFile) -> None:
+    """An array of zeros that is small in the file, and too large to take."""
+    with file.open("node_lon_deg.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (10**8,)})
+        for _ in range(100):
+            member.write(bytes(8 * 10**6))
+
+
+def is_no_array(file: zipfile.ZipFile) -> None:
+    """Something else by the name of an array."""
+    file.writestr("node_lon_deg.npy", b"hello")
+
+
+@pytest.mark.parametrize("write_member", [claims_much, is_much, is_no_array])
+def test_arrays_that_are_not_what_they_say(tmp_path: Path, write_member: Callable[[zipfile.ZipFile], None]) -> None:
+    np.savez(tmp_path / "town.npz", **maps.arrays(node_lon_deg=None))
+    with zipfile.ZipFile(tmp_path / "town.npz", "a", compression=zipfile.ZIP_DEFLATED) as file:
+        write_member(file)
+    assert refusal(tmp_path / "town.npz").startswith("not an NPZ file: ")
+
+
+def test_geojson_of_a_map_that_is_nowhere(tmp_path: Path) -> None:
+    roads = read_roads(write(tmp_path, "town.net.xml", maps.sumo_net()))
+    with pytest.raises(ScenarioError, match="nothing says where on the earth this map is"):
+        write_roads(roads, tmp_path / "town.geojson")
+    assert not (tmp_path / "town.geojson").exists()

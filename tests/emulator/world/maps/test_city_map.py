@@ -1,0 +1,150 @@
+"""Vehicles that drive on a map: what programs are given of it, and that they make something of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
+from emulator.stream.messages import scene_message, unpack
+from emulator.world.world import build_world
+from tests.support.motion import Course, along, scenario_of_trips, write_trips
+from vnet.errors import ScenarioError
+from vnet.roads.road_map import RoadMap
+
+ORIGIN_DEG = (42.28, -83.74)
+M_A_DEGREE = 111_000.0
+RIGHT_M = 1.75
+"""A road without a class has lanes of 3.5 m, side by side about its line."""
+
+
+def north(y_m: float, speed_mps: float, x_m: float) -> Course:
+    return lambda time_s: (x_m, y_m + speed_mps * time_s)
+
+
+def write_cross(path: Path) -> Path:
+    """Two roads of 4 km that cross at the origin, one due east and one due north, as GeoJSON in degrees."""
+    lat, lon = ORIGIN_DEG
+    half = 2000 / M_A_DEGREE
+    lines = [
+        [[lon - half / np.cos(np.deg2rad(lat)), lat], [lon, lat], [lon + half / np.cos(np.deg2rad(lat)), lat]],
+        [[lon, lat - half], [lon, lat], [lon, lat + half]],
+    ]
+    features = [
+        {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": line}}
+        for line in lines
+    ]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+def driving(folder: Path, program: str = "agents.cooperative:main", seconds: float = 8.0, **map_: Any) -> Scenario:
+    """Four vehicles on the right-hand lanes of the cross."""
+    courses = {
+        "east": along(-150, 12, -RIGHT_M),
+        "west": along(150, -11, RIGHT_M),
+        "north": north(-150, 12, RIGHT_M),
+        "south": north(150, -13, -RIGHT_M),
+    }
+    trips = write_trips(folder / "trips.csv", {name: [(0, seconds, course)] for name, course in courses.items()})
+    section = {"path": str(write_cross(folder / "cross.geojson")), "origin_deg": list(ORIGIN_DEG), **map_}
+    scenario = scenario_of_trips(trips, seconds - 0.2, program, radio={"loss": 0.1})
+    return Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
+
+
+def test_programs_get_the_lanes_around_where_vehicles_drive(tmp_path: Path) -> None:
+    whole, near = (build_world(driving(tmp_path, margin_m=margin_m)).lane_map for margin_m in (1e5, 50.0))
+    assert isinstance(whole, RoadMap) and isinstance(near, RoadMap)
+    assert len(whole) == 8, "two roads of two pieces, both ways"
+    assert sorted(set(np.round(whole.heading_rad, 2) % 6.28)) == pytest.approx([0, 1.57, 3.14, 4.71], abs=0.01)
+    scene = scene_message(build_world(driving(tmp_path)), driving(tmp_path))
+    assert unpack(scene["lane_length_m"])[:, 0] == pytest.approx(whole.length_m, rel=1e-5)
+
+
+def test_lanes_may_lie_aside(tmp_path: Path) -> None:
+    plain, aside = (build_world(driving(tmp_path, aside_m=metres)).lane_map for metres in (0.0, 1.5))
+    assert isinstance(plain, RoadMap) and isinstance(aside, RoadMap)
+    moved = np.einsum("ij,ij->i", aside.point_m - plain.point_m, plain.normal)
+    assert moved == pytest.approx(1.5)
+
+
+def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Path) -> None:
+    """And without it they cannot."""
+    figures = {}
+    for name in ("with", "without"):
+        (tmp_path / name).mkdir()
+        scenario = driving(tmp_path / name, seconds=12.0)
+        if name == "without":
+            scenario = scenario.model_copy(update={"map": None})
+        folder = RunFolder.create(tmp_path / name / "run", scenario)
+        emulation = Emulation(scenario, build_world(scenario), folder)
+        simulate(emulation)
+        figures[name] = emulation.metrics.rows[-1]
+        assert figures[name].not_finite == 0
+    found, lost = figures["with"].common_error_rmse_m, figures["without"].common_error_rmse_m
+    assert found is not None and lost is not None
+    assert found < 1.0
+    assert lost > 2 * found
+
+
+def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
+    """The next one has been filtering beside it, and goes on; who comes later does not take over."""
+    courses = {
+        "a": [(3.0, 12.0, along(-150, 12, -RIGHT_M))],
+        "b": [(0, 8.0, along(150, -11, RIGHT_M))],
+        "c": [(0, 12.0, north(-150, 12, RIGHT_M))],
+        "d": [(0, 12.0, north(150, -13, -RIGHT_M))],
+    }
+    trips = write_trips(tmp_path / "trips.csv", courses)
+    section = {"path": str(write_cross(tmp_path / "cross.geojson")), "origin_deg": list(ORIGIN_DEG)}
+    scenario = scenario_of_trips(trips, 11.8, "agents.centralized:main", radio={"loss": 0.0})
+    scenario = Scenario.model_validate(scenario.model_dump(mode="json", exclude_none=True) | {"map": section})
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    simulate(emulation)
+    error = [row.common_error_rmse_m for row in emulation.metrics.rows]
+    left = 41  # the period after the one in which b leaves
+    assert error[left - 3] is not None and error[left - 3] < 1.5
+    after = [value for value in error[left : left + 10] if value is not None]
+    assert len(after) == 10 and max(after) < 1.5, "it does not begin anew from three metres"
+
+
+def test_a_map_of_somewhere_else_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"cross\.geojson: most of what vehicles drive is over 100 m") as error:
+        build_world(driving(tmp_path, origin_deg=[42.9, -83.0]))
+    assert "\n" not in str(error.value)
+
+
+def test_a_map_is_for_those_who_drive(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text(f'[map]\npath = "{write_cross(tmp_path / "cross.geojson")}"\n')
+    with pytest.raises(
+        ScenarioError, match=r'map goes with vehicles that drive, not with network.kind = "generated"'
+    ):
+        load_scenario(path)
+
+
+def test_a_map_that_has_changed_is_not_the_recorded_one(tmp_path: Path) -> None:
+    scenario = driving(tmp_path)
+    path = tmp_path / "recorded.toml"
+    path.write_text(dump_scenario(scenario))
+    assert load_scenario(path) == scenario
+    (tmp_path / "cross.geojson").write_text((tmp_path / "cross.geojson").read_text() + " ")
+    with pytest.raises(ScenarioError, match=r"cross\.geojson has changed since this run was recorded"):
+        load_scenario(path)
+
+
+def test_a_map_is_found_beside_the_scenario(tmp_path: Path) -> None:
+    driving(tmp_path)
+    path = tmp_path / "s.toml"
+    path.write_text('[network]\nkind = "trips"\npath = "trips.csv"\n[map]\npath = "cross.geojson"\n')
+    scenario = load_scenario(path)
+    assert scenario.map is not None and scenario.map.path == tmp_path / "cross.geojson"
+    with pytest.raises(ScenarioError, match=r"map\.path = 'nowhere\.osm': no such file"):
+        load_scenario(path, ["map.path=nowhere.osm"])

@@ -1,0 +1,89 @@
+"""Links as a matrix: rows are receivers, and whatever does not fit the network is said in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.scenario.scenario import Radio, Scenario
+from emulator.stream.messages import scene_message
+from emulator.world.links import load_links
+from emulator.world.world import build_world
+from vnet.errors import ScenarioError
+
+CHAIN = [[False, False, False], [True, False, False], [False, True, False]]
+
+
+def links_of(path: Path, vehicles: int = 3) -> np.ndarray | None:
+    return load_links(Radio(links=path), vehicles)
+
+
+def test_without_links_there_is_no_matrix() -> None:
+    assert load_links(Radio(), 3) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["0,0,0\n1,0,0\n0,1,0\n", "1,0,0\r\n1,1,0\r\n0,1,1", "\ufeff 0 ,0,0\n\n1.0,0.0,0\n0,1e0,0\n\n"],
+    ids=["plain", "the diagonal means nothing", "as spreadsheets write it"],
+)
+def test_a_file_is_the_matrix_it_holds(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "links.csv"
+    path.write_text(text, encoding="utf-8")
+    links = links_of(path)
+    assert links is not None
+    assert links.dtype == bool
+    assert links.tolist() == CHAIN
+
+
+def test_a_matrix_in_the_scenario_is_that_matrix() -> None:
+    links = load_links(Radio.model_validate({"links": [[1, 0, 0], [1, 0, 0], [0, 1, 0]]}), 3)
+    assert links is not None
+    assert links.tolist() == CHAIN
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty; a square matrix of 0 and 1"),
+        ("\n\n", "empty"),
+        ("0,1,0\n1,0,1\n", "not square: 2 rows, and 3 entries in row 1"),
+        ("0,1,0\n1,0\n0,0,0\n", "not square: 3 rows, and 2 entries in row 2"),
+        ("0,1\n1,0\n", "radio.links is 2×2, but the network has 3 vehicles"),
+        ("0,0,0\n0,0,2\n0,0,0\n", "line 2: entry 3 = '2': 0 or 1 is needed"),
+        ("0,0,0\n0,0,-1\n0,0,0\n", "line 2: entry 3 = '-1'"),
+        ("0,0,0\n0,0,0.5\n0,0,0\n", "line 2: entry 3 = '0.5'"),
+        ("0,0,0\n\n\n0,nan,0\n0,0,0\n", "line 4: entry 2 = 'nan'"),
+        ("a,b,c\n0,0,0\n0,0,0\n0,0,0\n", "line 1: entry 1 = 'a': 0 or 1 is needed"),
+        ("0,0,0,\n0,0,0,\n0,0,0,\n", "line 1: entry 4 = ''"),
+        ("0;0;0\n0;0;0\n0;0;0\n", "line 1: entry 1 = '0;0;0'"),
+    ],
+)
+def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "links.csv"
+    path.write_text(text)
+    with pytest.raises(ScenarioError) as caught:
+        links_of(path)
+    assert str(caught.value).startswith(f"{path}: {message}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"no\.csv: cannot be read: No such file"):
+        links_of(tmp_path / "no.csv")
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\n")
+    with pytest.raises(ScenarioError, match=r"bytes\.csv: not a CSV file"):
+        links_of(tmp_path / "bytes.csv")
+
+
+def test_a_matrix_of_another_size_than_the_network_is_refused_with_the_world() -> None:
+    scenario = Scenario.model_validate({"network": {"vehicles": 3}, "radio": {"links": [[0, 1], [1, 0]]}})
+    with pytest.raises(ScenarioError, match=r"radio\.links is 2×2, but the network has 3 vehicles") as caught:
+        build_world(scenario)
+    assert "\n" not in str(caught.value)
+
+
+def test_observers_are_told_no_range_where_it_means_nothing() -> None:
+    for radio, range_m in (({"range_m": 500.0}, 500.0), ({"links": [[0, 1], [1, 0]]}, None)):
+        scenario = Scenario.model_validate({"network": {"vehicles": 2}, "radio": radio})
+        assert scene_message(build_world(scenario), scenario)["range_m"] == range_m

@@ -1,0 +1,275 @@
+"""Files of trips: what each reader reads, and that a wrong file is refused in one line that names its place."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.scenario.scenario import Scenario
+from emulator.world.trips import samples as samples_module
+from emulator.world.trips.drive import READERS
+from emulator.world.trips.samples import Samples, Trip
+from emulator.world.world import World, build_world
+from vnet.errors import ScenarioError
+
+TWO = "id,time_s,x_m,y_m\na,0,0,0\na,2,20,0\nb,1,0,50\nb,3,0,90\n"
+FCD = """<?xml version="1.0" encoding="UTF-8"?>
+<fcd-export xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance">
+    <timestep time="0.00">
+        <vehicle id="a" x="0.0" y="0.0" angle="90.00" type="car" speed="10.00" pos="5" lane="e_0" slope="0.0"/>
+    </timestep>
+    <timestep time="1.00">
+        <vehicle id="a" x="10.0" y="0.0" angle="0.00" speed="0.00"/>
+        <vehicle id="b" x="0.0" y="50.0" angle="180.00" speed="20.00"/>
+        <person id="p" x="1" y="1" angle="0" speed="1"/>
+    </timestep>
+    <timestep time="2.00">
+        <vehicle id="b" x="0.0" y="30.0" angle="180.00" speed="20.00"/>
+    </timestep>
+</fcd-export>
+"""
+
+
+def write(folder: Path, name: str, content: str | bytes) -> Path:
+    path = folder / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def read(path: Path, origin_deg: tuple[float, float] | None = None, **options: Any) -> dict[str, Trip]:
+    trips = READERS[path.suffix](path, options.get("window_s")).trips(origin_deg)
+    return {trip.node_id: trip for trip in trips}
+
+
+def world_of(path: Path, duration_s: float = 2.0, rate_hz: float = 10.0, **network: Any) -> World:
+    data = {
+        "run": {"duration_s": duration_s},
+        "network": {"kind": "trips", "path": str(path), **network},
+        "world": {"gnss": {"rate_hz": rate_hz}},
+    }
+    return build_world(Scenario.model_validate(data))
+
+
+def refusal(path: Path, **network: Any) -> str:
+    """What is said of a file that cannot be used: one line, which begins with its name."""
+    with pytest.raises(ScenarioError) as caught:
+        world_of(path, **network)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and "\n" not in text
+    return text.removeprefix(f"{path}: ")
+
+
+# What is read.
+
+
+def test_a_csv_file_may_be_sorted_by_vehicle_or_by_time_and_have_other_columns(tmp_path: Path) -> None:
+    header, *rows = TWO.split()
+    by_time = sorted(rows, key=lambda row: float(row.split(",")[1]))
+    mixed = "\n".join([f"note,{header}", *(f"x,{row}" for row in by_time)]) + "\n"
+    for name, text in (("by_vehicle.csv", TWO), ("by_time.csv", mixed), ("mark.csv", "\ufeff" + TWO)):
+        trips = read(write(tmp_path, name, text))
+        assert list(trips) == ["a", "b"]
+        assert trips["b"].time_s.tolist() == [1, 3]
+        assert trips["b"].position_m.tolist() == [[0, 50], [0, 90]]
+
+
+def test_parquet_says_what_csv_says_and_ids_may_be_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "trips.parquet"
+    columns = {"id": [7, 7, 8, 8], "time_s": [0, 2, 1, 3], "x_m": [0, 20, 0, 0], "y_m": [0.0, 0.0, 50.0, 90.0]}
+    pq.write_table(pa.table(columns), path)
+    trips, same = read(path), read(write(tmp_path, "t.csv", TWO.replace("\na", "\n7").replace("\nb", "\n8")))
+    for name in ("7", "8"):
+        assert np.array_equal(trips[name].position_m, same[name].position_m)
+        assert np.array_equal(trips[name].time_s, same[name].time_s)
+
+
+def test_the_same_sample_twice_counts_once(tmp_path: Path) -> None:
+    twice = "".join(f"{row}\n{row}\n" for row in TWO.split()[1:])
+    trips = read(write(tmp_path, "t.csv", TWO.split()[0] + "\n" + twice))
+    assert trips["a"].time_s.tolist() == [0, 2]
+
+
+def test_in_a_matrix_nan_is_not_there_and_ids_are_made_up_or_given(tmp_path: Path) -> None:
+    path = tmp_path / "m.npz"
+    x = np.array([[0.0, 1, 2, 3], [math.nan, math.nan, 5, 6]])
+    np.savez(path, x_m=x, y_m=x + 100, rate_hz=2.0)
+    trips = read(path)
+    assert list(trips) == ["v1", "v2"]
+    assert trips["v2"].time_s.tolist() == [1.0, 1.5]
+    assert trips["v2"].position_m.tolist() == [[5, 105], [6, 106]]
+    np.savez(path, x_m=x, y_m=x, rate_hz=2, id=np.array(["car", "bus"]))
+    assert list(read(path)) == ["car", "bus"]
+
+
+def test_sumos_angles_are_clockwise_from_north_and_ours_the_other_way_from_east(tmp_path: Path) -> None:
+    trips = read(write(tmp_path, "fcd.xml", FCD))
+    assert trips["a"].heading_rad == pytest.approx([0, math.pi / 2])
+    assert trips["b"].heading_rad == pytest.approx([-math.pi / 2] * 2)
+    assert trips["a"].speed_mps is not None and trips["a"].speed_mps.tolist() == [10, 0]
+    assert trips["b"].position_m.tolist() == [[0, 50], [0, 30]]
+
+
+def test_sumos_header_tells_degrees_from_metres(tmp_path: Path) -> None:
+    header = '<!-- generated\n<output><fcd-output.geo value="true"/></output>\n-->\n'
+    body = FCD.split("\n", 1)[1].replace('"10.0" y="0.0"', '"0.001" y="0.0"')
+    body = body.replace('y="50.0"', 'y="0.0005"').replace('y="30.0"', 'y="0.0003"')
+    trips = read(write(tmp_path, "fcd.xml", header + body), origin_deg=(0.0, 0.0))
+    assert trips["a"].position_m[1] == pytest.approx([111.32, 0], abs=0.01), "a thousandth of a degree of longitude"
+
+
+def test_degrees_become_metres_from_the_origin_or_from_their_middle(tmp_path: Path) -> None:
+    text = "id,time_s,lat_deg,lon_deg\na,0,42.28,-83.74\na,9,42.28,-83.74\nb,0,42.30,-83.70\nb,9,42.30,-83.70\n"
+    path = write(tmp_path, "t.csv", text)
+    a, b = (trip.position_m[0] for trip in read(path).values())
+    # Ellipsoidal: a degree of latitude is 111 080 m there, one of longitude 82 460 m.
+    assert b - a == pytest.approx([0.04 * 82_460, 0.02 * 111_080], rel=1e-3)
+    assert a + b == pytest.approx([0, 0], abs=1.0), "the middle of both is zero"
+    assert read(path, origin_deg=(42.28, -83.74))["a"].position_m[0] == pytest.approx([0, 0], abs=1e-6)
+
+
+# What is refused.
+
+HEADER = "id,time_s,x_m,y_m\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "no column 'id'"),
+        (HEADER, "no samples"),
+        ("id,time_s,x_m\na,0,1\n", "no column 'lat_deg'"),
+        ("id,time_s,x_m,y_m,x_m\na,0,1,2,3\n", "two columns 'x_m'"),
+        (HEADER + "a,0,1,2\na,1,1\n", "Row #3"),
+        (HEADER + "a,0,1,2\na,one,1,2\n", "Row #3"),
+        (HEADER + "a,0,1,2\na,1,nan,2\n", "row 3: x_m = nan"),
+        (HEADER + "a,0,1,2\na,1,inf,2\n", "row 3: x_m = inf"),
+        (HEADER + "a,0,1,2\na,1e300,1,2\n", "row 3: time_s = 1e+300"),
+        (HEADER + "a,0,1,2\na,1,4e7,2\n", "row 3: x_m = 4e+07"),
+        (HEADER + "a,0,1,2\n,1,1,2\n", "row 3: id = ''"),
+        (HEADER + "a,0,1,2\na b,1,1,2\n", "row 3: id = 'a b'"),
+        (HEADER + "a,5,1,2\nb,0,1,2\na,4,1,2\n", "row 4: a: time_s = 4 after 5"),
+        (HEADER + "a,5,1,2\nb,0,1,2\na,5,1,3\n", "row 4: a is in two places at time_s = 5"),
+        (HEADER + "a,0,1,2\n", "no vehicle is there"),
+        (HEADER + "a,0,-83.70,42.1\na,9,-83.71,42.2\nb,0,-83.72,42.2\nb,9,-83.7,42.3\n", "are these degrees?"),
+        ("id,time_s,lat_deg,lon_deg\na,0,4682000,271000\n", "row 2: lat_deg = 4.682e+06"),
+        (
+            "id,time_s,lat_deg,lon_deg\na,0,-83.7,42.3\nb,0,42.3,-83.7\n",
+            "are latitudes and longitudes what they should be",
+        ),
+        (HEADER + "a,0," + "1" * 5_000_000 + ",2\n", "not a CSV file of trips"),
+        (b"\xff\xfe" * 50, "not a CSV file"),
+        (b"\0" * 5000, "no column 'id'"),
+    ],
+)
+def test_a_wrong_csv_file_is_refused_with_its_row(tmp_path: Path, text: str | bytes, named: str) -> None:
+    assert named in refusal(write(tmp_path, "t.csv", text))
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("<fcd-export", "<routes"), "line 2: element 'routes'"),
+        (('time="1.00"', 'time="-1"'), "line 7: a: time_s = -1 after 0"),
+        (('time="1.00"', 'time="0"'), "line 7: a is in two places"),
+        (('time="1.00"', 'time="soon"'), "line 6: time = 'soon'"),
+        (('x="10.0"', 'x="nan"'), "line 7: x_m = nan"),
+        ((' x="10.0"', ""), "line 7: no x"),
+        ((' id="b"', ""), "line 8: a vehicle without id"),
+        (("</fcd-export>", ""), "not an XML file: no element found"),
+        (("</timestep>", "</timestop>"), "mismatched tag: line 5"),
+        (("<fcd-export", '<!DOCTYPE fcd-export [<!ENTITY a "b">]>\n<fcd-export'), "line 2: a document type"),
+        ((FCD, "<fcd-export/>"), "no samples"),
+        ((FCD, ""), "no element found"),
+    ],
+)
+def test_a_wrong_fcd_file_is_refused_with_its_line(tmp_path: Path, change: tuple[str, str], named: str) -> None:
+    assert named in refusal(write(tmp_path, "fcd.xml", FCD.replace(*change)))
+
+
+def test_a_wrong_matrix_is_refused_with_its_array(tmp_path: Path) -> None:
+    path = tmp_path / "m.npz"
+    good = {"x_m": np.zeros((2, 3)), "y_m": np.ones((2, 3)), "rate_hz": 10}
+    for change, named in (
+        ({"x_m": None}, "no array 'lat_deg'"),
+        ({"rate_hz": None}, "no array 'rate_hz'"),
+        ({"rate_hz": 0}, "rate_hz = 0"),
+        ({"y_m": np.ones((2, 4))}, "matrices of one shape"),
+        ({"x_m": np.zeros(3), "y_m": np.zeros(3)}, "matrices of one shape"),
+        ({"x_m": np.array([["a"]])}, "numbers are needed"),
+        ({"x_m": np.array([[0, np.nan, 1], [0, 0, 0]])}, "row 1: x_m = nan"),
+        ({"heading_rad": np.zeros((2, 2))}, "heading_rad is (2, 2)"),
+        ({"id": np.array(["a"])}, "1 ids for 2 rows"),
+        ({"id": np.array(["a", "a"])}, "appears twice"),
+        ({"id": np.array(["a", "b/c"])}, "row 2: id = 'b/c'"),
+        ({"x_m": np.full((2, 3), np.nan), "y_m": np.full((2, 3), np.nan)}, "no samples"),
+    ):
+        arrays = {name: value for name, value in {**good, **change}.items() if value is not None}
+        np.savez(path, **arrays)
+        assert named in refusal(path), change
+    pickled = np.array([[{"a": 1}]], dtype=object)
+    np.savez(path, x_m=pickled, y_m=pickled, rate_hz=1)
+    assert "not an NPZ file" in refusal(path)
+    assert "not an NPZ file" in refusal(write(tmp_path, "other.npz", b"PK\3\4 nothing"))
+
+
+def test_a_wrong_parquet_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "t.parquet"
+    assert "not a Parquet file" in refusal(write(tmp_path, "t.parquet", b"PAR1 nothing PAR1"))
+    columns: dict[str, Any] = {"id": ["a", None], "time_s": [0.0, 1.0], "x_m": [0.0, 1.0], "y_m": [0.0, 1.0]}
+    pq.write_table(pa.table(columns), path)
+    assert "row 2: id is missing" in refusal(path)
+    pq.write_table(pa.table({**columns, "id": ["a", "a"], "x_m": [0.0, None]}), path)
+    assert "row 2: x_m = nan" in refusal(path)
+    pq.write_table(pa.table({**columns, "id": ["a", "a"], "x_m": ["one", "two"]}), path)
+    assert "not a Parquet file of trips" in refusal(path)
+
+
+def test_other_files_are_refused_by_their_name(tmp_path: Path) -> None:
+    assert "trips are read from .csv, .parquet, .npz, .xml" in refusal(write(tmp_path, "trips.json", "{}"))
+
+
+def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples_module, "MOST_SAMPLES", 5)
+    path = write(tmp_path, "t.csv", HEADER + "".join(f"a,{time},{time},0\n" for time in range(9)))
+    assert "more than 5 samples; with network.start_s" in refusal(path)
+    assert world_of(path, duration_s=1.0, start_s=0.0, longest_gap_s=2.0).node_ids == ("a",)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    rows=st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 8), st.integers(0, 1)), min_size=1, max_size=30),
+    batch=st.integers(1, 7),
+)
+def test_batches_do_not_matter(rows: list[tuple[str, int, int]], batch: int) -> None:
+    """Whatever a file holds, it is taken or refused a batch at a time or at once, as a plain reader would."""
+
+    def outcome(size: int) -> object:
+        samples = Samples(Path("f"), "row")
+        try:
+            for start in range(0, len(rows), size):
+                ids, time, x = zip(*rows[start : start + size], strict=True)
+                place = np.arange(start, start + len(ids)) + 1
+                columns = {"time_s": np.array(time, float), "x_m": np.array(x, float) * 5, "y_m": np.zeros(len(x))}
+                samples.add(pa.array(ids), place, columns)
+            return [(trip.node_id, trip.time_s.tolist(), trip.position_m.tolist()) for trip in samples.trips(None)]
+        except ScenarioError as error:
+            return str(error)
+
+    last: dict[str, tuple[int, int]] = {}
+    wrong = None
+    for number, (name, time, x) in enumerate(rows, start=1):
+        if name in last and (time < last[name][0] or (time == last[name][0] and x != last[name][1])):
+            wrong = number
+            break
+        last[name] = (time, x)
+    at_once = outcome(len(rows))
+    if wrong is not None:
+        assert isinstance(at_once, str) and f"row {wrong}:" in at_once
+    assert outcome(batch) == at_once or isinstance(at_once, str)
+    assert isinstance(outcome(batch), str) == isinstance(at_once, str)

@@ -1,0 +1,1 @@
+"""Helpers of the tests: programs, maps, trips and recordings that several of them use."""

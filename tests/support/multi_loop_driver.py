@@ -1,0 +1,163 @@
+"""Runs without Zenoh, for tests: simulated, and with a loop and a host for each process, as live ones have.
+
+`run_apart` does what `LiveRun` and an agent do in lockstep, with a thread in place of each process: all messages
+pass through the wire's encoding, a kill leaves a loop where it stands, and an end runs what is left.
+"""
+
+import asyncio
+import atexit
+import queue
+import threading
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.join import split_into_processes
+from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import build_world
+from vnet.runtime.host import Host, load_programs
+from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.transport import wire
+
+_folders = TemporaryDirectory(prefix="vnet-apart-")
+atexit.register(_folders.cleanup)
+_numbers = count()
+
+
+class Killed(BaseException):
+    """What happens to a process that is killed: nothing more runs."""
+
+
+class Over(Exception):
+    """The emulator has said that the run is over."""
+
+
+def scenario_of(faults: Sequence[dict[str, Any]], program: str, vehicles: int = 4, **sections: Any) -> Scenario:
+    """A small scenario: some seconds at 5 Hz, all in range."""
+    data: dict[str, Any] = {
+        "run": {"duration_s": 3.0, "settle_s": 0.5},
+        "network": {"vehicles": vehicles},
+        "world": {"gnss": {"rate_hz": 5}},
+        "radio": {"loss": 0.1, "range_m": 1e6},
+        "program": {"entry": program},
+        "fault": list(faults),
+    }
+    for name, section in sections.items():
+        data[name] = {**data[name], **section}
+    return Scenario.model_validate(data)
+
+
+def emulation_of(scenario: Scenario) -> Emulation:
+    """The state of a run of `scenario`, in a new folder."""
+    folder = RunFolder.create(Path(_folders.name) / str(next(_numbers)), scenario)
+    return Emulation(scenario, build_world(scenario), folder)
+
+
+def run_together(scenario: Scenario) -> Emulation:
+    """Simulate."""
+    emulation = emulation_of(scenario)
+    simulate(emulation)
+    return emulation
+
+
+def run_apart(scenario: Scenario) -> Emulation:
+    """Run each process on a loop of its own."""
+    emulation = emulation_of(scenario)
+    groups = {
+        nodes[0]: nodes for nodes in split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
+    }
+    lockstep = Lockstep(emulation, list(groups.values()))
+    processes = {lead: _Process(emulation, nodes) for lead, nodes in groups.items() if emulation.up[lead]}
+    try:
+        grants = lockstep.start()
+        while grants:
+            for actions in lockstep.take_actions():
+                for lead, nodes in groups.items():
+                    killed = [actions.stop[node] for node in nodes if node in actions.stop]
+                    if killed:
+                        processes.pop(lead).end(killed=any(killed))
+                    if any(node in actions.start for node in nodes):
+                        processes[lead] = _Process(emulation, nodes)
+            for lead, grant in grants.items():
+                processes[lead].grants.put(wire.encode(grant))
+            for lead in grants:
+                lockstep.receive(lead, processes[lead].take_yield())
+            grants = lockstep.step()
+    finally:
+        for process in processes.values():
+            process.end(killed=False)
+    return emulation
+
+
+class _Process:
+    """One process of nodes, as a thread; see agents/host.py."""
+
+    def __init__(self, emulation: Emulation, nodes: Sequence[str]) -> None:
+        self.grants: queue.SimpleQueue[bytes | type[BaseException]] = queue.SimpleQueue()
+        self.yields: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
+        encoded = [wire.encode(emulation.welcome(node, b"n")) for node in nodes]
+        self._welcomes = [wire.decode_rx(welcome) for welcome in encoded]
+        self._seq = 0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def take_yield(self) -> wire.Yield:
+        message = self.yields.get(timeout=60)
+        if isinstance(message, BaseException):
+            raise message
+        decoded = wire.decode_tx(message)
+        assert isinstance(decoded, wire.Yield)
+        return decoded
+
+    def end(self, killed: bool) -> None:
+        """End it from the emulator's side, and wait until it has."""
+        self.grants.put(Killed if killed else Over)
+        self._thread.join(60)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            self._host_programs()
+        except Killed:
+            pass
+        except BaseException as error:
+            self.yields.put(error)
+
+    def _next_grant(self) -> int:
+        item = self.grants.get()
+        if isinstance(item, type):
+            raise item
+        grant = wire.decode_rx(item)
+        assert isinstance(grant, wire.Grant)
+        self._seq = grant.seq
+        self._host.bend(grant.clocks, self._loop)
+        self._host.deliver(grant.packets, grant.fixes)
+        return grant.time_ns
+
+    def _exchange(self, next_timer_ns: int | None) -> int:
+        self.yields.put(wire.encode(self._host.make_yield(b"n", self._seq, next_timer_ns)))
+        return self._next_grant()
+
+    def _host_programs(self) -> None:
+        loop = self._loop = VirtualTimeLoop(self._exchange, self._welcomes[0].spin_limit)
+        loop.set_exception_handler(lambda *_: None)  # killed tasks are pending tasks
+        self._host = Host(self._welcomes, lambda: loop.now_ns)
+        asyncio.set_event_loop(loop)
+        try:
+            loop.start_at(self._next_grant())
+            self._host.start(loop, load_programs(self._welcomes))
+            while True:
+                try:
+                    loop.run_forever()
+                except SpinError as spin:
+                    self._host.end_spinning(loop, spin)
+        except Over:
+            self._host.close(loop)
+        finally:
+            loop.close()

@@ -1,0 +1,5 @@
+"""Where the repository is, for tests that read its files or start commands in it."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]

@@ -1,0 +1,276 @@
+"""Hosting programs on a loop: mailboxes, endings, and programs that misbehave."""
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vnet import Node
+from vnet.errors import PayloadTooLargeError, ProgramError
+from vnet.roads.lanes import LaneMap
+from vnet.runtime.host import Host, Program, load_program
+from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.transport import wire
+
+LANES = LaneMap(np.array([[0.0, 0.0]]), np.array([0.0]), 0.85)
+LAST_NS = 10_000_000_000
+
+
+class Over(Exception):
+    """The end of the emulated time of these tests."""
+
+
+def welcome(node: str, seed: int = 1) -> wire.Welcome:
+    return wire.Welcome(
+        node, b"n", 0, "lockstep", "x:y", {}, LANES.to_wire(), seed, 100_000_000, 1400, 5.0, 1000, ""
+    )
+
+
+class World:
+    """Plays the emulator for one host: a packet for every node each 0.25 s, a fix each 0.1 s."""
+
+    def __init__(self, *nodes: str) -> None:
+        self.yields: list[wire.Yield] = []
+        self.loop = VirtualTimeLoop(self.exchange, spin_limit=500)
+        self.host = Host([welcome(node) for node in nodes], lambda: self.loop.now_ns)
+        self._packet_ns = dict.fromkeys(nodes, 250_000_000)
+        self._fix_ns = dict.fromkeys(nodes, 100_000_000)
+
+    def exchange(self, next_timer_ns: int | None) -> int:
+        message = self.host.make_yield(b"n", len(self.yields), next_timer_ns)
+        self.yields.append(message)
+        wakes = [LAST_NS if next_timer_ns is None else next_timer_ns]
+        wakes += [self._packet_ns[node] for node in message.waiting_radio]
+        wakes += [self._fix_ns[node] for node in message.waiting_gnss]
+        now_ns = min(wakes)
+        if now_ns >= LAST_NS:
+            raise Over
+        packets, fixes = [], []
+        for node in self.host.nodes:
+            while self._packet_ns[node] <= now_ns:
+                packets.append(wire.WirePacket(node, "other", 0, self._packet_ns[node], b"hi"))
+                self._packet_ns[node] += 250_000_000
+            while self._fix_ns[node] <= now_ns:
+                fixes.append(wire.WireFix(node, self._fix_ns[node], (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None))
+                self._fix_ns[node] += 100_000_000
+        self.host.deliver(packets, fixes)
+        return now_ns
+
+    def run(self, program: Program) -> None:
+        self.host.start(self.loop, dict.fromkeys(self.host.nodes, program))
+        try:
+            while True:
+                try:
+                    self.loop.run_forever()
+                except SpinError as spin:
+                    self.host.end_spinning(self.loop, spin)
+        except Over:
+            self.host.close(self.loop)
+        finally:
+            self.loop.close()
+
+    @property
+    def endings(self) -> list[wire.Ending]:
+        return [ending for message in self.yields for ending in message.traffic.endings]
+
+
+def test_a_program_that_only_waits_on_the_radio_is_woken_by_each_packet() -> None:
+    heard: list[tuple[int, int]] = []
+
+    async def program(node: Node) -> None:
+        async for packet in node.radio:
+            heard.append((node.now_ns, packet.received_ns))
+
+    World("v1").run(program)
+    assert heard == [(t, t) for t in range(250_000_000, LAST_NS, 250_000_000)]
+
+
+def test_a_program_that_never_waits_on_the_radio_finds_packets_with_their_true_times() -> None:
+    heard: list[list[int]] = []
+    world = World("v1")
+
+    async def program(node: Node) -> None:
+        while True:
+            await asyncio.sleep(1.0)
+            heard.append([packet.received_ns for packet in node.radio.drain()])
+
+    world.run(program)
+    assert heard[0] == [250_000_000, 500_000_000, 750_000_000, 1_000_000_000]
+    assert len(world.yields) == 10, "one barrier a second: packets do not wake it"
+
+
+def test_packets_come_before_fixes_and_fixes_before_timers() -> None:
+    order: list[str] = []
+
+    async def hear(node: Node) -> None:
+        while (await node.radio.receive()).received_ns < 500_000_000:
+            pass
+        order.append("packet")
+
+    async def locate(node: Node) -> None:
+        while (await node.gnss.receive()).time_ns < 500_000_000:
+            pass
+        order.append("fix")
+
+    async def program(node: Node) -> None:
+        timer = asyncio.create_task(asyncio.sleep(0.5))
+        timer.add_done_callback(lambda _: order.append("timer"))
+        await asyncio.gather(timer, locate(node), hear(node))
+
+    World("v1").run(program)
+    assert order == ["packet", "fix", "timer"]
+
+
+def test_a_timeout_on_the_radio_loses_no_packet() -> None:
+    heard: list[int] = []
+
+    async def program(node: Node) -> None:
+        while node.now_ns < 2_000_000_000:
+            try:
+                packet = await asyncio.wait_for(node.radio.receive(), timeout=0.1)
+            except TimeoutError:
+                continue
+            heard.append(packet.received_ns)
+
+    World("v1").run(program)
+    assert heard == list(range(250_000_000, 2_000_000_001, 250_000_000))
+
+
+def test_a_program_that_raises_ends_its_node_and_no_other() -> None:
+    async def program(node: Node) -> None:
+        await asyncio.sleep(1.0)
+        if node.id == "v1":
+            raise ValueError("no\nidea")
+        await asyncio.sleep(1.0)
+        await node.radio.broadcast(b"still here")
+
+    world = World("v1", "v2")
+    world.run(program)
+    assert [(e.node, e.kind, e.error) for e in world.endings] == [
+        ("v1", "crashed", "ValueError: no idea"),
+        ("v2", "finished", ""),
+    ]
+    assert "raise ValueError" in world.endings[0].details
+    frames = [frame for message in world.yields for frame in message.traffic.frames]
+    assert [(frame.node, frame.payload) for frame in frames] == [("v2", b"still here")]
+
+
+@pytest.mark.parametrize(("code", "kind"), [(0, "finished"), (None, "finished"), (3, "crashed")])
+def test_sys_exit_in_a_program_ends_its_node_only(code: int | None, kind: str) -> None:
+    async def program(node: Node) -> None:
+        if node.id == "v1":
+            raise SystemExit(code)
+        await asyncio.sleep(1.0)
+
+    world = World("v1", "v2")
+    world.run(program)
+    assert [(e.node, e.kind) for e in world.endings] == [("v1", kind), ("v2", "finished")]
+
+
+def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:
+    async def chatter(node: Node) -> None:
+        while True:
+            await asyncio.sleep(0.1)
+            await node.radio.broadcast(b"boo")
+
+    async def program(node: Node) -> None:
+        background = asyncio.create_task(chatter(node))
+        await asyncio.sleep(1.05)
+        assert not background.done()
+
+    world = World("v1")
+    world.run(program)
+    assert sum(len(message.traffic.frames) for message in world.yields) == 10
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_a_spinning_node_is_named_and_shown_and_the_others_go_on(stubborn: bool) -> None:
+    async def spin() -> None:
+        while True:
+            try:
+                await asyncio.sleep(0)
+            except asyncio.CancelledError:
+                if not stubborn:
+                    raise
+
+    async def program(node: Node) -> None:
+        await asyncio.sleep(1.0)
+        if node.id == "v2":
+            await spin()
+        await asyncio.sleep(1.0)
+
+    world = World("v1", "v2")
+    world.run(program)
+    spun, finished = world.endings
+    assert (spun.node, spun.kind) == ("v2", "spun")
+    assert "spin" in spun.details
+    assert (finished.node, finished.kind) == ("v1", "finished")
+
+
+def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
+    async def program(node: Node) -> None:
+        async for fix in node.gnss:
+            node.report(fix.position_m, fix.covariance_m2, speed=3, cloud_m=np.zeros((2, 2)))
+
+    world = World("v1")
+    world.run(program)
+    report = world.yields[1].traffic.reports[0]
+    assert (report.time_ns, report.node, report.estimate_m) == (100_000_000, "v1", (1.0, 2.0))
+    assert report.values == {"speed": 3.0, "cloud_m": [0.0, 0.0, 0.0, 0.0]}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda node: node.report(estimate_m=[1.0]),
+        lambda node: node.report(covariance_m2=[1.0, 2.0]),
+        lambda node: node.report(note="far"),
+    ],
+)
+def test_a_wrong_report_is_refused_where_it_is_made(wrong: Callable[[Node], None]) -> None:
+    refused = []
+
+    async def program(node: Node) -> None:
+        with pytest.raises(ValueError, match="report"):
+            wrong(node)
+        refused.append(node.id)
+
+    World("v1").run(program)
+    assert refused == ["v1"]
+
+
+def test_a_payload_above_the_limit_is_refused() -> None:
+    refused = []
+
+    async def program(node: Node) -> None:
+        with pytest.raises(PayloadTooLargeError, match="1401 bytes"):
+            await node.radio.broadcast(bytes(1401))
+        refused.append(node.id)
+
+    World("v1").run(program)
+    assert refused == ["v1"]
+
+
+def test_nodes_draw_from_seeds_of_their_own() -> None:
+    draws = {}
+
+    async def program(node: Node) -> None:
+        draws[node.id] = node.rng.random()
+
+    World("v1", "v2").run(program)
+    assert draws["v1"] == draws["v2"], "these two were given the same seed"
+    assert draws["v1"] == np.random.default_rng(1).random()
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("no.such.module:main", "cannot import: ModuleNotFoundError"),
+        ("agents.beacon:nothing", "has no 'nothing'"),
+        ("agents.beacon:encode", "is not an async function"),
+    ],
+)
+def test_a_program_that_cannot_be_loaded_says_why(entry: str, message: str) -> None:
+    with pytest.raises(ProgramError, match=message):
+        load_program(entry)

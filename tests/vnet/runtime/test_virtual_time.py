@@ -1,0 +1,205 @@
+"""asyncio in virtual time: what programs may rely on, and what they are refused."""
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vnet.errors import VirtualTimeError
+from vnet.runtime.virtual_time import LoopAbandonedError, SpinError, VirtualTimeLoop
+
+
+class Deadlock(Exception):
+    """Nothing is left that could wake the loop."""
+
+
+@pytest.fixture
+def loop() -> Iterator[VirtualTimeLoop]:
+    """A loop that is always granted exactly the timer it asks for."""
+
+    def exchange(next_timer_ns: int | None) -> int:
+        if next_timer_ns is None:
+            raise Deadlock
+        return next_timer_ns
+
+    loop = VirtualTimeLoop(exchange, spin_limit=1000)
+    yield loop
+    loop.close()
+
+
+def run(loop: VirtualTimeLoop, program: Callable[[], Awaitable[Any]]) -> Any:
+    return loop.run_until_complete(program())
+
+
+def test_sleep_takes_exactly_the_time_asked_for(loop: VirtualTimeLoop) -> None:
+    async def program() -> list[int]:
+        times = []
+        for _ in range(1000):
+            await asyncio.sleep(0.1)
+            times.append(loop.now_ns)
+        return times
+
+    times = run(loop, program)
+    assert all(abs(t - (k + 1) * 100_000_000) <= 1 for k, t in enumerate(times))
+
+
+def test_wait_for_times_out_on_the_emulated_clock(loop: VirtualTimeLoop) -> None:
+    async def program() -> int:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asyncio.Event().wait(), timeout=7.25)
+        return loop.now_ns
+
+    assert run(loop, program) == 7_250_000_000
+
+
+def test_tasks_queues_and_locks_work_as_ever(loop: VirtualTimeLoop) -> None:
+    async def program() -> list[tuple[int, int]]:
+        queue: asyncio.Queue[int] = asyncio.Queue(maxsize=1)
+        lock = asyncio.Lock()
+        seen = []
+
+        async def produce() -> None:
+            for item in range(5):
+                await asyncio.sleep(1)
+                async with lock:
+                    await queue.put(item)
+
+        producer = asyncio.create_task(produce())
+        for _ in range(5):
+            seen.append((await queue.get(), loop.now_ns))
+        await producer
+        return seen
+
+    assert run(loop, program) == [(i, (i + 1) * 1_000_000_000) for i in range(5)]
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.integers(min_value=0, max_value=10**12), min_size=1, max_size=20))
+def test_timers_fire_in_order_at_their_nanosecond(delays_ns: list[int]) -> None:
+    loop = VirtualTimeLoop(lambda timer: timer if timer is not None else pytest.fail("deadlock"))
+    fired: list[tuple[int, int]] = []
+
+    async def sleeper(delay_ns: int) -> None:
+        await asyncio.sleep(delay_ns / 1e9)
+        fired.append((loop.now_ns, delay_ns))
+
+    async def program() -> None:
+        await asyncio.gather(*(sleeper(d) for d in delays_ns))
+
+    try:
+        loop.run_until_complete(program())
+    finally:
+        loop.close()
+    assert [t for t, _ in fired] == sorted(t for t, _ in fired)
+    assert all(abs(now - delay) <= 1 for now, delay in fired)
+
+
+def test_waiting_for_nothing_yields_without_a_timer(loop: VirtualTimeLoop) -> None:
+    with pytest.raises(Deadlock):
+        run(loop, lambda: asyncio.Event().wait())
+
+
+def test_an_executor_job_costs_no_emulated_time(loop: VirtualTimeLoop) -> None:
+    async def program() -> tuple[int, int]:
+        await asyncio.sleep(1)
+        value = await asyncio.to_thread(lambda: 42)
+        return value, loop.now_ns
+
+    assert run(loop, program) == (42, 1_000_000_000)
+
+
+def test_executor_results_appear_in_the_order_of_submission(loop: VirtualTimeLoop) -> None:
+    order: list[int] = []
+    last_done = threading.Event()
+
+    def job(index: int) -> int:
+        if index < 2:  # the first two end only after the last one
+            assert last_done.wait(10)
+        else:
+            last_done.set()
+        return index
+
+    async def one(index: int) -> None:
+        order.append(await asyncio.to_thread(job, index))
+
+    async def program() -> None:
+        await asyncio.gather(*(one(i) for i in range(3)))
+
+    run(loop, program)
+    assert order == [0, 1, 2]
+
+
+def test_an_executor_job_may_call_back_into_the_loop(loop: VirtualTimeLoop) -> None:
+    async def answer() -> int:
+        return 7
+
+    async def program() -> int:
+        return await asyncio.to_thread(lambda: asyncio.run_coroutine_threadsafe(answer(), loop).result(10))
+
+    assert run(loop, program) == 7
+
+
+def test_an_exception_in_an_executor_reaches_the_program(loop: VirtualTimeLoop) -> None:
+    async def program() -> None:
+        with pytest.raises(ZeroDivisionError):
+            await asyncio.to_thread(lambda: 1 // 0)
+
+    run(loop, program)
+
+
+@pytest.mark.parametrize("step_s", [0, 1e-10])
+def test_spinning_at_one_instant_is_an_error(loop: VirtualTimeLoop, step_s: float) -> None:
+    async def program() -> None:
+        while True:
+            await asyncio.sleep(step_s)
+
+    with pytest.raises(SpinError, match="1000 rounds"):
+        run(loop, program)
+
+
+def test_many_rounds_over_time_are_no_spin(loop: VirtualTimeLoop) -> None:
+    async def program() -> None:
+        for _ in range(50):
+            for _ in range(100):
+                await asyncio.sleep(0)
+            await asyncio.sleep(0.1)
+
+    run(loop, program)
+
+
+@pytest.mark.parametrize(
+    "forbidden",
+    [
+        lambda: asyncio.open_connection("127.0.0.1", 1),
+        lambda: asyncio.start_server(lambda r, w: None, "127.0.0.1", 0),
+        lambda: asyncio.create_subprocess_exec("true"),
+        lambda: asyncio.create_subprocess_shell("true"),
+        lambda: asyncio.get_running_loop().getaddrinfo("localhost", 1),
+    ],
+)
+def test_the_real_world_is_refused(loop: VirtualTimeLoop, forbidden: Callable[[], Any]) -> None:
+    async def program() -> None:
+        with pytest.raises(VirtualTimeError, match="realtime"):
+            await forbidden()
+
+    run(loop, program)
+
+
+def test_finish_lets_cleanup_run_but_not_wait(loop: VirtualTimeLoop) -> None:
+    done = []
+
+    async def cleanup() -> None:
+        await asyncio.sleep(0)
+        done.append("cleanup")
+
+    async def stuck() -> None:
+        await asyncio.sleep(1)
+
+    loop.finish(cleanup())
+    assert done == ["cleanup"]
+    with pytest.raises(LoopAbandonedError):
+        loop.finish(stuck())

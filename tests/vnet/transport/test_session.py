@@ -1,0 +1,58 @@
+"""An embedded router and a client of it, on a port that the system chooses."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+import zenoh
+
+from tests.support.paths import ROOT
+from vnet.transport import keys, wire
+from vnet.transport.access import Access, node_user
+from vnet.transport.session import open_client, open_router, router_endpoint
+
+LEASE_MS = 10_000
+
+
+def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "LARGEST_SAID_BYTES", 2**20)
+    access, key = Access.create("r", [["v01"]]), keys.node_tx("r", "v01")
+    received = zenoh.handlers.FifoChannel(10)
+    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
+        subscriber = router.declare_subscriber(key, received)
+        with open_client(router_endpoint(router), access.credentials(node_user("v01")), LEASE_MS) as client:
+            for size in (2**20 - 1000, 2**21, 7):
+                client.put(key, bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
+            sizes = [len(subscriber.recv().payload) for _ in range(2)]
+    assert sizes == [2**20 - 1000, 7], "the session goes on without the one in between"
+
+
+@pytest.mark.parametrize("wanted", [None, "off", "debug", "trace,zenoh::api::session=trace"])
+def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
+    """In a process of its own, because a log is opened once for all."""
+    code = (
+        "from vnet.errors import LinkError\n"
+        "from vnet.transport import session\n"
+        "from vnet.transport.access import Credentials\n"
+        "session.CONNECT_TIMEOUT_MS = 1\n"
+        "session.quiet_zenoh()\n"
+        "try:\n"
+        "    with session.open_client('tcp/127.0.0.1:1', Credentials('user', 'tell-nobody'), 1000): pass\n"
+        "except LinkError: print('over')\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
+    if wanted is not None:
+        environment["RUST_LOG"] = wanted
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    said = done.stdout + done.stderr
+    assert "over" in said and "tell-nobody" not in said
+    assert ("zenoh" in said) == (wanted not in (None, "off"))

@@ -1,0 +1,153 @@
+"""The wire: what is encoded comes back, and whatever else comes is a WireError."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vnet.errors import WireError
+from vnet.node import Fix, Report
+from vnet.transport import wire
+
+times = st.integers(min_value=0, max_value=2**62)
+names = st.text(min_size=1, max_size=8)
+reals = st.floats(allow_nan=False)
+packets = st.builds(wire.WirePacket, names, names, times, times, st.binary(max_size=64))
+clocks = st.lists(
+    st.builds(wire.ClockBend, names, times, st.integers(-(2**50), 2**50), st.floats(-0.5, 0.5)), max_size=2
+)
+fixes = st.builds(
+    wire.WireFix,
+    names,
+    times,
+    st.tuples(reals, reals),
+    st.tuples(reals, reals, reals, reals),
+    st.none() | reals,
+)
+reports = st.builds(
+    Report,
+    times,
+    names,
+    st.none() | st.tuples(reals, reals),
+    st.none() | st.tuples(reals, reals, reals, reals),
+    st.dictionaries(names, reals | st.lists(reals, max_size=4), max_size=3),
+)
+frames = st.builds(wire.Frame, names, st.binary(max_size=64))
+endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
+traffic = st.builds(
+    wire.Traffic,
+    st.lists(frames, max_size=3),
+    st.lists(reports, max_size=3),
+    st.lists(endings, max_size=2),
+)
+agent_messages = st.one_of(
+    st.builds(wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names),
+    st.builds(wire.Yield, st.binary(), times, st.none() | times, st.lists(names), st.lists(names), traffic),
+    st.builds(
+        wire.Frames,
+        st.binary(),
+        times,
+        times,
+        st.lists(st.tuples(times, times), max_size=3),
+        traffic,
+        st.none() | st.builds(wire.Lateness, st.lists(times, max_size=5)),
+        st.booleans(),
+    ),
+    st.builds(wire.Standing, st.binary(), names),
+)
+emulator_messages = st.one_of(
+    st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
+    st.builds(
+        wire.Batch,
+        st.lists(fixes, max_size=3),
+        times,
+        st.lists(packets, max_size=3),
+        st.none() | times,
+        times,
+        st.booleans(),
+        clocks,
+    ),
+    st.builds(wire.Await, st.floats(0, 60)),
+    st.just(wire.Where()),
+    st.builds(wire.End, st.none() | st.binary(), names, st.booleans()),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(agent_messages)
+def test_what_agents_say_comes_back(message: wire.AgentMessage) -> None:
+    assert wire.decode_tx(wire.encode(message)) == message
+
+
+@settings(max_examples=200, deadline=None)
+@given(emulator_messages)
+def test_what_the_emulator_says_comes_back(message: wire.EmulatorMessage) -> None:
+    assert wire.decode_rx(wire.encode(message)) == message
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=200))
+def test_arbitrary_bytes_never_do_harm(data: bytes) -> None:
+    for decode in (wire.decode_tx, wire.decode_rx, wire.decode_report, wire.decode_observation):
+        try:
+            decode(data)
+        except WireError:
+            continue
+
+
+@settings(max_examples=100, deadline=None)
+@given(agent_messages, st.data())
+def test_damaged_messages_never_do_harm(message: wire.AgentMessage, data: st.DataObject) -> None:
+    encoded = bytearray(wire.encode(message))
+    position = data.draw(st.integers(0, len(encoded) - 1))
+    encoded[position] ^= data.draw(st.integers(1, 255))
+    try:
+        wire.decode_tx(bytes(encoded))
+    except WireError:
+        return
+
+
+@pytest.mark.parametrize("time_ns", [-1, 2**62 + 1, 1.5, "1"])
+def test_times_are_integers_within_bounds(time_ns: object) -> None:
+    grant = wire.encode(wire.Grant(0, time_ns))  # type: ignore[arg-type]
+    with pytest.raises(WireError):
+        wire.decode_rx(grant)
+
+
+@pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_report])
+def test_what_is_too_large_is_not_even_decoded(decode: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "LARGEST_SAID_BYTES", 10)
+    with pytest.raises(WireError, match="11 bytes at once: at most 10 are read"):
+        decode(bytes(11))  # type: ignore[operator]
+
+
+def test_what_an_error_quotes_is_one_short_line() -> None:
+    with pytest.raises(WireError) as caught:
+        wire.decode_tx(b"\x91\xda\xff\xff" + b"a\n" * 32767 + b"a")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 300
+
+
+def test_a_fix_survives_the_wire_bit_by_bit() -> None:
+    fix = Fix(5, np.array([0.1, -1e9 / 3]), np.array([[1.0, 0.1], [0.1, 2.0]]), 0.3)
+    again = wire.WireFix.of("v1", fix).fix()
+    assert again.time_ns == 5
+    assert again.heading_rad == 0.3
+    assert np.array_equal(again.position_m, fix.position_m)
+    assert np.array_equal(again.covariance_m2, fix.covariance_m2)
+
+
+def test_lateness_bins_have_an_edge_at_the_limit() -> None:
+    at_limit = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
+    assert wire.lateness_bin(wire.LATENESS_LIMIT_NS - 1) == at_limit - 1
+    assert wire.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
+    assert wire.lateness_bin(-5) == 0
+    assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(emulator_messages)
+def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
+    batch = isinstance(message, wire.Batch)
+    assert wire.is_batch(wire.encode(message)) == batch
+    assert wire.is_packets_only(wire.encode(message)) == (batch and not message.fixes)

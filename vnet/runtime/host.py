@@ -1,0 +1,338 @@
+"""Hosting: running the programs of one process's nodes on one event loop.
+
+A `Host` builds the nodes from their welcomes, starts their programs, collects what they send and feeds them
+what arrives. It knows no transport: agents put its traffic on Zenoh, `vnet simulate` hands it to the engine.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import contextvars
+import importlib
+import inspect
+import os
+import sys
+import traceback
+import weakref
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from vnet.errors import ProgramError
+from vnet.node import Node, Report
+from vnet.roads.road_map import map_from_wire
+from vnet.runtime.virtual_time import BendableLoop, LoopAbandonedError, SpinError, VirtualTimeLoop
+from vnet.transport import wire
+
+Program = Callable[[Node], Awaitable[None]]
+Programs = Mapping[str, Program]
+"""What each node runs, by id."""
+
+_current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
+"""On whose behalf code runs: a node, in one of its incarnations."""
+
+
+def load_program(entry: str) -> Program:
+    """Import `package.module:function`. Raises ProgramError with the reason in one line."""
+    module_name, _, name = entry.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise ProgramError(f"program.entry = {entry!r}: cannot import: {_one_line(error)}") from error
+    program = getattr(module, name, None)
+    if program is None:
+        raise ProgramError(f"program.entry = {entry!r}: module {module_name} has no {name!r}")
+    if not asyncio.iscoroutinefunction(program):
+        raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
+    return program  # type: ignore[no-any-return]
+
+
+def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
+    """The program of each node that is welcome. Raises ProgramError."""
+    return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
+
+
+def fix_hash_seed(module: str) -> None:
+    """Start this command (`python -m module`) again with a fixed hash seed, unless it has one.
+
+    Programs that iterate over sets of strings must come out the same in every process and every run.
+    """
+    if os.environ.get("PYTHONHASHSEED") != "0":
+        arguments = [sys.executable, "-P", "-m", module, *sys.argv[1:]]
+        os.execve(sys.executable, arguments, {**os.environ, "PYTHONHASHSEED": "0"})
+
+
+class Host:
+    """The nodes of one process and their programs; see the module's text.
+
+    `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
+    puts it at once; lockstep takes it at the next yield).
+    """
+
+    def __init__(
+        self,
+        welcomes: Sequence[wire.Welcome],
+        clock: Callable[[], int],
+        on_traffic: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._clock = clock
+        self._on_traffic = on_traffic
+        self._frames: list[wire.Frame] = []
+        self._reports: list[Report] = []
+        self._endings: list[wire.Ending] = []
+        self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
+        self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
+        self._active = {welcome.node: welcome.runs for welcome in welcomes}
+        self._clocks: dict[str, wire.ClockBend] = {}
+        self._past_clocks: dict[str, list[wire.ClockBend]] = {}
+        self._paused: set[str] = set()
+        self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
+
+    def _node(self, welcome: wire.Welcome) -> Node:
+        return Node(
+            welcome.node,
+            self,
+            lane_map=map_from_wire(welcome.lane_map),
+            seed=welcome.seed,
+            options=welcome.options,
+            period_ns=welcome.period_ns,
+            max_payload=welcome.max_payload,
+            incarnation=welcome.incarnation,
+        )
+
+    # What nodes ask of their link.
+
+    def now_ns(self, node: str) -> int:
+        """Emulated time in nanoseconds, by the clock of `node`."""
+        bend = self._clocks.get(node)
+        return self._clock() if bend is None else max(bend.shown_ns(self._clock()), 0)
+
+    def send_frame(self, node: str, payload: bytes) -> None:
+        """Take a frame for the radio; a node that has ended is silent."""
+        if self._active[node]:
+            self._frames.append(wire.Frame(node, payload))
+            self._on_traffic()
+
+    def send_report(self, report: Report) -> None:
+        """Take a report."""
+        if self._active[report.node]:
+            self._reports.append(report)
+            self._on_traffic()
+
+    # What the transport asks of the host.
+
+    def start(self, loop: asyncio.AbstractEventLoop, programs: Programs) -> None:
+        """Schedule every node's program on `loop`."""
+        self._loop = loop
+        self._programs = programs
+        loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
+        for node in self.nodes.values():
+            if self._active[node.id]:
+                self._start(node)
+
+    def _start(self, node: Node) -> None:
+        context = contextvars.copy_context()
+        context.run(_current_node.set, node)
+        program = self._run(node, self._programs[node.id])
+        self._loop.create_task(program, name=f"{node.id} main", context=context)
+
+    def stop(self, node: str, killed: bool) -> None:
+        """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
+        gone = self.nodes[node]
+        gone.sever()
+        self._active[node] = False
+        if killed:
+            self._killed[gone] = self._tasks_of(gone)
+            for task in self._killed[gone]:
+                task._log_destroy_pending = False  # type: ignore[attr-defined]
+                program = task.get_coro()
+                assert inspect.iscoroutine(program)
+                if inspect.getcoroutinestate(program) == inspect.CORO_CREATED:
+                    program.close()
+            self._hold()
+        else:
+            for task in self._tasks_of(gone):
+                task.cancel()
+
+    def restart(self, welcome: wire.Welcome) -> None:
+        """Run a node's program anew, as another incarnation (simulated)."""
+        node = self.nodes[welcome.node] = self._node(welcome)
+        self._active[node.id] = True
+        self._start(node)
+
+    def pause(self, nodes: Iterable[str]) -> None:
+        """From now on these nodes stand still, and no others: their callbacks wait (simulated)."""
+        self._paused = set(nodes)
+        self._hold()
+
+    def _hold(self) -> None:
+        assert isinstance(self._loop, VirtualTimeLoop)
+        self._loop.hold(self._stands_still)
+
+    def _stands_still(self, handle: asyncio.Handle) -> bool:
+        owner = _owner(handle)
+        return owner is not None and (owner.id in self._paused or owner in self._killed)
+
+    def bend(self, clocks: Iterable[wire.ClockBend], loop: BendableLoop) -> None:
+        """Take new clocks of nodes."""
+        for clock in clocks:
+            self._past_clocks.setdefault(clock.node, []).append(clock)
+            self._clocks.pop(clock.node, None)
+            if clock.bends:
+                self._clocks[clock.node] = clock
+        loop.bend_of = self._bend_of_task if self._clocks else _no_bend
+
+    def _bend_of_task(self) -> wire.ClockBend | None:
+        node = _current_node.get()
+        return None if node is None else self._clocks.get(node.id)
+
+    def _shown_ns(self, node: str, time_ns: int) -> int:
+        """What the clock of `node` showed at `time_ns`, as it went then."""
+        for bend in reversed(self._past_clocks.get(node, ())):
+            if bend.since_ns <= time_ns:
+                return max(bend.shown_ns(time_ns), 0)
+        return time_ns
+
+    def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
+        """Put packets, then fixes, into the mailboxes."""
+        for packet in packets:
+            received = packet.packet()
+            if packet.node in self._past_clocks:
+                received = replace(received, received_ns=self._shown_ns(packet.node, received.received_ns))
+            self.nodes[packet.node].radio.inbox.deliver((received,))
+        for fix in fixes:
+            self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
+
+    def take_traffic(self) -> wire.Traffic:
+        """Everything that the nodes have handed over since the last call."""
+        traffic = wire.Traffic(self._frames, self._reports, self._endings)
+        self._frames, self._reports, self._endings = [], [], []
+        return traffic
+
+    def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
+        """What the process has to say when nothing is left to do at this instant (lockstep)."""
+        nodes = self.nodes.values()
+        return wire.Yield(
+            nonce,
+            seq,
+            next_timer_ns,
+            waiting_radio=[node.id for node in nodes if node.radio.inbox.waiting],
+            waiting_gnss=[node.id for node in nodes if node.gnss.inbox.waiting],
+            traffic=self.take_traffic(),
+        )
+
+    def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
+        """Record that a node's program is over, and cancel what it left running."""
+        if not self._active[node]:
+            return
+        self._active[node] = False
+        self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        running = asyncio.current_task(self._loop)
+        for task in self._tasks_of(self.nodes[node]):
+            if task is not running:
+                task.cancel()
+        self._on_traffic()
+
+    def _tasks_of(self, node: Node) -> list[asyncio.Task[Any]]:
+        return [task for task, owner in list(self._tasks.items()) if owner is node and not task.done()]
+
+    def end_spinning(self, loop: VirtualTimeLoop, spin: SpinError) -> None:
+        """After a SpinError: end the nodes whose callbacks were still coming, and say where they stand.
+
+        What spins on although it was cancelled loses its callbacks.
+        """
+        ready = loop._ready
+        owners = dict.fromkeys(_owner(handle) for handle in ready)
+        spinning = [owner for owner in owners if owner is not None] or list(self.nodes.values())
+        if not any(self._runs(node) for node in spinning):
+            kept = [handle for handle in ready if _owner(handle) not in spinning]
+            ready.clear()
+            ready.extend(kept)
+        for node in spinning:
+            if self._runs(node):
+                self.end(node.id, "spun", str(spin), self.stacks(node.id))
+
+    def _runs(self, node: Node) -> bool:
+        """Whether its program goes on, and is not what is left of an earlier incarnation."""
+        return self.nodes[node.id] is node and self._active[node.id]
+
+    def stacks(self, node: str) -> str:
+        """Where the tasks of a node stand, as text."""
+        lines = []
+        for task in self._tasks_of(self.nodes[node]):
+            lines.append(f"task {task.get_name()}:")
+            lines += [f"  {place}" for place in _standing(task)]
+        return "\n".join(lines)
+
+    def _cancel_all(self) -> list[asyncio.Task[Any]]:
+        live = [(task, owner) for task, owner in self._tasks.items() if not task.done()]
+        tasks = [task for task, owner in live if owner is not None and owner not in self._killed]
+        for task in tasks:
+            task.cancel()
+        return tasks
+
+    def close(self, loop: VirtualTimeLoop) -> None:
+        """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep)."""
+        with contextlib.suppress(LoopAbandonedError, SpinError):
+            loop.finish(_all_done(self._cancel_all()))
+
+    async def cancel(self) -> None:
+        """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""
+        if tasks := self._cancel_all():
+            await asyncio.wait(tasks, timeout=1.0)
+
+    async def _run(self, node: Node, program: Program) -> None:
+        try:
+            await program(node)
+        except (asyncio.CancelledError, GeneratorExit):
+            raise
+        except (Exception, SystemExit) as error:
+            if isinstance(error, SystemExit) and not error.code:
+                self._over(node, "finished")
+                return
+            self._over(node, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
+        else:
+            self._over(node, "finished")
+
+    def _over(self, node: Node, kind: str, error: str = "", details: str = "") -> None:
+        if self.nodes[node.id] is node:  # and not what is left of an earlier incarnation
+            self.end(node.id, kind, error, details)
+
+    def _new_task(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        coroutine: Generator[Any, None, Any],
+        context: contextvars.Context | None = None,
+    ) -> asyncio.Task[Any]:
+        task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context)
+        owner = _current_node.get() if context is None else context.get(_current_node)
+        self._tasks[task] = owner
+        return task
+
+
+def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
+    """Where a suspended task stands, from its outermost coroutine inwards."""
+    coroutine: Any = task.get_coro()
+    while (frame := getattr(coroutine, "cr_frame", None)) is not None:
+        yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
+        coroutine = coroutine.cr_await
+
+
+def _no_bend() -> wire.ClockBend | None:
+    """All clocks are right."""
+    return None
+
+
+def _owner(handle: asyncio.Handle) -> Node | None:
+    """The node on whose behalf a callback is scheduled."""
+    return handle._context.get(_current_node)  # type: ignore[attr-defined, no-any-return]
+
+
+async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

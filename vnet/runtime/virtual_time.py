@@ -1,0 +1,289 @@
+"""The asyncio event loop whose clock the emulator grants.
+
+An ordinary loop asks its selector to wait until something happens. Here, when no callback is ready, waiting
+means *yielding*: the loop hands its next timer to `exchange`, which comes back with the new time in
+nanoseconds once something is due, having put packets and fixes into the nodes' mailboxes. Between two
+exchanges no time passes, however long the program computes.
+
+Earlier loops of this kind, for one process and without an outside clock: async-solipsism, looptime, aiotools.
+Loop time starts near 0: at epoch-sized values float timers and the clock's resolution no longer agree, and a
+virtual loop spins for ever (cpython#116342).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import selectors
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import Context
+from itertools import count
+from typing import Any, NoReturn
+
+from vnet.errors import VirtualTimeError
+from vnet.transport.wire import ClockBend
+from vnet.units import NS_PER_S
+
+LATEST_S = 1e9
+"""Timers after this, more than thirty years, are for never."""
+
+Exchange = Callable[[int | None], int]
+"""Yield: takes the next timer (ns, or None), blocks for the grant, returns the granted time (ns)."""
+
+
+class SpinError(VirtualTimeError):
+    """A program that goes on for ever at one instant."""
+
+
+class LoopAbandonedError(VirtualTimeError):
+    """A loop that was told to end, but whose tasks still wait for something."""
+
+
+class BendableLoop(asyncio.SelectorEventLoop):
+    """A loop that shows some tasks another time: `bend_of` gives the clock of the task that asks, or None.
+
+    Timers are kept in the loop's own time.
+    """
+
+    bend_of: Callable[[], ClockBend | None] = staticmethod(lambda: None)
+
+    @property
+    def now_ns(self) -> int:
+        """The loop's own time in nanoseconds of the run."""
+        raise NotImplementedError
+
+    def time(self) -> float:
+        """Seconds, as asyncio counts, on the clock of the task that asks."""
+        bend = self.bend_of()
+        if bend is None:
+            return self.own_time()
+        now_ns = self.now_ns
+        return self.own_time() + (bend.shown_ns(now_ns) - now_ns) / NS_PER_S
+
+    def own_time(self) -> float:
+        """Seconds on the loop's own clock."""
+        return super().time()
+
+    def call_at(  # type: ignore[override]
+        self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """Call at `when` on the clock of the task that asks."""
+        return super().call_at(self._own_when(when), callback, *args, context=context)
+
+    def _own_when(self, when: float) -> float:
+        """When, on the loop's own clock, the clock of the task that asks shows `when`."""
+        bend = self.bend_of()
+        return when if bend is None else self.own_time() + (when - self.time()) / (1 + bend.rate)
+
+
+class _Timer(asyncio.TimerHandle):
+    """A timer with a number: those of one instant fire in the order in which they were set.
+
+    asyncio leaves that to the shape of its heap, and so to how many other nodes share the loop.
+    """
+
+    __slots__ = ("_number",)
+
+    def __init__(self, number: int, *rest: Any) -> None:
+        super().__init__(*rest)
+        self._number = number
+
+    def __lt__(self, other: asyncio.TimerHandle) -> bool:
+        assert isinstance(other, _Timer)
+        return (self._when, self._number) < (other._when, other._number)  # type: ignore[attr-defined]
+
+
+class VirtualTimeLoop(BendableLoop):
+    """An event loop in virtual time; see the module's text.
+
+    `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.
+    """
+
+    def __init__(self, exchange: Exchange, spin_limit: int = 100_000) -> None:
+        self._exchange = exchange
+        self._spin_limit = spin_limit
+        self._rounds = 0
+        self._now_ns = 0
+        self._ending = False
+        self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
+        self._timers = count()
+        self._scheduled: list[asyncio.TimerHandle]  # asyncio's heap
+        self._ready: deque[asyncio.Handle]  # asyncio's
+        super().__init__(_YieldingSelector(self._wait))
+        self._clock_resolution = 0.5 / NS_PER_S  # no timer fires before its nanosecond
+
+    @property
+    def now_ns(self) -> int:
+        """The granted time in nanoseconds."""
+        return self._now_ns
+
+    def start_at(self, time_ns: int) -> None:
+        """Set the clock before anything runs: a process that is started anew joins late."""
+        self._now_ns = time_ns
+
+    def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
+        """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
+
+        Timers that became due meanwhile are due when they are let go: after what has come in by then, in order.
+        """
+        if not isinstance(self._ready, _HoldingQueue):
+            self._ready = _HoldingQueue(self._ready)
+        for timer in self._ready.release(held):
+            heapq.heappush(self._scheduled, timer)
+            timer._scheduled = True  # type: ignore[attr-defined]
+
+    def own_time(self) -> float:
+        """The granted time in seconds, as asyncio counts."""
+        return self._now_ns / NS_PER_S
+
+    def call_at(  # type: ignore[override]
+        self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """Call at `when` on the clock of the task that asks, at the nearest nanosecond."""
+        self._check_closed()  # type: ignore[attr-defined]
+        when = self._own_when(when)
+        if when < LATEST_S:
+            when = round(when * NS_PER_S) / NS_PER_S
+        timer = _Timer(next(self._timers), when, callback, args, self, context)
+        heapq.heappush(self._scheduled, timer)
+        timer._scheduled = True  # type: ignore[attr-defined]
+        return timer
+
+    def finish(self, main: Coroutine[Any, Any, None]) -> None:
+        """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
+        self._ending = True
+        self._rounds = 0
+        self.run_until_complete(main)
+
+    def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
+        """What the selector does instead of sleeping."""
+        if timeout is not None and timeout <= 0:
+            self._count_round()
+            return poll(0)
+        if self._jobs:
+            return self._wait_for_jobs(poll)
+        if self._ending:
+            raise LoopAbandonedError("a task still waits after the run has ended")
+        next_timer_ns = self._next_timer_ns()
+        if next_timer_ns == self._now_ns:  # a timer closer than the clock's resolution: due already
+            self._count_round()
+            return []
+        self._rounds = 0
+        self._now_ns = self._exchange(next_timer_ns)
+        return []
+
+    def _count_round(self) -> None:
+        self._rounds += 1
+        if self._rounds > self._spin_limit:
+            self._rounds = 0
+            raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
+
+    def _next_timer_ns(self) -> int | None:
+        # asyncio has just dropped cancelled timers from the head of its heap.
+        if not self._scheduled or self._scheduled[0].when() > LATEST_S:
+            return None
+        return max(round(self._scheduled[0].when() * NS_PER_S), self._now_ns)
+
+    # Executors: while a job is pending the loop does not yield (computing costs no virtual time), and results
+    # appear in the order in which the jobs were submitted, when all are there: no race decides anything.
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Executor | None, func: Callable[..., Any], *args: Any
+    ) -> asyncio.Future[Any]:
+        """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
+        if executor is None:
+            executor = self._own_executor()
+        job = executor.submit(func, *args)
+        outer: asyncio.Future[Any] = self.create_future()
+        self._jobs.append((job, outer))
+        job.add_done_callback(lambda _: self.call_soon_threadsafe(_nothing))
+        return outer
+
+    def _own_executor(self) -> Executor:
+        if self._default_executor is None:  # type: ignore[has-type]
+            self._default_executor = ThreadPoolExecutor(thread_name_prefix="vnet")
+        executor: Executor = self._default_executor
+        return executor
+
+    def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
+        if not all(job.done() for job, _ in self._jobs):
+            return poll(None)  # a finished job, or a call from a job's thread, wakes the self-pipe
+        jobs, self._jobs = self._jobs, []
+        for job, outer in jobs:
+            if not outer.done():
+                _copy_result(job, outer)
+        return []
+
+    # Sockets and subprocesses would wait on the real world, whose time has no place here.
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise VirtualTimeError(
+            "sockets, pipes and subprocesses are not available to programs in lockstep; use node.radio, or "
+            "run the scenario with run.pacing = realtime"
+        )
+
+    create_connection = create_server = create_datagram_endpoint = _refuse
+    create_unix_connection = create_unix_server = _refuse
+    subprocess_exec = subprocess_shell = _refuse
+    connect_read_pipe = connect_write_pipe = _refuse
+    connect_accepted_socket = start_tls = sendfile = _refuse
+    add_reader = add_writer = _refuse  # type: ignore[assignment]
+    getaddrinfo = getnameinfo = _refuse
+    sock_recv = sock_recv_into = sock_recvfrom = sock_recvfrom_into = _refuse
+    sock_sendall = sock_sendto = sock_connect = sock_accept = sock_sendfile = _refuse
+
+
+class _HoldingQueue(deque[asyncio.Handle]):
+    """The loop's queue of callbacks that are ready, but for those of programs that stand still."""
+
+    def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
+        super().__init__(ready)
+        self._holds: Callable[[asyncio.Handle], bool] = lambda handle: False
+        self._held: list[asyncio.Handle] = []
+
+    def append(self, handle: asyncio.Handle) -> None:
+        if self._holds(handle):
+            self._held.append(handle)
+        else:
+            super().append(handle)
+
+    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[_Timer]:
+        """Hold what `holds` says, and let go of the rest in the order in which it came; returns timers let go."""
+        waiting, held = list(self), self._held
+        self.clear()
+        self._holds, self._held = holds, []
+        for handle in waiting:
+            self.append(handle)
+        timers = []
+        for handle in held:
+            if isinstance(handle, _Timer) and not holds(handle):
+                timers.append(handle)
+            else:
+                self.append(handle)
+        return timers
+
+
+class _YieldingSelector(selectors.DefaultSelector):
+    """The real selector for the loop's own self-pipe, with the waiting handed to `wait`."""
+
+    def __init__(self, wait: Callable[[float | None, Callable[[float | None], list[Any]]], list[Any]]) -> None:
+        super().__init__()
+        self._wait = wait
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        return self._wait(timeout, super().select)
+
+
+def _copy_result(job: Future[Any], outer: asyncio.Future[Any]) -> None:
+    if job.cancelled():
+        outer.cancel()
+    elif (error := job.exception()) is not None:
+        outer.set_exception(error)
+    else:
+        outer.set_result(job.result())
+
+
+def _nothing() -> None:
+    """Scheduled only to wake the loop."""

@@ -1,0 +1,133 @@
+"""Opening Zenoh sessions: the emulator's embedded router, or a client of somebody's router.
+
+All settings that were measured to matter are here (DESIGN 4): no multicast scouting, no shared memory,
+explicit endpoints, finite timeouts. Sessions must be closed (`with`): an open one hangs the exit.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from vnet.errors import LinkError
+from vnet.transport import wire
+from vnet.transport.access import Access, Credentials, Identity, as_base64, is_tls, router_config, write_private
+
+AGENT_RUNTIME = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:2))"
+"""`ZENOH_RUNTIME` of an agent: fewer threads, 30 % less CPU. Zenoh reads it when it starts."""
+
+CONNECT_TIMEOUT_MS = 5000
+
+_NO_CONFIGURATIONS = "zenoh::api::session=off"
+
+
+@contextmanager
+def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Session]:
+    """A session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
+
+    Raises LinkError if the endpoint cannot be listened on, or speaks TLS where the users have no certificates.
+    """
+    access.check_endpoint(listen)
+    with tempfile.TemporaryDirectory(prefix="vnet-") as folder:
+        dictionary = Path(folder) / "users.txt"
+        write_private(dictionary, access.dictionary())
+        config = router_config([listen], dictionary, access.access_control(), access.tls)
+        link = {**_link(lease_ms), "rx": {"max_message_size": wire.LARGEST_SAID_BYTES}}
+        config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
+        config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
+        session = _open(config, f"cannot listen on {listen}")
+    with session:
+        yield session
+
+
+@contextmanager
+def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -> Iterator[zenoh.Session]:
+    """A client session of the router at `endpoint`. Raises LinkError if it is not there or refuses."""
+    identity = None if credentials is None else credentials.tls
+    if is_tls(endpoint) != (identity is not None):
+        has = "have a certificate: connect to tls/HOST:PORT" if identity else "have no certificate"
+        raise LinkError(f"cannot connect to {endpoint}: the credentials {has}")
+    config: dict[str, Any] = {
+        "mode": "client",
+        "connect": {
+            "endpoints": [endpoint],
+            "timeout_ms": CONNECT_TIMEOUT_MS,
+            "exit_on_failure": True,
+            "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+        },
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": False},
+            "link": {**_link(lease_ms), **_identification(identity)},
+        },
+    }
+    if credentials is not None:
+        usrpwd = {"user": credentials.user, "password": credentials.password}
+        config["transport"]["auth"] = {"usrpwd": usrpwd}
+    who = f" as {credentials.user}" if credentials else " without credentials"
+    with _open(config, f"cannot connect to {endpoint}{who}") as session:
+        yield session
+
+
+def router_endpoint(session: zenoh.Session) -> str:
+    """Where an embedded router really listens: the locator with the port that the system chose for port 0."""
+    for reply in session.get(f"@/{session.zid()}/router"):
+        if reply.ok is not None:
+            locators = json.loads(reply.ok.payload.to_string())["locators"]
+            return str(locators[0])
+    raise LinkError("the embedded router does not say where it listens")
+
+
+def quiet_zenoh() -> None:
+    """Zenoh's own log on stderr, at `RUST_LOG` if set; otherwise only what vnet itself says is shown.
+
+    Whatever is set, the part of Zenoh that would write a session's configuration, password included, is left out.
+    """
+    wanted = os.environ.get("RUST_LOG", "off")
+    if not wanted.endswith(_NO_CONFIGURATIONS):
+        os.environ["RUST_LOG"] = f"{wanted},{_NO_CONFIGURATIONS}"  # also for the processes that this one starts
+    zenoh.init_log_from_env_or("off")
+
+
+def _link(lease_ms: int) -> dict[str, Any]:
+    """Leases, and queues as long as Zenoh allows: in real time what finds its queue full is dropped."""
+    return {"tx": {"lease": lease_ms, "keep_alive": 4, "queue": {"size": {"data": 16}}}}
+
+
+def _identification(identity: Identity | None) -> dict[str, Any]:
+    """How a client shows who it is, and makes sure that it speaks to the run's own router."""
+    if identity is None:
+        return {}
+    return {
+        "tls": {
+            "root_ca_certificate_base64": as_base64(identity.authority),
+            "connect_certificate_base64": as_base64(identity.own.certificate),
+            "connect_private_key_base64": as_base64(identity.own.private_key),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+        }
+    }
+
+
+def _open(config: dict[str, Any], failure: str) -> zenoh.Session:
+    try:
+        return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
+    except zenoh.ZError as error:
+        raise LinkError(f"{failure}: {_reason(str(error))}") from None
+
+
+def _reason(text: str) -> str:
+    if "Address already in use" in text or "os error 98" in text:
+        return "the address is already in use"
+    if "Cannot assign requested address" in text:
+        return "no such address on this machine"
+    if "Timeout" in text:
+        return f"no router answered, or it refused the credentials, within {CONNECT_TIMEOUT_MS / 1000:.0f} s"
+    return text.split(" at /")[0]
