@@ -29,7 +29,7 @@ class AveragingFrame(msgspec.Struct, array_like=True):
 
     epoch: int
     running_sum: tuple[float, float, float]
-    takers: list[str]
+    out_neighbours: list[str]
     heard: list[str]
 
 
@@ -102,7 +102,7 @@ def _consensus(name: str, rule: str) -> Consensus:
 
 def encode(share: Share) -> bytes:
     """A share as the bytes of a frame."""
-    frame = AveragingFrame(share.epoch, share.running_sum, sorted(share.takers), sorted(share.heard))
+    frame = AveragingFrame(share.epoch, share.running_sum, sorted(share.out_neighbours), sorted(share.heard))
     return msgspec.msgpack.encode(frame)
 
 
@@ -111,7 +111,7 @@ def decode(payload: bytes) -> Share:
     frame = msgspec.msgpack.decode(payload, type=AveragingFrame)  # its errors are ValueErrors
     if not all(map(math.isfinite, frame.running_sum)) or frame.epoch < 0:
         raise ValueError("numbers out of bounds")
-    return Share(frame.epoch, frame.running_sum, frozenset(frame.takers), frozenset(frame.heard))
+    return Share(frame.epoch, frame.running_sum, frozenset(frame.out_neighbours), frozenset(frame.heard))
 
 
 async def main(node: Node) -> None:

@@ -64,8 +64,8 @@ async def main(node: Node) -> None:
         if before < FILTERING:
             rbpf.step((fix.time_ns - last_ns) / NS_PER_S, _observations(node.id, fix, sightings))
             last_ns = fix.time_ns
-            if options.roads_apart:
-                rbpf.weigh_roads()
+            if options.separate_map_update:
+                rbpf.update_from_map()
         if before == 0:
             result = _result(rbpf, fix.time_ns)
             await node.radio.broadcast(msgspec.msgpack.encode(result))

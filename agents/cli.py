@@ -18,7 +18,7 @@ import typer
 from agents.host import run_agent
 from vnet.errors import ProgramError, VnetError
 from vnet.runtime.host import fix_hash_seed
-from vnet.transport.access import Credentials
+from vnet.transport.credentials import Credentials
 from vnet.transport.keys import is_segment
 from vnet.transport.session import quiet_zenoh
 

@@ -22,11 +22,11 @@ from contextlib import ExitStack
 
 import zenoh
 
-from vnet.errors import LinkError, ProgramError, VnetError
+from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime.host import Host, Programs, load_programs
-from vnet.runtime.virtual_time import BendableLoop, SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import keys, wire
-from vnet.transport.access import Credentials
+from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
 from vnet.transport.session import open_client
 
@@ -34,7 +34,7 @@ HELLO_PERIOD_S = 0.5
 LEASE_MS = 60_000
 """Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
 
-_WHERE = wire.encode(wire.Where())
+_WHERE = wire.encode(wire.StackRequest())
 
 
 class _RunOverError(Exception):
@@ -58,7 +58,7 @@ def run_agent(
 ) -> None:
     """Join `run` at `endpoint` as `nodes` and run their programs to the end of the run.
 
-    Raises LinkError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
+    Raises TransportError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
     with ExitStack() as stack:
         set_time_slice(PROMPT_SLICE_NS)  # Zenoh's threads keep it
@@ -120,7 +120,7 @@ class _Attachment:
     def _on_rx(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
         if payload == _WHERE:  # the program's thread may be stuck: this one answers
-            self.say(wire.Standing(self.nonce, self._stack()))
+            self.say(wire.StackDump(self.nonce, self._stack()))
             return
         self.inbox.put((payload, time.monotonic_ns()))
         self.on_message(payload)
@@ -157,7 +157,7 @@ class _Attachment:
             publisher.put(wire.encode(hello))
 
     def join(self, timeout_s: float) -> list[wire.Welcome]:
-        """Repeat hello until every node is welcome. Raises LinkError on refusal and after `timeout_s`."""
+        """Repeat hello until every node is welcome. Raises TransportError on refusal and after `timeout_s`."""
         welcomes: dict[str, wire.Welcome] = {}
         deadline = time.monotonic() + timeout_s
         while True:
@@ -172,12 +172,12 @@ class _Attachment:
                     return [welcomes[node] for node in self.nodes]
             if time.monotonic() > deadline:
                 missing = ", ".join(node for node in self.nodes if node not in welcomes)
-                raise LinkError(f"no welcome for {missing} within {timeout_s:g} s: is the emulator running?")
+                raise TransportError(f"no welcome for {missing} within {timeout_s:g} s: is the emulator running?")
 
     def next_message(self) -> wire.EmulatorMessage:
         """The next message, waiting for as long as the emulator is there.
 
-        Raises _RunOverError at the end of the run, LinkError once the emulator has been gone for
+        Raises _RunOverError at the end of the run, TransportError once the emulator has been gone for
         `orphan_timeout_s`.
         """
         message = None
@@ -196,7 +196,7 @@ class _Attachment:
         return self.decode(item)
 
     def decode(self, item: Item) -> wire.EmulatorMessage | None:
-        """A queued item as a message for this process; raises _RunOverError and LinkError when told to go."""
+        """A queued item as a message for this process; raises _RunOverError and TransportError when told to go."""
         if not isinstance(item, tuple):
             return None
         message = wire.decode_rx(item[0])
@@ -205,7 +205,7 @@ class _Attachment:
             return None
         if isinstance(message, wire.End) and message.nonce in (None, self.nonce):
             if message.refused:
-                raise LinkError(f"refused: {message.reason}")
+                raise TransportError(f"refused: {message.reason}")
             raise _RunOverError(message.reason)
         return message
 
@@ -228,7 +228,7 @@ class _Attachment:
                 return
             if isinstance(item, tuple):
                 self._set_aside.append(item)
-        raise LinkError(self.orphaned(patience_s))
+        raise TransportError(self.orphaned(patience_s))
 
     def found(self) -> None:
         """The emulator is back: it has said nothing about when it goes the next time."""
@@ -259,7 +259,7 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
         while not isinstance(message, wire.Grant):
             message = attachment.next_message()
         seq = message.seq
-        host.bend(message.clocks, loop)
+        host.apply_clock_error(message.clocks, loop)
         host.deliver(message.packets, message.fixes)
         return message.time_ns
 
@@ -286,7 +286,7 @@ def _run_realtime(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
         runner.run(_RealTimeAgent(attachment, welcomes, programs).main())
 
 
-class _WallClockLoop(BendableLoop):
+class _WallClockLoop(SkewedLoop):
     """An ordinary loop that knows when the run began, so that clocks can go wrong."""
 
     origin_ns = 0
@@ -380,7 +380,7 @@ class _RealTimeAgent:
 
     def _orphaned(self, patience_s: float) -> None:
         if not self._over.done():
-            self._over.set_exception(LinkError(self._attachment.orphaned(patience_s)))
+            self._over.set_exception(TransportError(self._attachment.orphaned(patience_s)))
 
     def _take(self, batch: wire.Batch, arrived_ns: int) -> None:
         if batch.seq > self._expected:
@@ -395,7 +395,7 @@ class _RealTimeAgent:
             head_start_s = max(0.0, (self._origin_ns + batch.start_ns - time.monotonic_ns()) / 1e9)
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)
         now_ns = arrived_ns - self._origin_ns
-        self._host.bend(batch.clocks, self._loop)
+        self._host.apply_clock_error(batch.clocks, self._loop)
         for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.deliver(batch.packets, batch.fixes)

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pyarrow as pa
 
-from emulator.checks.judge import Evidence
+from emulator.checks.judge import RecordedRun
 from emulator.records.metrics import STATES
 from emulator.records.radio_metrics import radio_metrics
 from emulator.scenario.scenario import Scenario
@@ -14,7 +14,7 @@ from emulator.scenario.scenario import Scenario
 PERIOD_NS = 100_000_000
 
 
-def large(links: int, frames: int) -> Evidence:
+def large(links: int, frames: int) -> RecordedRun:
     """Vehicles in which each hears all others: links × frames rows."""
     count = round(math.sqrt(links))
     rng = np.random.default_rng(1)
@@ -34,18 +34,18 @@ def large(links: int, frames: int) -> Evidence:
     }
     states = [{"period": 0, "time_ns": 0, "node": name} for name in names.to_pylist()]
     table = pa.Table.from_pylist(states, schema=STATES)
-    return Evidence(Scenario(), pa.table(columns), table, pa.table({}), [], rng.uniform(0, 3000, (1, count, 2)))
+    return RecordedRun(Scenario(), pa.table(columns), table, pa.table({}), [], rng.uniform(0, 3000, (1, count, 2)))
 
 
 def main() -> None:
     """A million rows, of few links and of many."""
     radio_metrics(large(100, 100))  # what is loaded at first use
     for links in (2500, 10_000, 1_000_000):
-        evidence = large(links, 1_000_000 // links)
+        recorded = large(links, 1_000_000 // links)
         started, cpu_s = time.perf_counter(), time.process_time()
-        told = radio_metrics(evidence)
+        told = radio_metrics(recorded)
         taken_s, cpu_s = time.perf_counter() - started, time.process_time() - cpu_s
-        print(f"{len(evidence.trace):,} rows, {len(told.links):,} links: {taken_s:.2f} s, {cpu_s:.2f} s of CPU")
+        print(f"{len(recorded.trace):,} rows, {len(told.links):,} links: {taken_s:.2f} s, {cpu_s:.2f} s of CPU")
 
 
 if __name__ == "__main__":

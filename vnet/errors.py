@@ -58,7 +58,7 @@ class WireError(VnetError):
     """A message on a Zenoh key that does not decode into what the key carries."""
 
 
-class LinkError(VnetError):
+class TransportError(VnetError):
     """A Zenoh session that could not be opened, was refused, or was lost."""
 
 

@@ -2,7 +2,7 @@
 
 A program is `async def main(node: Node) -> None`. It hears the radio, its own GNSS receiver and its clock,
 and reports what it believes. Where the packets come from (lockstep, real time, one process or fifty) is the
-business of the `NodeLink` behind it; the program cannot tell.
+business of the `NodeTransport` behind it; the program cannot tell.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class Report:
     values: dict[str, float | list[float]] = field(default_factory=dict)
 
 
-class NodeLink(Protocol):
+class NodeTransport(Protocol):
     """What a node needs of the process that hosts it."""
 
     def now_ns(self, node: str) -> int:
@@ -135,17 +135,17 @@ class Radio:
         max_payload: the most bytes of a frame.
     """
 
-    def __init__(self, node_id: str, link: NodeLink, max_payload: int) -> None:
+    def __init__(self, node_id: str, transport: NodeTransport, max_payload: int) -> None:
         self.max_payload = max_payload
         self.inbox: Mailbox[Packet] = Mailbox()
         self._node_id = node_id
-        self._link = link
+        self._transport = transport
 
     async def broadcast(self, payload: bytes) -> None:
         """Send one frame to all in range. Raises `PayloadTooLargeError` above `max_payload` bytes."""
         if len(payload) > self.max_payload:
             raise PayloadTooLargeError(len(payload), self.max_payload)
-        self._link.send_frame(self._node_id, bytes(payload))
+        self._transport.send_frame(self._node_id, bytes(payload))
 
     def drain(self) -> list[Packet]:
         """All packets heard since the last look, oldest first, without waiting."""
@@ -201,7 +201,7 @@ class Node:
     def __init__(
         self,
         node_id: str,
-        link: NodeLink,
+        transport: NodeTransport,
         *,
         lane_map: LaneMap | RoadMap,
         seed: int,
@@ -211,23 +211,23 @@ class Node:
         incarnation: int = 0,
     ) -> None:
         self.id = node_id
-        self.radio = Radio(node_id, link, max_payload)
+        self.radio = Radio(node_id, transport, max_payload)
         self.gnss = GnssReceiver()
         self.map = lane_map
         self.rng = np.random.default_rng(seed)
         self.options = options
         self.period_ns = period_ns
         self.incarnation = incarnation
-        self._link = link
+        self._transport = transport
 
     @property
     def now_ns(self) -> int:
         """Emulated nanoseconds since the start of the run, by the vehicle's own clock."""
-        return self._link.now_ns(self.id)
+        return self._transport.now_ns(self.id)
 
-    def sever(self) -> None:
+    def disconnect(self) -> None:
         """Cut what is left of the program off from the world: the vehicle's process is gone."""
-        self._link = self.radio._link = _Severed(self.now_ns)
+        self._transport = self.radio._transport = _Disconnected(self.now_ns)
 
     def report(
         self,
@@ -246,7 +246,7 @@ class Node:
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
         covariance = None if covariance_m2 is None else _floats("covariance_m2", covariance_m2, 4)
         named = {name: _value(name, value) for name, value in values.items()}
-        self._link.send_report(
+        self._transport.send_report(
             Report(
                 self.now_ns,
                 self.id,
@@ -257,7 +257,7 @@ class Node:
         )
 
 
-class _Severed:
+class _Disconnected:
     """The link of a node whose process is gone: nothing that it still does reaches anybody."""
 
     def __init__(self, now_ns: int) -> None:

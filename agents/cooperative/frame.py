@@ -67,7 +67,7 @@ class CooperativeFrame:
     name: str = "00000000"
 
     @cached_property
-    def takers(self) -> frozenset[str]:
+    def out_neighbours(self) -> frozenset[str]:
         """Those of `heard` that are given a share."""
         return frozenset(name for name, takes in self.heard.items() if takes)
 

@@ -81,7 +81,7 @@ class Options:
     """How wide it starts; 0 means as wide as `common_sigma_m`."""
     one_sided: bool = False
     """Whether lanes are bounded on their right only, as the paper's."""
-    roads_apart: bool = False
+    separate_map_update: bool = False
     """Whether roads weigh the particles after stacking, all and each time anew, as the paper's."""
     two_frames: bool = False
     """Whether estimates follow in a frame of their own, once the fixes have been filtered, as the paper's."""
@@ -161,7 +161,7 @@ class Options:
             start_m=(self.start_m[0], self.start_m[1]),
             start_sigma_m=self.start_sigma_m or None,
             one_sided=self.one_sided,
-            roads_apart=self.roads_apart,
+            separate_map_update=self.separate_map_update,
             least_log_road=LEAST_LOG_ROAD if self.defence else -math.inf,
         )
 

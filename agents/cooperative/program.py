@@ -151,8 +151,8 @@ class Estimator:
             self.stacked_m = self._come_together(frames)
         else:
             self.stacked_m = self.rbpf.estimate_m
-        if self._options.roads_apart:
-            self.rbpf.weigh_roads()
+        if self._options.separate_map_update:
+            self.rbpf.update_from_map()
 
     def _plausible(self, frames: dict[str, CooperativeFrame]) -> dict[str, CooperativeFrame]:
         """Without those whose estimate is not where most are; who they are is decided anew each period."""
@@ -226,7 +226,7 @@ class Estimator:
         """The frame with the newest fix, as long as `max_payload` bytes allow."""
         share = self._share
         self._said = self._estimate()
-        heard = {name: name in share.takers for name in sorted(share.heard)[:255]}
+        heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:255]}
         left = room(len(heard), max_payload)
         mixes = self._options.exchange == "particles" and self._options.fusion != "none"
         count = min(self._options.particles, left // 4) if mixes else 0
@@ -265,7 +265,7 @@ def usable(fix: Fix) -> bool:
 
 
 def _share(frame: CooperativeFrame) -> Share:
-    return Share(frame.epoch, frame.running_sum, frame.takers, frame.names_heard)
+    return Share(frame.epoch, frame.running_sum, frame.out_neighbours, frame.names_heard)
 
 
 async def main(node: Node) -> None:

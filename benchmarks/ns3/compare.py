@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.ns3.ground import BIN_M, Curve, Ground
+from benchmarks.ns3.ground import BIN_M, Curve, ScheduleConstraints
 from benchmarks.ns3.simulators import ns3, ours
 
 LEAST_PAIRS = 1000
@@ -78,7 +78,7 @@ class Comparison:
 
 def compare(program: Path, vehicles: int, fading: bool, seconds: float) -> Comparison:
     """Both on the same ground, one after the other."""
-    ground = Ground.of(vehicles, seconds)
+    ground = ScheduleConstraints.of(vehicles, seconds)
     theirs, mine = ns3(program, ground, fading), ours(ground, fading)
     return Comparison(
         vehicles,

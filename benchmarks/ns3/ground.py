@@ -14,7 +14,7 @@ BIN_M = 50.0
 
 
 @dataclass(frozen=True)
-class Ground:
+class ScheduleConstraints:
     """Vehicles on a road: their places (N,) in metres, and when (ns, in order) which of them sends."""
 
     east_m: NDArray[np.float64]
@@ -23,7 +23,7 @@ class Ground:
     seconds: float
 
     @classmethod
-    def of(cls, vehicles: int, seconds: float, seed: int = 0) -> Ground:
+    def of(cls, vehicles: int, seconds: float, seed: int = 0) -> ScheduleConstraints:
         """Uniformly placed; each sends once in every tenth of a second, at another instant each time."""
         draws = np.random.default_rng([seed, vehicles])
         east_m = draws.uniform(0, ROAD_M, vehicles)
@@ -62,7 +62,7 @@ class Curve:
     share: NDArray[np.float64]
 
     @classmethod
-    def of(cls, ground: Ground, outcome: Outcome) -> Curve:
+    def of(cls, ground: ScheduleConstraints, outcome: Outcome) -> Curve:
         """The curve of one simulator."""
         distance_m = np.abs(ground.east_m[:, None] - ground.east_m[None])
         others = ~np.eye(len(distance_m), dtype=bool)

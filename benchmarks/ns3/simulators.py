@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.ns3.ground import SIZE_BYTES, Ground, Outcome
+from benchmarks.ns3.ground import SIZE_BYTES, Outcome, ScheduleConstraints
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome as Fate
 from emulator.scenario.scenario import Radio
@@ -54,7 +54,7 @@ def _last_line(text: str) -> str:
     return text.strip().splitlines()[-1] if text.strip() else "no reason given"
 
 
-def ns3(program: Path, ground: Ground, fading: bool) -> Outcome:
+def ns3(program: Path, ground: ScheduleConstraints, fading: bool) -> Outcome:
     """The ground in ns-3. Raises MissingError if the program fails."""
     arguments = [f"--fading={int(fading)}", f"--bytes={SIZE_BYTES}", f"--seconds={ground.seconds:g}"]
     done = subprocess.run([program, *arguments], input=ground.text(), capture_output=True, text=True)
@@ -66,7 +66,7 @@ def ns3(program: Path, ground: Ground, fading: bool) -> Outcome:
     return Outcome(np.array(figures["received"]), np.array(figures["busy"]), figures["wall_s"], figures["cpu_s"])
 
 
-def ours(ground: Ground, fading: bool) -> Outcome:
+def ours(ground: ScheduleConstraints, fading: bool) -> Outcome:
     """The ground in vnet's engine, period by period."""
     count = len(ground.east_m)
     radio = Radio.model_validate({**RADIO, **({"fading": {}} if fading else {})})

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from emulator.radio.outcomes import Outcome
-from emulator.records.recorded_run import ARRIVED, NEVER_NS, ON_AIR, Evidence
+from emulator.records.recorded_run import ARRIVED, NEVER_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.faults import SenderFault, StaleMessages
 from vnet.types import Array, IntArray, Mask
@@ -19,138 +19,138 @@ LOSS_BAND = 0.999
 IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
 
 
-def nothing_seen(name: str, evidence: Evidence, text: str) -> Finding:
+def nothing_seen(name: str, recorded: RecordedRun, text: str) -> Finding:
     """Nothing observed is unknown, unless there was nobody to observe it."""
-    if not evidence.places.most_in_range:
+    if not recorded.places.most_in_range:
         return NotExercised(name, "no vehicle has another in range")
     return unknown(name, text)
 
 
-def check_conservation(evidence: Evidence) -> Finding:
+def check_conservation(recorded: RecordedRun) -> Finding:
     """Every frame has exactly one row, with exactly one outcome, for each receiver in range; so have its copies."""
     name = "conservation"
-    if not len(evidence.trace):
-        return nothing_seen(name, evidence, "no frame was sent")
+    if not len(recorded.trace):
+        return nothing_seen(name, recorded, "no frame was sent")
     broken: dict[str, Mask] = {
-        "repeated": _repeated(evidence),
-        "wrong_count": _in_frames_of_wrong_size(evidence),
-        "not_in_range": evidence.placed & ~evidence.in_range,
-        "undecided": ~evidence.outcome_is(*IN_TRACE),
-        "orphans": _orphans(evidence),
-        "disordered": _out_of_order(evidence),
-        "mistimed": _mistimed(evidence),
+        "repeated": _repeated(recorded),
+        "wrong_count": _in_frames_of_wrong_size(recorded),
+        "not_in_range": recorded.placed & ~recorded.in_range,
+        "undecided": ~recorded.outcome_is(*IN_TRACE),
+        "orphans": _orphans(recorded),
+        "disordered": _out_of_order(recorded),
+        "mistimed": _mistimed(recorded),
     }
-    frames = np.unique(evidence.emission[evidence.copy == 0])
-    gaps = _missing_numbers(evidence)
+    frames = np.unique(recorded.emission[recorded.copy == 0])
+    gaps = _missing_numbers(recorded)
     counts: dict[str, Any] = {what: int(mask.sum()) for what, mask in broken.items()}
-    counts["wrong_count"] = len(np.unique(evidence.emission[broken["wrong_count"]]))
+    counts["wrong_count"] = len(np.unique(recorded.emission[broken["wrong_count"]]))
     total = sum(counts.values()) + gaps
     offending = np.logical_or.reduce(list(broken.values()))
     return result(
         name,
         total,
-        f"{len(frames):,} frames, {len(evidence.trace):,} pairs in range, each with one outcome",
+        f"{len(frames):,} frames, {len(recorded.trace):,} pairs in range, each with one outcome",
         f"{total} frames or pairs without exactly one outcome",
-        evidence.rows(offending),
+        recorded.rows(offending),
         frames=len(frames),
-        pairs=len(evidence.trace),
+        pairs=len(recorded.trace),
         **counts,
         missing_frames=gaps,
     )
 
 
-def _repeated(evidence: Evidence) -> Mask:
-    key = evidence.emission * len(evidence.node_ids) + evidence.receiver
+def _repeated(recorded: RecordedRun) -> Mask:
+    key = recorded.emission * len(recorded.node_ids) + recorded.receiver
     order = np.argsort(key, kind="stable")
     repeated = np.zeros(len(key), dtype=bool)
     repeated[order[1:]] = key[order[1:]] == key[order[:-1]]
     return repeated
 
 
-def _in_frames_of_wrong_size(evidence: Evidence) -> Mask:
+def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
     """Rows of frames that have not one for each in range; what is only received twice may have fewer."""
-    first, inverse, rows = np.unique(evidence.emission, return_index=True, return_inverse=True, return_counts=True)[
+    first, inverse, rows = np.unique(recorded.emission, return_index=True, return_inverse=True, return_counts=True)[
         1:
     ]
-    in_range = evidence.places.receivers_in_range(evidence.sender[first], evidence.sent_ns[first])
-    wrong = evidence.placed[first] & (rows != in_range)
-    received_twice = evidence.caused_by("duplicate") & (evidence.copy > 0)
+    in_range = recorded.places.receivers_in_range(recorded.sender[first], recorded.sent_ns[first])
+    wrong = recorded.placed[first] & (rows != in_range)
+    received_twice = recorded.caused_by("duplicate") & (recorded.copy > 0)
     sent = np.bincount(inverse, weights=~received_twice, minlength=len(first)) > 0
     return np.asarray((wrong & sent)[inverse])
 
 
-def _orphans(evidence: Evidence) -> Mask:
+def _orphans(recorded: RecordedRun) -> Mask:
     """Copies that name no fault, or no original that was sent by then."""
-    copies = evidence.copy > 0
-    frame, place = np.unique(evidence.frame, return_inverse=True)
+    copies = recorded.copy > 0
+    frame, place = np.unique(recorded.frame, return_inverse=True)
     original_ns = np.full(len(frame), NEVER_NS)
-    np.minimum.at(original_ns, place[~copies], evidence.sent_ns[~copies])
-    named = evidence.trace["cause"].combine_chunks()
+    np.minimum.at(original_ns, place[~copies], recorded.sent_ns[~copies])
+    named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
-    return np.asarray(copies & (nameless | (original_ns[place] > evidence.sent_ns)))
+    return np.asarray(copies & (nameless | (original_ns[place] > recorded.sent_ns)))
 
 
-def _out_of_order(evidence: Evidence) -> Mask:
+def _out_of_order(recorded: RecordedRun) -> Mask:
     """Originals that were sent before an earlier one of their sender."""
-    originals = np.flatnonzero(evidence.copy == 0)
-    order = originals[np.lexsort((evidence.seq[originals], evidence.sender[originals]))]
-    same = evidence.sender[order[1:]] == evidence.sender[order[:-1]]
-    disordered = np.zeros(len(evidence.trace), dtype=bool)
-    disordered[order[1:]] = same & (evidence.sent_ns[order[1:]] < evidence.sent_ns[order[:-1]])
+    originals = np.flatnonzero(recorded.copy == 0)
+    order = originals[np.lexsort((recorded.seq[originals], recorded.sender[originals]))]
+    same = recorded.sender[order[1:]] == recorded.sender[order[:-1]]
+    disordered = np.zeros(len(recorded.trace), dtype=bool)
+    disordered[order[1:]] = same & (recorded.sent_ns[order[1:]] < recorded.sent_ns[order[:-1]])
     return disordered
 
 
-def _mistimed(evidence: Evidence) -> Mask:
+def _mistimed(recorded: RecordedRun) -> Mask:
     """What arrived has a time of arrival after its sending, and nothing else has one."""
-    there = evidence.arrival_ns >= 0
-    return np.asarray((there != evidence.arrived) | (there & (evidence.arrival_ns <= evidence.sent_ns)))
+    there = recorded.arrival_ns >= 0
+    return np.asarray((there != recorded.arrived) | (there & (recorded.arrival_ns <= recorded.sent_ns)))
 
 
-def _missing_numbers(evidence: Evidence) -> int:
+def _missing_numbers(recorded: RecordedRun) -> int:
     """How many numbers are missing below the last: of each sender's frames, and of each frame's copies.
 
     What a vehicle sends while nobody is near has no rows, so that its numbers may be missing.
     """
-    first = np.unique(evidence.emission, return_index=True)[1]
-    originals = first[evidence.copy[first] == 0]
+    first = np.unique(recorded.emission, return_index=True)[1]
+    originals = first[recorded.copy[first] == 0]
     missing = 0
-    for sender in np.unique(evidence.sender[originals]).tolist():
-        rows = originals[evidence.sender[originals] == sender]
-        seqs = np.concatenate([[-1], evidence.seq[rows]])
-        lonely = evidence.places.was_lonely(sender, np.concatenate([[0], evidence.sent_ns[rows]]))
+    for sender in np.unique(recorded.sender[originals]).tolist():
+        rows = originals[recorded.sender[originals] == sender]
+        seqs = np.concatenate([[-1], recorded.seq[rows]])
+        lonely = recorded.places.was_lonely(sender, np.concatenate([[0], recorded.sent_ns[rows]]))
         missing += int((np.diff(seqs) - 1)[~lonely].sum())
-    copies = first[evidence.copy[first] > 0]
-    copies = copies[~evidence.places.ever_lonely[evidence.sender[copies]]]
-    frame, place = np.unique(evidence.frame[copies], return_inverse=True)
+    copies = first[recorded.copy[first] > 0]
+    copies = copies[~recorded.places.ever_lonely[recorded.sender[copies]]]
+    frame, place = np.unique(recorded.frame[copies], return_inverse=True)
     last = np.zeros(len(frame), dtype=np.int64)
-    np.maximum.at(last, place, evidence.copy[copies])
+    np.maximum.at(last, place, recorded.copy[copies])
     return missing + int(last.sum()) - len(copies)
 
 
-def check_range(evidence: Evidence) -> Finding:
+def check_range(recorded: RecordedRun) -> Finding:
     """Nothing reached a receiver out of range."""
     name = "range"
-    delivered = evidence.outcome_is("delivered")
+    delivered = recorded.outcome_is("delivered")
     if not delivered.any():
-        return nothing_seen(name, evidence, "nothing was delivered")
-    beyond = delivered & evidence.placed & ~evidence.in_range
+        return nothing_seen(name, recorded, "nothing was delivered")
+    beyond = delivered & recorded.placed & ~recorded.in_range
     broken, count = int(beyond.sum()), int(delivered.sum())
     text = f"all {count:,} deliveries within range"
     broken_text = f"{broken} deliveries beyond range"
-    return result(name, broken, text, broken_text, evidence.rows(beyond), delivered=count, beyond=broken)
+    return result(name, broken, text, broken_text, recorded.rows(beyond), delivered=count, beyond=broken)
 
 
-def check_peer_cap(evidence: Evidence) -> Finding:
+def check_peer_cap(recorded: RecordedRun) -> Finding:
     """Each receiver hears its nearest `max_peers` live senders in range, and no other."""
     name = "peer_cap"
-    cap = evidence.scenario.radio.max_peers
-    largest = evidence.places.most_in_range
+    cap = recorded.scenario.radio.max_peers
+    largest = recorded.places.most_in_range
     if largest <= cap:
         return NotExercised(name, f"no receiver has more than {cap} senders in range (at most {largest})")
-    if not len(evidence.trace):
+    if not len(recorded.trace):
         return unknown(name, "no frame was sent")
-    capped = evidence.outcome_is("peer_cap")
-    wrong = _wrongly_capped(evidence, capped)
+    capped = recorded.outcome_is("peer_cap")
+    wrong = _wrongly_capped(recorded, capped)
     broken = int(wrong.sum())
     figures = {"cap": cap, "largest_in_range": largest, "capped": int(capped.sum()), "wrong": broken}
     if not broken and not capped.any():
@@ -158,65 +158,65 @@ def check_peer_cap(evidence: Evidence) -> Finding:
         return unknown(name, text, **figures)
     text = f"{int(capped.sum()):,} pairs beyond the nearest {cap} (up to {largest} in range)"
     return result(
-        name, broken, text, f"{broken} pairs on the wrong side of the cap", evidence.rows(wrong), **figures
+        name, broken, text, f"{broken} pairs on the wrong side of the cap", recorded.rows(wrong), **figures
     )
 
 
-def _wrongly_capped(evidence: Evidence, capped: Mask) -> Mask:
+def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
     # What was sent at the very instant of a death may have come before or after it: it is not judged.
-    judged = capped | evidence.outcome_is("fault", *ON_AIR)
-    judged &= evidence.placed & ~evidence.is_unsure(evidence.sent_ns)
-    everybody = np.arange(len(evidence.node_ids))
-    edges = {0, NEVER_NS} | {edge for span in evidence.down for edge in (span.start_ns, span.end_ns)}
-    if evidence.moves:
-        edges |= set(evidence.period_starts_ns().tolist())
+    judged = capped | recorded.outcome_is("fault", *ON_AIR)
+    judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns)
+    everybody = np.arange(len(recorded.node_ids))
+    edges = {0, NEVER_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
+    if recorded.moves:
+        edges |= set(recorded.period_starts_ns().tolist())
     wrong = np.zeros(len(capped), dtype=bool)
     for start_ns, end_ns in pairwise(sorted(edges)):
-        rows = evidence.sent_between(start_ns, end_ns)
+        rows = recorded.sent_between(start_ns, end_ns)
         if len(rows):
-            up = ~evidence.is_down(everybody, np.full(len(everybody), start_ns))
-            admitted = admitted_by_cap(evidence, up, start_ns)
-            wrong[rows] = judged[rows] & (admitted[evidence.sender[rows], evidence.receiver[rows]] == capped[rows])
+            up = ~recorded.is_down(everybody, np.full(len(everybody), start_ns))
+            admitted = admitted_by_cap(recorded, up, start_ns)
+            wrong[rows] = judged[rows] & (admitted[recorded.sender[rows], recorded.receiver[rows]] == capped[rows])
     return wrong
 
 
-def admitted_by_cap(evidence: Evidence, up: Mask, time_ns: int) -> Mask:
+def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Mask:
     """(N, N), rows are senders: whom each receiver's cap admits when these nodes (N,) are up."""
-    index = int(evidence.places.index(np.array([time_ns]))[0])
-    in_range = evidence.places.in_range(index) & up[:, None]
-    distance_m: Array = np.where(in_range, evidence.places.distance_m(index), np.inf)
+    index = int(recorded.places.index(np.array([time_ns]))[0])
+    in_range = recorded.places.in_range(index) & up[:, None]
+    distance_m: Array = np.where(in_range, recorded.places.distance_m(index), np.inf)
     # The nearest first, of equally near ones those of lower number; who is out of range is last.
-    nearest = np.argsort(distance_m, axis=0, kind="stable")[: evidence.scenario.radio.max_peers]
+    nearest = np.argsort(distance_m, axis=0, kind="stable")[: recorded.scenario.radio.max_peers]
     admitted = np.zeros_like(in_range)
     np.put_along_axis(admitted, nearest, True, axis=0)
     return np.asarray(admitted & in_range)
 
 
-def check_loss_rate(evidence: Evidence) -> Finding:
+def check_loss_rate(recorded: RecordedRun) -> Finding:
     """Among the pairs that no fault decided, the share of lost ones is in the binomial band of `radio.loss`."""
     name = "loss_rate"
-    loss = evidence.scenario.radio.loss
-    drawing = drew_for_loss(evidence)
-    lost, drawn = int((drawing & evidence.outcome_is("lost")).sum()), int(drawing.sum())
+    loss = recorded.scenario.radio.loss
+    drawing = drew_for_loss(recorded)
+    lost, drawn = int((drawing & recorded.outcome_is("lost")).sum()), int(drawing.sum())
     if drawn == 0:
-        return nothing_seen(name, evidence, "no pair came as far as the loss")
+        return nothing_seen(name, recorded, "no pair came as far as the loss")
     low, high = binomial_band(drawn, loss, LOSS_BAND)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": loss, "low": low, "high": high}
     text = f"{lost:,} of {drawn:,} pairs lost, {lost / drawn:.2%}; {loss:.2%} expected"
-    wrong_way = evidence.outcome_is("lost") if lost > high else drawing & ~evidence.outcome_is("lost")
+    wrong_way = recorded.outcome_is("lost") if lost > high else drawing & ~recorded.outcome_is("lost")
     outside = not low <= lost <= high
-    rows = evidence.rows(wrong_way) if outside else []
+    rows = recorded.rows(wrong_way) if outside else []
     return result(name, int(outside), text, f"{text}: outside the {LOSS_BAND:.1%} band", rows, **figures)
 
 
-def drew_for_loss(evidence: Evidence) -> Mask:
+def drew_for_loss(recorded: RecordedRun) -> Mask:
     """Pairs that came as far as the radio's loss. What is received twice was drawn for once."""
-    return np.asarray(evidence.outcome_is("lost", *ARRIVED) & ~received_twice(evidence))
+    return np.asarray(recorded.outcome_is("lost", *ARRIVED) & ~received_twice(recorded))
 
 
-def received_twice(evidence: Evidence) -> Mask:
+def received_twice(recorded: RecordedRun) -> Mask:
     """Rows that are no transmission of their own: duplicates on the way to one receiver."""
-    return np.asarray(evidence.caused_by("duplicate") & (evidence.copy > 0))
+    return np.asarray(recorded.caused_by("duplicate") & (recorded.copy > 0))
 
 
 def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, float]:
@@ -227,103 +227,103 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
     return low, high
 
 
-def check_isolation(evidence: Evidence) -> Finding:
+def check_isolation(recorded: RecordedRun) -> Finding:
     """What arrives was sent, byte for byte, and programs received nothing that did not arrive."""
     name = "isolation"
-    refused = sum(int(event.details.get("count", 0)) for event in evidence.event("refused_total"))
-    arrived = int(evidence.arrived.sum())
+    refused = sum(int(event.details.get("count", 0)) for event in recorded.event("refused_total"))
+    arrived = int(recorded.arrived.sum())
     if not arrived:
-        return nothing_seen(name, evidence, "nothing arrived")
-    foreign = _foreign(evidence)
-    claims = _claims_beyond(evidence)
+        return nothing_seen(name, recorded, "nothing arrived")
+    foreign = _foreign(recorded)
+    claims = _claims_beyond(recorded)
     broken = int(foreign.sum()) + len(claims)
-    reporting = int(np.isfinite(evidence.value("heard")).any(axis=0).sum())
+    reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{arrived:,} arrivals as they were sent"
     text += f"; {reporting} programs report what they heard, and it is no more than that" if reporting else ""
     broken_text = f"{int(foreign.sum())} arrivals of what nobody sent, {len(claims)} reports of more than arrived"
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
-    return result(name, broken, text, broken_text, evidence.rows(foreign) + claims, **figures)
+    return result(name, broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 
 
-def _foreign(evidence: Evidence) -> Mask:
+def _foreign(recorded: RecordedRun) -> Mask:
     """Arrivals with other bytes than their frame's, though no fault says that it changed them."""
-    differs = evidence.arrived & ~evidence.caused_by("corrupt") & changed_bytes(evidence)
-    replaced = _replaced(evidence)
-    differs |= evidence.arrived & _not_of_that_age(evidence, replaced)
+    differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded)
+    replaced = _replaced(recorded)
+    differs |= recorded.arrived & _not_of_that_age(recorded, replaced)
     # What a vehicle handed over and a stale frame took the place of is in no row of its own.
-    differs &= ~(evidence.caused_by("DataReplay") & np.isin(evidence.frame, evidence.frame[replaced]))
-    twice = np.flatnonzero(differs & received_twice(evidence))
+    differs &= ~(recorded.caused_by("DataReplay") & np.isin(recorded.frame, recorded.frame[replaced]))
+    twice = np.flatnonzero(differs & received_twice(recorded))
     if len(twice):
-        once = evidence.arrived & ~received_twice(evidence)
-        heard = set(zip(*(column[once].tolist() for column in _what(evidence)), strict=True))
-        described = zip(*(column[twice].tolist() for column in _what(evidence)), strict=True)
+        once = recorded.arrived & ~received_twice(recorded)
+        heard = set(zip(*(column[once].tolist() for column in _what(recorded)), strict=True))
+        described = zip(*(column[twice].tolist() for column in _what(recorded)), strict=True)
         differs[twice] = [what not in heard for what in described]
     return np.asarray(differs)
 
 
-def changed_bytes(evidence: Evidence) -> Mask:
+def changed_bytes(recorded: RecordedRun) -> Mask:
     """Rows with other bytes than their frame's, so far as an original that nothing corrupted tells them."""
-    frame, place = np.unique(evidence.frame, return_inverse=True)
-    plain = np.flatnonzero((evidence.copy == 0) & ~evidence.caused_by("corrupt"))[::-1]
+    frame, place = np.unique(recorded.frame, return_inverse=True)
+    plain = np.flatnonzero((recorded.copy == 0) & ~recorded.caused_by("corrupt"))[::-1]
     said = np.zeros(len(frame), dtype=np.uint64)
     known = np.zeros(len(frame), dtype=bool)
-    said[place[plain]], known[place[plain]] = evidence.digest[plain], True
-    return np.asarray(known[place] & (evidence.digest != said[place]))
+    said[place[plain]], known[place[plain]] = recorded.digest[plain], True
+    return np.asarray(known[place] & (recorded.digest != said[place]))
 
 
-def _replaced(evidence: Evidence) -> Mask:
+def _replaced(recorded: RecordedRun) -> Mask:
     """Originals that a stale frame may have taken the place of. (Where they were cut, they name the cut.)
 
     A sender's frames are remembered from when a fault first makes it misbehave.
     """
-    replaced = np.zeros(len(evidence.trace), dtype=bool)
-    remembered_ns = np.full(len(evidence.node_ids), NEVER_NS)
-    for planned in evidence.plan:
+    replaced = np.zeros(len(recorded.trace), dtype=bool)
+    remembered_ns = np.full(len(recorded.node_ids), NEVER_NS)
+    for planned in recorded.plan:
         if isinstance(planned.fault, SenderFault):
             remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
-    for planned in evidence.plan:
+    for planned in recorded.plan:
         if isinstance(planned.fault, StaleMessages):
-            old_ns = evidence.sent_ns - round(planned.fault.age_s * NS_PER_S) + evidence.guard_ns
-            acts = evidence.reached(planned, evidence.guard_ns) & (evidence.copy == 0)
-            replaced |= acts & (old_ns >= remembered_ns[evidence.sender])
+            old_ns = recorded.sent_ns - round(planned.fault.age_s * NS_PER_S) + recorded.guard_ns
+            acts = recorded.reached(planned, recorded.guard_ns) & (recorded.copy == 0)
+            replaced |= acts & (old_ns >= remembered_ns[recorded.sender])
     return replaced
 
 
-def _not_of_that_age(evidence: Evidence, replaced: Mask) -> Mask:
+def _not_of_that_age(recorded: RecordedRun, replaced: Mask) -> Mask:
     """Stale frames that are not what their sender sent so long ago, where that was not stale itself."""
     wrong = np.zeros(len(replaced), dtype=bool)
-    sound = ~evidence.caused_by("corrupt")
-    for planned in evidence.plan:
-        mine = np.flatnonzero(evidence.cause == planned.number)
+    sound = ~recorded.caused_by("corrupt")
+    for planned in recorded.plan:
+        mine = np.flatnonzero(recorded.cause == planned.number)
         if not isinstance(planned.fault, StaleMessages) or not len(mine):
             continue
-        for sender in np.unique(evidence.sender[mine]):
-            own = np.flatnonzero((evidence.sender == sender) & (evidence.copy == 0))
-            own = own[np.lexsort((sound[own], evidence.seq[own], evidence.sent_ns[own]))]
-            late = mine[evidence.sender[mine] == sender]
-            before_ns = evidence.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
-            place = np.searchsorted(evidence.sent_ns[own], before_ns, side="right") - 1
+        for sender in np.unique(recorded.sender[mine]):
+            own = np.flatnonzero((recorded.sender == sender) & (recorded.copy == 0))
+            own = own[np.lexsort((sound[own], recorded.seq[own], recorded.sent_ns[own]))]
+            late = mine[recorded.sender[mine] == sender]
+            before_ns = recorded.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
+            place = np.searchsorted(recorded.sent_ns[own], before_ns, side="right") - 1
             old = own[np.maximum(place, 0)]
             wrong[late] = (place < 0) | (
-                sound[old] & ~replaced[old] & (evidence.digest[late] != evidence.digest[old])
+                sound[old] & ~replaced[old] & (recorded.digest[late] != recorded.digest[old])
             )
     return wrong
 
 
-def _what(evidence: Evidence) -> tuple[IntArray, ...]:
-    return evidence.frame, evidence.receiver, evidence.digest  # type: ignore[return-value]
+def _what(recorded: RecordedRun) -> tuple[IntArray, ...]:
+    return recorded.frame, recorded.receiver, recorded.digest  # type: ignore[return-value]
 
 
-def _claims_beyond(evidence: Evidence) -> list[dict[str, Any]]:
+def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
     """Reports in which a program claims to have `heard`, all in all, more packets than had arrived by then."""
-    heard = evidence.value("heard")
+    heard = recorded.value("heard")
     claimed = np.cumsum(np.nan_to_num(heard), axis=0)
     claims = []
-    ends_ns = evidence.period_starts_ns() + evidence.scenario.period_ns
+    ends_ns = recorded.period_starts_ns() + recorded.scenario.period_ns
     for node in np.flatnonzero(np.isfinite(heard).any(axis=0)).tolist():
-        mine = evidence.outcome_is("delivered", "transport") & (evidence.receiver == node)
-        delivered = np.searchsorted(np.sort(evidence.arrival_ns[mine]), ends_ns, side="right")
+        mine = recorded.outcome_is("delivered", "transport") & (recorded.receiver == node)
+        delivered = np.searchsorted(np.sort(recorded.arrival_ns[mine]), ends_ns, side="right")
         for period in np.flatnonzero((claimed[:, node] > delivered) & np.isfinite(heard[:, node])).tolist():
-            claim = {"node": evidence.node_ids[node], "period": period, "heard": int(claimed[period, node])}
+            claim = {"node": recorded.node_ids[node], "period": period, "heard": int(claimed[period, node])}
             claims.append({**claim, "delivered": int(delivered[period])})
     return claims

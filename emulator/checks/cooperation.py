@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from emulator.checks.channel import admitted_by_cap
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.faults import GnssFault
 from vnet.types import Array, Mask
@@ -25,46 +25,46 @@ LOST_M, LOST_S = 10.0, 5.0
 """MODEL 6: a vehicle is divergent when its common error is over 10 m for 5 s."""
 
 
-def honest(evidence: Evidence) -> Mask:
+def honest(recorded: RecordedRun) -> Mask:
     """(N,), the nodes that run the program of the scenario; what exceptions say of themselves is their affair."""
-    excepted = {node for exception in evidence.scenario.program.exceptions for node in exception.nodes}
-    return np.array([node not in excepted for node in evidence.node_ids], dtype=bool)
+    excepted = {node for exception in recorded.scenario.program.exceptions for node in exception.nodes}
+    return np.array([node not in excepted for node in recorded.node_ids], dtype=bool)
 
 
-def ups(evidence: Evidence) -> Mask:
+def ups(recorded: RecordedRun) -> Mask:
     """(periods, N), who was up throughout a period."""
-    up = np.ones((evidence.periods, len(evidence.node_ids)), dtype=bool)
-    start_ns = evidence.period_starts_ns()
-    for span in evidence.down:
-        up[(span.start_ns < start_ns + evidence.scenario.period_ns) & (span.end_ns > start_ns), span.node] = False
+    up = np.ones((recorded.periods, len(recorded.node_ids)), dtype=bool)
+    start_ns = recorded.period_starts_ns()
+    for span in recorded.down:
+        up[(span.start_ns < start_ns + recorded.scenario.period_ns) & (span.end_ns > start_ns), span.node] = False
     return up
 
 
-def _components(evidence: Evidence, among: Mask, time_ns: int) -> list[Mask]:
+def _components(recorded: RecordedRun, among: Mask, time_ns: int) -> list[Mask]:
     """The parts of the network in which all hear of each other, links in both directions, among some nodes (N,)."""
-    linked = admitted_by_cap(evidence, among, time_ns)
+    linked = admitted_by_cap(recorded, among, time_ns)
     linked &= linked.T & among[:, None]
     count, label = connected_components(linked, directed=False)
     parts = [np.asarray((label == number) & among) for number in range(count)]
     return [part for part in parts if part.sum() > 1]
 
 
-def check_consensus_mean(evidence: Evidence) -> Finding:
+def check_consensus_mean(recorded: RecordedRun) -> Finding:
     """At the end, every vehicle's mean is near the mean of what the vehicles of its component believe."""
     name = "consensus_mean"
-    mean_m, common_m = evidence.vectors("mean_m"), evidence.vectors("common_error_estimate_m")
+    mean_m, common_m = recorded.vectors("mean_m"), recorded.vectors("common_error_estimate_m")
     if not np.isfinite(mean_m).any():
         return NotExercised(name, "the program reports no mean")
-    rested_s = (evidence.closed_ns - evidence.last_heal_ns) / NS_PER_S
+    rested_s = (recorded.closed_ns - recorded.last_heal_ns) / NS_PER_S
     if rested_s < AT_REST_S:
         return NotExercised(name, f"{rested_s:.1f} s at rest; {AT_REST_S:g} s are needed")
-    off_m = _off_the_mean(evidence, mean_m, common_m)
+    off_m = _off_the_mean(recorded, mean_m, common_m)
     judged = int(np.isfinite(off_m).sum())
     if not judged:
         return NotExercised(name, "no component of which all are honest, up and sure of a mean")
     worst_m = float(np.nanmax(off_m))
     off = [
-        {"node": evidence.node_ids[node], "off_m": float(off_m[node])}
+        {"node": recorded.node_ids[node], "off_m": float(off_m[node])}
         for node in np.flatnonzero(off_m > MEAN_TOLERANCE_M).tolist()
     ]
     figures = {"vehicles": judged, "worst_m": worst_m, "tolerance_m": MEAN_TOLERANCE_M}
@@ -75,35 +75,35 @@ def check_consensus_mean(evidence: Evidence) -> Finding:
     return result(name, len(off), text, broken_text, off, **figures)
 
 
-def _off_the_mean(evidence: Evidence, mean_m: Array, common_m: Array) -> Array:
+def _off_the_mean(recorded: RecordedRun, mean_m: Array, common_m: Array) -> Array:
     """(N,), how far each vehicle's mean was off its component's over the last second; NaN where nobody can say."""
-    last = slice(-max(1, NS_PER_S // evidence.scenario.period_ns), None)
-    up: Mask = np.asarray(ups(evidence)[last].all(axis=0))
+    last = slice(-max(1, NS_PER_S // recorded.scenario.period_ns), None)
+    up: Mask = np.asarray(ups(recorded)[last].all(axis=0))
     known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
     off_m = np.full(len(up), np.nan)
-    for part in _components(evidence, up, int(evidence.period_starts_ns()[-1])):
-        if (honest(evidence) & known)[part].all():
+    for part in _components(recorded, up, int(recorded.period_starts_ns()[-1])):
+        if (honest(recorded) & known)[part].all():
             centre = common_m[last, part].mean(axis=1)[:, None]
             off_m[part] = np.hypot(*np.median(mean_m[last, part] - centre, axis=0).T)
     return off_m
 
 
-def check_convergence(evidence: Evidence) -> Finding:
+def check_convergence(recorded: RecordedRun) -> Finding:
     """After every heal the vehicles agree again about as well as before the first fault, in time."""
     name = "convergence"
-    common_m = evidence.vectors("common_error_estimate_m")
-    if not evidence.plan:
+    common_m = recorded.vectors("common_error_estimate_m")
+    if not recorded.plan:
         return NotExercised(name, NO_FAULTS)
     if not np.isfinite(common_m).any():
         return NotExercised(name, "the program reports no common error")
-    deviation_m = _deviation(evidence, common_m)
-    start_ns = evidence.period_starts_ns()
-    first_ns = min(planned.start_ns for planned in evidence.plan)
-    before = deviation_m[start_ns + evidence.scenario.period_ns <= first_ns][-LEVEL_PERIODS:]
+    deviation_m = _deviation(recorded, common_m)
+    start_ns = recorded.period_starts_ns()
+    first_ns = min(planned.start_ns for planned in recorded.plan)
+    before = deviation_m[start_ns + recorded.scenario.period_ns <= first_ns][-LEVEL_PERIODS:]
     level_m = float(np.nanmedian(before)) if np.isfinite(before).any() else np.nan
     limit_m = max(BACK_FACTOR * level_m, BACK_LEAST_M) if np.isfinite(level_m) else BACK_LEAST_M
     late, recoveries, cut = [], [], 0
-    for heal_ns, until_ns in _rests(evidence):
+    for heal_ns, until_ns in _rests(recorded):
         window = (start_ns >= heal_ns) & (start_ns < until_ns) & np.isfinite(deviation_m)
         back = np.flatnonzero(window & (deviation_m <= limit_m))
         if len(back):
@@ -122,18 +122,18 @@ def check_convergence(evidence: Evidence) -> Finding:
     return result(name, len(late), text, broken_text, late, **figures)
 
 
-def _deviation(evidence: Evidence, common_m: Array) -> Array:
+def _deviation(recorded: RecordedRun, common_m: Array) -> Array:
     """(periods,), the deviation of the vehicles' estimates from their component's mean, of the worst component."""
     worst = np.full(len(common_m), np.nan)
-    up = ups(evidence)
-    everybody = np.ones(len(evidence.node_ids), dtype=bool)
-    period_ns = evidence.scenario.period_ns
+    up = ups(recorded)
+    everybody = np.ones(len(recorded.node_ids), dtype=bool)
+    period_ns = recorded.scenario.period_ns
     # Where vehicles move, each period has components of its own, among those that are there.
-    pieces = [slice(k, k + 1) for k in range(len(common_m))] if evidence.moves else [slice(None)]
+    pieces = [slice(k, k + 1) for k in range(len(common_m))] if recorded.moves else [slice(None)]
     for piece in pieces:
-        among = up[piece.start] if evidence.moves else everybody
-        for part in _components(evidence, among, (piece.start or 0) * period_ns):
-            values = np.where((up[piece] & part & honest(evidence))[..., None], common_m[piece], np.nan)
+        among = up[piece.start] if recorded.moves else everybody
+        for part in _components(recorded, among, (piece.start or 0) * period_ns):
+            values = np.where((up[piece] & part & honest(recorded))[..., None], common_m[piece], np.nan)
             known = np.isfinite(values).all(axis=2)
             several = known.sum(axis=1) > 1
             mean = np.nansum(values, axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
@@ -143,39 +143,39 @@ def _deviation(evidence: Evidence, common_m: Array) -> Array:
     return worst
 
 
-def _rests(evidence: Evidence) -> Sequence[tuple[int, int]]:
+def _rests(recorded: RecordedRun) -> Sequence[tuple[int, int]]:
     """The times in which the network may recover: from when no fault acts, for so long as it should take.
 
     One that the next fault cuts short is left out.
     """
-    period_ns = evidence.scenario.period_ns
-    end_ns = len(evidence.period_starts_ns()) * period_ns
+    period_ns = recorded.scenario.period_ns
+    end_ns = len(recorded.period_starts_ns()) * period_ns
     rests = []
-    for heal_ns in sorted({planned.end_ns for planned in evidence.plan if planned.end_ns < end_ns}):
-        if any(planned.acts_at(heal_ns) for planned in evidence.plan):
+    for heal_ns in sorted({planned.end_ns for planned in recorded.plan if planned.end_ns < end_ns}):
+        if any(planned.acts_at(heal_ns) for planned in recorded.plan):
             continue
         until_ns = heal_ns + round(WITHIN_S * NS_PER_S)
-        if all(not heal_ns <= planned.start_ns < until_ns for planned in evidence.plan):
+        if all(not heal_ns <= planned.start_ns < until_ns for planned in recorded.plan):
             rests.append((heal_ns, min(until_ns, end_ns)))
     return rests
 
 
-def check_bounded_error(evidence: Evidence) -> Finding:
+def check_bounded_error(recorded: RecordedRun) -> Finding:
     """No vehicle that is up, and neither lies nor is lied to by its receiver, is lost (MODEL 6)."""
     name = "bounded_error"
-    common_m = evidence.vectors("common_error_estimate_m")
+    common_m = recorded.vectors("common_error_estimate_m")
     if not np.isfinite(common_m).any():
         return NotExercised(name, "the program reports no common error")
-    error_m = np.hypot(*np.moveaxis(common_m - evidence.vectors("common_error_m"), 2, 0))
-    judged = np.isfinite(error_m) & ups(evidence) & honest(evidence) & ~_deceived(evidence)
+    error_m = np.hypot(*np.moveaxis(common_m - recorded.vectors("common_error_m"), 2, 0))
+    judged = np.isfinite(error_m) & ups(recorded) & honest(recorded) & ~_deceived(recorded)
     over = judged & (error_m > LOST_M)
-    need = max(1, round(LOST_S * NS_PER_S / evidence.scenario.period_ns))
+    need = max(1, round(LOST_S * NS_PER_S / recorded.scenario.period_ns))
     run_length = np.zeros(over.shape[1], dtype=int)
     lost: dict[int, dict[str, Any]] = {}
     for period in range(len(over)):
         run_length = np.where(over[period], run_length + 1, 0)
         for node in np.flatnonzero(run_length == need).tolist():
-            row = {"node": evidence.node_ids[node], "period": period, "error_m": float(error_m[period, node])}
+            row = {"node": recorded.node_ids[node], "period": period, "error_m": float(error_m[period, node])}
             lost.setdefault(node, row)
     worst = float(error_m[judged].max(initial=0))
     text = f"no common error over {LOST_M:g} m for {LOST_S:g} s; {worst:.1f} m at most"
@@ -183,13 +183,13 @@ def check_bounded_error(evidence: Evidence) -> Finding:
     return result(name, len(lost), text, broken_text, list(lost.values()), worst_m=worst, lost=len(lost))
 
 
-def _deceived(evidence: Evidence) -> Mask:
+def _deceived(recorded: RecordedRun) -> Mask:
     """(periods, N), whose receiver a fault bends, and for so long afterwards as a vehicle may take to recover."""
-    deceived = np.zeros((evidence.periods, len(evidence.node_ids)), dtype=bool)
-    for planned in evidence.plan:
+    deceived = np.zeros((recorded.periods, len(recorded.node_ids)), dtype=bool)
+    for planned in recorded.plan:
         if isinstance(planned.fault, GnssFault):
-            start_ns = evidence.period_starts_ns()
+            start_ns = recorded.period_starts_ns()
             when = (planned.start_ns <= start_ns) & (start_ns < planned.end_ns + round(WITHIN_S * NS_PER_S))
             # Where it follows a region, whoever has been within it.
-            deceived |= when[:, None] & (np.logical_or.accumulate(evidence.struck(planned)) | planned.nodes)
+            deceived |= when[:, None] & (np.logical_or.accumulate(recorded.struck(planned)) | planned.nodes)
     return deceived

@@ -49,7 +49,7 @@ from emulator.checks.run import (
 from emulator.checks.senders import check_copies, check_gnss
 from emulator.radio.trace import read_trace, sha256_of_table
 from emulator.records.busy import read_busy
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import read_events
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
 from emulator.scenario.scenario import load_scenario
@@ -57,20 +57,20 @@ from vnet.errors import VnetError
 
 __all__ = [
     "CheckResult",
-    "Evidence",
     "Judgement",
     "NotExercised",
+    "RecordedRun",
     "Verdict",
     "check_run",
     "judge",
-    "read_evidence",
+    "read_recorded_run",
     "recorded_verdict",
 ]
 
-Check = Callable[[Evidence], Finding]
-Checks = Callable[[Evidence], Iterable[Finding]]
+Check = Callable[[RecordedRun], Finding]
+Checks = Callable[[RecordedRun], Iterable[Finding]]
 
-OF_THE_RADIO: tuple[Check, ...] = (check_conservation, check_range, check_peer_cap, check_loss_rate)
+RADIO_CHECKS: tuple[Check, ...] = (check_conservation, check_range, check_peer_cap, check_loss_rate)
 """These need to know where the vehicles are; so do those of the other tuples but the last."""
 OF_FRAMES: tuple[Check, ...] = (
     check_fading,
@@ -102,7 +102,7 @@ OF_THE_RUN: tuple[Check, ...] = (
     check_kept_up,
 )
 OF_THE_MACHINE = ("transport", "kept_up")
-SPOILT_BY_THE_MACHINE = (
+REALTIME_SENSITIVE = (
     "pause_respected",
     "liveness",
     "consensus_mean",
@@ -112,24 +112,24 @@ SPOILT_BY_THE_MACHINE = (
 """What these see as broken may be the doing of a machine that did not keep up."""
 
 
-def judge(evidence: Evidence) -> Judgement:
+def judge(recorded: RecordedRun) -> Judgement:
     """Run all checks."""
-    findings = [*_placed(evidence), *(check(evidence) for check in OF_THE_RUN), ONCE]
+    findings = [*_placed(recorded), *(check(recorded) for check in OF_THE_RUN), ONCE]
     checks = [finding for finding in findings if isinstance(finding, CheckResult)]
     skipped = [finding for finding in findings if isinstance(finding, NotExercised)]
-    return Judgement(_excused(checks), skipped, sha256_of_table(evidence.trace))
+    return Judgement(_downgrade_if_overloaded(checks), skipped, sha256_of_table(recorded.trace))
 
 
-def _placed(evidence: Evidence) -> Iterator[Finding]:
+def _placed(recorded: RecordedRun) -> Iterator[Finding]:
     """The checks that need to know who was where. A run that ended within its first period does not know."""
     reason = "no period was completed, so nobody's position is known"
-    if len(evidence.states):
-        for check in (*OF_THE_RADIO, *OF_FRAMES, *OF_BELIEFS):
-            yield check(evidence)
+    if len(recorded.states):
+        for check in (*RADIO_CHECKS, *OF_FRAMES, *OF_BELIEFS):
+            yield check(recorded)
         for checks in OF_EACH_FAULT:
-            yield from checks(evidence)
+            yield from checks(recorded)
         return
-    for check in OF_THE_RADIO:
+    for check in RADIO_CHECKS:
         yield CheckResult(_name(check), Verdict.UNKNOWN, reason)
     for check in (*OF_FRAMES, *OF_BELIEFS):
         yield NotExercised(_name(check), reason)
@@ -139,13 +139,13 @@ def _name(check: Check) -> str:
     return check.__name__.removeprefix("check_")
 
 
-def _excused(checks: list[CheckResult]) -> list[CheckResult]:
+def _downgrade_if_overloaded(checks: list[CheckResult]) -> list[CheckResult]:
     """Where the machine did not keep up, what is to happen in time is unknown rather than broken."""
     if all(check.verdict is Verdict.VALID for check in checks if check.name in OF_THE_MACHINE):
         return checks
     return [
         replace(check, verdict=Verdict.UNKNOWN, text=f"{check.text}; but the machine did not keep up")
-        if check.name in SPOILT_BY_THE_MACHINE and check.verdict is Verdict.INVALID
+        if check.name in REALTIME_SENSITIVE and check.verdict is Verdict.INVALID
         else check
         for check in checks
     ]
@@ -166,17 +166,17 @@ def check_run(folder: Path) -> Judgement:
 
     A trace that is not the one whose hash the verdict holds makes the run invalid.
     """
-    evidence = read_evidence(folder)
-    recorded = recorded_verdict(folder)["trace_sha256"]
-    judgement = judge(evidence)
+    recorded = read_recorded_run(folder)
+    trace_sha256 = recorded_verdict(folder)["trace_sha256"]
+    judgement = judge(recorded)
     judgement.put(check_replay(folder))
-    if judgement.trace_sha256 != recorded:
-        text = f"the trace is not the one that verdict.json speaks of ({recorded[:12]}…)"
+    if judgement.trace_sha256 != trace_sha256:
+        text = f"the trace is not the one that verdict.json speaks of ({trace_sha256[:12]}…)"
         judgement.put(CheckResult("trace_sha256", Verdict.INVALID, text))
     return judgement
 
 
-def read_evidence(folder: Path) -> Evidence:
+def read_recorded_run(folder: Path) -> RecordedRun:
     """What a run has left in its folder. Raises VnetError if the folder is not a finished run's."""
     events = read_events(folder)
     try:
@@ -187,4 +187,4 @@ def read_evidence(folder: Path) -> Evidence:
         raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
     scenario = load_scenario(folder / "scenario.toml")
     busy = None if scenario.radio.mac is None else read_busy(folder)
-    return Evidence(scenario, trace, states, metrics, events, busy=busy)
+    return RecordedRun(scenario, trace, states, metrics, events, busy=busy)

@@ -10,7 +10,7 @@ import numpy as np
 
 from emulator.checks.channel import nothing_seen, received_twice
 from emulator.faults.plan import PlannedFault
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
 from emulator.scenario.faults import Delay, Duplicate, Jitter, Reorder, Throttle
 from vnet.types import Array, IntArray, Mask
@@ -35,48 +35,48 @@ class Bounds:
     alone: Mask
 
 
-def bounds(evidence: Evidence, without: PlannedFault | None = None) -> Bounds:
+def bounds(recorded: RecordedRun, without: PlannedFault | None = None) -> Bounds:
     """When each row's frame may have arrived, if it arrived at all; as if `without` one of the faults."""
-    radio = evidence.scenario.radio
-    plan = [planned for planned in evidence.plan if planned is not without]
-    start_ns, end_ns, airtime_ns, alone = _queue(evidence, plan)
+    radio = recorded.scenario.radio
+    plan = [planned for planned in recorded.plan if planned is not without]
+    start_ns, end_ns, airtime_ns, alone = _queue(recorded, plan)
     latency_ns = radio.latency_ms * NS_PER_MS
-    sooner_ns, later_ns = _delays(evidence, plan)
+    sooner_ns, later_ns = _delays(recorded, plan)
     most_ns = latency_ns + radio.jitter_ms * NS_PER_MS + radio.delivery_tick_us * 1_000
     earliest_ns = start_ns + airtime_ns + max(latency_ns, 1_000) + sooner_ns - ROUNDING_NS
     return Bounds(earliest_ns, end_ns + most_ns + later_ns + ROUNDING_NS, airtime_ns, alone & (later_ns == 0))
 
 
-def _queue(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array, Array, Mask]:
+def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array, Array, Mask]:
     """For each row: the earliest start and the latest end of its transmission, its airtime, whether it was alone.
 
     The sender's queue is monotonic in its access delays: with none of them everything is at its earliest, with the
     longest at its latest. Frames of one instant are taken as one batch, so that their order does not matter. Where
     all share the air, the trace tells when each frame was on it.
     """
-    usual_ns = evidence.airtime_ns.astype(float)
-    if evidence.shares_air:
-        start_ns = evidence.on_air_ns.astype(float)
-        return start_ns, start_ns + usual_ns, usual_ns, evidence.arrived
-    fast_mbps, slow_mbps = _bitrates(evidence, plan)
-    bits = evidence.column("size_bytes") * 8_000
+    usual_ns = recorded.airtime_ns.astype(float)
+    if recorded.shares_air:
+        start_ns = recorded.on_air_ns.astype(float)
+        return start_ns, start_ns + usual_ns, usual_ns, recorded.arrived
+    fast_mbps, slow_mbps = _bitrates(recorded, plan)
+    bits = recorded.column("size_bytes") * 8_000
     slowed_ns = [np.maximum(usual_ns, np.rint(bits / mbps)) for mbps in (fast_mbps, slow_mbps)]
     airtimes_ns = [usual_ns, *slowed_ns]
-    longest_ns = int(evidence.sent_ns.max(initial=0)) + 1
-    key, batch = np.unique(evidence.sender * longest_ns + evidence.sent_ns, return_inverse=True)
-    offered = np.flatnonzero(~received_twice(evidence) & ~evidence.outcome_is("oversize"))
-    first = offered[np.unique(evidence.emission[offered], return_index=True)[1]]
-    taken = first[~evidence.outcome_is("queue_full")[first]]
+    longest_ns = int(recorded.sent_ns.max(initial=0)) + 1
+    key, batch = np.unique(recorded.sender * longest_ns + recorded.sent_ns, return_inverse=True)
+    offered = np.flatnonzero(~received_twice(recorded) & ~recorded.outcome_is("oversize"))
+    first = offered[np.unique(recorded.emission[offered], return_index=True)[1]]
+    taken = first[~recorded.outcome_is("queue_full")[first]]
     sums = [np.bincount(batch[taken], weights=air[taken], minlength=len(key)) for air in airtimes_ns]
     sums.append(np.bincount(batch[first], weights=airtimes_ns[0][first], minlength=len(key)))
     sender, sent_ns = np.divmod(key, longest_ns)
-    start, end, waits = _courses(evidence, plan, sender, sent_ns, np.column_stack(sums))
+    start, end, waits = _courses(recorded, plan, sender, sent_ns, np.column_stack(sums))
     alone = ~waits & (np.bincount(batch[first], minlength=len(key)) == 1)
     return start[batch], end[batch], airtimes_ns[1], alone[batch]
 
 
 def _courses(
-    evidence: Evidence, plan: list[PlannedFault], sender: IntArray, sent_ns: IntArray, airtime_ns: Array
+    recorded: RecordedRun, plan: list[PlannedFault], sender: IntArray, sent_ns: IntArray, airtime_ns: Array
 ) -> tuple[Array, Array, Mask]:
     """Earliest start, latest end and whether it may have waited, of each batch (B,), in order of sender and time.
 
@@ -84,9 +84,9 @@ def _courses(
     faults leave; and of all that was offered, at that of the radio. A throttled sender has a queue of its own,
     which begins as the plain one stands; afterwards the plain one goes on, as if it had never been slowed.
     """
-    delay_ns = evidence.scenario.radio.access_jitter_ms * NS_PER_MS
+    delay_ns = recorded.scenario.radio.access_jitter_ms * NS_PER_MS
     start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
-    episode = _episodes(evidence, plan, sender, sent_ns)
+    episode = _episodes(recorded, plan, sender, sent_ns)
     who, plain, slow, within = -1, (0.0, 0.0), (0.0, 0.0), NO_EPISODE
     for place, (node, time_ns, number) in enumerate(
         zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), strict=True)
@@ -109,67 +109,67 @@ def _courses(
     return start, end, waits
 
 
-def _episodes(evidence: Evidence, plan: list[PlannedFault], sender: IntArray, sent_ns: IntArray) -> IntArray:
+def _episodes(recorded: RecordedRun, plan: list[PlannedFault], sender: IntArray, sent_ns: IntArray) -> IntArray:
     """For each batch the number of the time without a break in which its sender was throttled, or NO_EPISODE."""
     episode = np.full(len(sender), NO_EPISODE, dtype=np.int64)
     throttles = sorted((p for p in plan if isinstance(p.fault, Throttle)), key=lambda p: p.start_ns)
-    guard_ns = evidence.guard_ns
+    guard_ns = recorded.guard_ns
     number = 0
     for node in np.flatnonzero(np.any([p.nodes for p in throttles], axis=0)).tolist() if throttles else ():
         until_ns = -1
         for planned in (p for p in throttles if p.nodes[node] and p.start_ns < p.end_ns):
             number += planned.start_ns > until_ns
             until_ns = max(until_ns, planned.end_ns)
-            episode[(sender == node) & evidence.acting(planned, sent_ns, guard_ns)] = number
+            episode[(sender == node) & recorded.acting(planned, sent_ns, guard_ns)] = number
         number += 1
     return episode
 
 
-def _bitrates(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array]:
+def _bitrates(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array]:
     """The fastest and the slowest bitrate that each row's frame may have had."""
-    base_mbps = evidence.scenario.radio.bitrate_mbps
-    fast, slow = np.full(len(evidence.trace), base_mbps), np.full(len(evidence.trace), base_mbps)
+    base_mbps = recorded.scenario.radio.bitrate_mbps
+    fast, slow = np.full(len(recorded.trace), base_mbps), np.full(len(recorded.trace), base_mbps)
     for planned in plan:
         if isinstance(planned.fault, Throttle):
-            chosen, limit_mbps = planned.nodes[evidence.sender], min(base_mbps, planned.fault.bitrate_mbps)
-            for rate, widen_ns in ((fast, -evidence.guard_ns), (slow, evidence.guard_ns)):
-                when = chosen & evidence.acting(planned, evidence.sent_ns, widen_ns)
+            chosen, limit_mbps = planned.nodes[recorded.sender], min(base_mbps, planned.fault.bitrate_mbps)
+            for rate, widen_ns in ((fast, -recorded.guard_ns), (slow, recorded.guard_ns)):
+                when = chosen & recorded.acting(planned, recorded.sent_ns, widen_ns)
                 rate[when] = np.minimum(rate[when], limit_mbps)
     return fast, slow
 
 
-def _delays(evidence: Evidence, plan: list[PlannedFault]) -> tuple[Array, Array]:
+def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array]:
     """What faults add to the latency of each row: at least, and at most."""
-    least, most = np.zeros(len(evidence.trace)), np.zeros(len(evidence.trace))
-    guard_ns = evidence.guard_ns
+    least, most = np.zeros(len(recorded.trace)), np.zeros(len(recorded.trace))
+    guard_ns = recorded.guard_ns
     for planned in plan:
         match planned.fault:
             case Delay(delay_ms=delay_ms):
-                least += np.where(evidence.reached(planned, -guard_ns), delay_ms, 0)
-                most += np.where(evidence.reached(planned, guard_ns), delay_ms, 0)
+                least += np.where(recorded.reached(planned, -guard_ns), delay_ms, 0)
+                most += np.where(recorded.reached(planned, guard_ns), delay_ms, 0)
             case Jitter(jitter_ms=jitter_ms):
-                most += np.where(evidence.reached(planned, guard_ns), jitter_ms, 0)
+                most += np.where(recorded.reached(planned, guard_ns), jitter_ms, 0)
             case Reorder(delay_ms=delay_ms):
-                most += np.where(evidence.reached(planned, guard_ns), delay_ms, 0)
+                most += np.where(recorded.reached(planned, guard_ns), delay_ms, 0)
             case Duplicate(delay_ms=delay_ms, copies=copies):
-                mine = (evidence.cause == planned.number) & (evidence.copy > 0)
+                mine = (recorded.cause == planned.number) & (recorded.copy > 0)
                 least += np.where(mine, delay_ms, 0)
                 most += np.where(mine, copies * delay_ms, 0)
     return least * NS_PER_MS, most * NS_PER_MS
 
 
-def check_latency(evidence: Evidence) -> Finding:
+def check_latency(recorded: RecordedRun) -> Finding:
     """What arrives does so after its airtime and latency, and no later than queue, jitter and faults explain."""
     name = "latency"
-    timed = evidence.arrived & (evidence.arrival_ns >= 0)
+    timed = recorded.arrived & (recorded.arrival_ns >= 0)
     if not timed.any():
-        return nothing_seen(name, evidence, "nothing arrived")
-    allowed = bounds(evidence)
-    early = timed & (evidence.arrival_ns < allowed.earliest_ns)
-    late = timed & (evidence.arrival_ns > allowed.latest_ns)
+        return nothing_seen(name, recorded, "nothing arrived")
+    allowed = bounds(recorded)
+    early = timed & (recorded.arrival_ns < allowed.earliest_ns)
+    late = timed & (recorded.arrival_ns > allowed.latest_ns)
     broken = int(early.sum() + late.sum())
     figures: dict[str, Any] = {"arrivals": int(timed.sum()), "early": int(early.sum()), "late": int(late.sum())}
-    mean = _mean_latency(evidence, allowed, timed)
+    mean = _mean_latency(recorded, allowed, timed)
     figures |= mean
     off = bool(mean) and abs(mean["mean_ms"] - mean["expected_ms"]) > mean["band_ms"]
     text = f"{int(timed.sum()):,} arrivals within their bounds"
@@ -178,21 +178,21 @@ def check_latency(evidence: Evidence) -> Finding:
     broken_text = (
         f"{figures['early']} too early, {figures['late']} too late" if broken else f"{text}: outside its band"
     )
-    rows = evidence.rows(early | late if broken else timed & allowed.alone) if broken or off else []
+    rows = recorded.rows(early | late if broken else timed & allowed.alone) if broken or off else []
     return result(name, broken + off, text, broken_text, rows, **figures)
 
 
-def _mean_latency(evidence: Evidence, allowed: Bounds, timed: Mask) -> dict[str, float]:
+def _mean_latency(recorded: RecordedRun, allowed: Bounds, timed: Mask) -> dict[str, float]:
     """The mean latency of frames that waited for no other, what it should be, and how far off it may be."""
-    radio = evidence.scenario.radio
-    rows = timed & allowed.alone & (evidence.copy == 0)
+    radio = recorded.scenario.radio
+    rows = timed & allowed.alone & (recorded.copy == 0)
     count = int(rows.sum())
     if not count:
         return {}
-    from_ns = evidence.on_air_ns if evidence.shares_air else evidence.sent_ns
-    access_ms = 0.0 if evidence.shares_air else radio.access_jitter_ms
-    mean_ns = float(np.mean((evidence.arrival_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
-    receivers: IntArray = np.unique(evidence.emission[rows], return_counts=True)[1]
+    from_ns = recorded.on_air_ns if recorded.shares_air else recorded.sent_ns
+    access_ms = 0.0 if recorded.shares_air else radio.access_jitter_ms
+    mean_ns = float(np.mean((recorded.arrival_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
+    receivers: IntArray = np.unique(recorded.emission[rows], return_counts=True)[1]
     tick_ms = radio.delivery_tick_us / 1_000
     expected_ms = radio.latency_ms + (access_ms + radio.jitter_ms + tick_ms) / 2
     # The access delay is one draw for all receivers of a frame, the jitter one for each of them.

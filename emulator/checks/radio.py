@@ -17,7 +17,7 @@ from emulator.radio.csma import times_ns
 from emulator.radio.dot11p import DETECTION_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.reception import Threshold, milliwatts
-from emulator.records.recorded_run import ON_AIR, Evidence
+from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
 from emulator.scenario.faults import Throttle
 from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
@@ -36,57 +36,59 @@ LEAST_PAUSE_NS = 25_000_000
 ROUNDING = 1e-6
 
 
-def check_fading(evidence: Evidence) -> Finding:
+def check_fading(recorded: RecordedRun) -> Finding:
     """Of the pairs that came as far as the receiver, so many faded as path loss, fading and noise make expect."""
     name = "fading"
-    radio = evidence.scenario.radio
+    radio = recorded.scenario.radio
     if not radio.is_physical:
         return NotExercised(name, "signals have no power: a frame fades nowhere within the range")
-    drawing = np.flatnonzero(evidence.outcome_is(*ON_AIR) & ~received_twice(evidence) & evidence.placed)
+    drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
-        return nothing_seen(name, evidence, "no pair came as far as the receiver")
-    survives = _survival(evidence, radio, drawing)
-    faded = evidence.outcome_is("faded")[drawing]
+        return nothing_seen(name, recorded, "no pair came as far as the receiver")
+    survives = _survival(recorded, radio, drawing)
+    faded = recorded.outcome_is("faded")[drawing]
     expected, seen = float((1 - survives).sum()), int(faded.sum())
     away = SIGMAS * sqrt(float((survives * (1 - survives)).sum())) + (log(1e6) / 3 if expected > 0 else 0)
     broken = not expected - away <= seen <= expected + away
     share, law = seen / len(drawing), expected / len(drawing)
     text = f"{seen:,} of {len(drawing):,} pairs faded, {share:.2%}; {law:.2%} expected"
     figures: dict[str, Any] = {"faded": seen, "pairs": len(drawing), "rate": share, "expected": law}
-    unlike, figures["links"] = _unlike_their_law(evidence, drawing, survives, faded)
+    unlike, figures["links"] = _unlike_their_law(recorded, drawing, survives, faded)
     broken_text = f"{text}: outside its band" if broken else f"{text}, but not on the links on which they should"
     rows = drawing[faded == (seen > expected)]
     if radio.fading is None and (impossible := np.where(faded, survives >= 1, survives <= 0)).any():
         rows, unlike = drawing[impossible], True
         broken_text = f"{len(rows)} pairs did what cannot be"
         figures["impossible"] = len(rows)
-    return result(name, broken + unlike, text, broken_text, evidence.rows(rows), **figures)
+    return result(name, broken + unlike, text, broken_text, recorded.rows(rows), **figures)
 
 
-def _unlike_their_law(evidence: Evidence, rows: NDArray[np.intp], survives: Array, faded: Mask) -> tuple[bool, int]:
+def _unlike_their_law(
+    recorded: RecordedRun, rows: NDArray[np.intp], survives: Array, faded: Mask
+) -> tuple[bool, int]:
     """Whether the links all in all differ from what is expected of each, by χ²; and how many say anything."""
-    link = evidence.sender[rows] * len(evidence.node_ids) + evidence.receiver[rows]
+    link = recorded.sender[rows] * len(recorded.node_ids) + recorded.receiver[rows]
     variance, differs = np.bincount(link, survives * (1 - survives)), np.bincount(link, faded - (1 - survives))
     telling = variance >= TELLING_VARIANCE
     squares = float((differs[telling] ** 2 / variance[telling]).sum())
     return bool(chi2.sf(squares, max(1, int(telling.sum()))) < CERTAIN), int(telling.sum())
 
 
-def _survival(evidence: Evidence, radio: Radio, rows: NDArray[np.intp]) -> Array:
+def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Array:
     """(n,) the probabilities with which pairs arrive if nobody else sends."""
-    sender, receiver, sent_ns = evidence.sender[rows], evidence.receiver[rows], evidence.sent_ns[rows]
-    power_mw = evidence.places.pair_powers_mw(sender, receiver, sent_ns)
+    sender, receiver, sent_ns = recorded.sender[rows], recorded.receiver[rows], recorded.sent_ns[rows]
+    power_mw = recorded.places.pair_powers_mw(sender, receiver, sent_ns)
     shape = np.zeros(len(rows), np.intp)
     shapes: tuple[float, ...] = (np.inf,)
     if radio.fading is not None:
         shapes = radio.fading.m
-        shape = np.searchsorted(radio.fading.until_m, evidence.places.pair_distances_m(sender, receiver, sent_ns))
+        shape = np.searchsorted(radio.fading.until_m, recorded.places.pair_distances_m(sender, receiver, sent_ns))
     power_db = np.full(len(rows), -np.inf)
     np.log10(power_mw, out=power_db, where=power_mw > 0)
     power_db *= 10
     survives = np.zeros(len(rows))
     heard = power_mw > 0
-    airtime_ns = evidence.airtime_ns[rows]
+    airtime_ns = recorded.airtime_ns[rows]
     for number, m in enumerate(shapes):
         for length_ns in np.unique(airtime_ns).tolist():
             some = heard & (shape == number) & (airtime_ns == length_ns)
@@ -117,20 +119,20 @@ def _arrives(radio: Radio, m: float, airtime_ns: int, power_db: Array) -> Array:
 class _Air:
     """The transmissions of a run, in order of their beginning, each by its first row of the trace."""
 
-    evidence: Evidence
+    recorded: RecordedRun
     rows: NDArray[np.intp]
     sender: NDArray[np.intp]
     begin_ns: IntArray
     end_ns: IntArray
 
     @classmethod
-    def of(cls, evidence: Evidence) -> _Air:
+    def of(cls, recorded: RecordedRun) -> _Air:
         """All that were on air."""
-        own = np.flatnonzero(~received_twice(evidence) & (evidence.on_air_ns >= 0))
-        rows = own[np.unique(evidence.emission[own], return_index=True)[1]]
-        rows = rows[np.argsort(evidence.on_air_ns[rows], kind="stable")]
-        begin_ns = evidence.on_air_ns[rows]
-        return cls(evidence, rows, evidence.sender[rows], begin_ns, begin_ns + evidence.airtime_ns[rows])
+        own = np.flatnonzero(~received_twice(recorded) & (recorded.on_air_ns >= 0))
+        rows = own[np.unique(recorded.emission[own], return_index=True)[1]]
+        rows = rows[np.argsort(recorded.on_air_ns[rows], kind="stable")]
+        begin_ns = recorded.on_air_ns[rows]
+        return cls(recorded, rows, recorded.sender[rows], begin_ns, begin_ns + recorded.airtime_ns[rows])
 
     def near(self, within_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs of transmissions (earlier, later): the later begins before so long after the other's end."""
@@ -155,7 +157,7 @@ class _Air:
     def met(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs of a place in `rows` of the trace and a transmission that overlapped that row's."""
         other, starts = self._overlaps
-        emission = self.evidence.emission
+        emission = self.recorded.emission
         by_emission = np.argsort(emission[self.rows])
         mine = by_emission[np.searchsorted(emission[self.rows], emission[rows], sorter=by_emission)]
         count = starts[mine + 1] - starts[mine]
@@ -164,19 +166,19 @@ class _Air:
         return place, other[np.repeat(starts[mine], count) + nth]
 
 
-def check_medium(evidence: Evidence) -> Finding:
+def check_medium(recorded: RecordedRun) -> Finding:
     """Senders share the air by the rules: nobody sends twice at once, without a pause, or into what it senses.
 
     What collided met another transmission that its receiver could hear, and nobody hears while it sends.
     """
     name = "medium"
-    if not evidence.shares_air:
+    if not recorded.shares_air:
         return NotExercised(name, "senders share no medium")
-    if not len(evidence.trace):
-        return nothing_seen(name, evidence, "no frame was sent")
-    air = _Air.of(evidence)
+    if not len(recorded.trace):
+        return nothing_seen(name, recorded, "no frame was sent")
+    air = _Air.of(recorded)
     broken: dict[str, NDArray[np.intp]] = {
-        "mistimed": _mistimed(evidence),
+        "mistimed": _mistimed(recorded),
         "without_pause": _without_pause(air),
         "into_others": _into_others(air),
         "collided_alone": _collided_alone(air),
@@ -185,31 +187,31 @@ def check_medium(evidence: Evidence) -> Finding:
     counts: dict[str, Any] = {what: len(rows) for what, rows in broken.items()}
     counts["too_idle"] = _too_idle(air)
     total = sum(counts.values())
-    collided = int(evidence.outcome_is("collided").sum())
+    collided = int(recorded.outcome_is("collided").sum())
     text = f"{len(air.rows):,} transmissions by the rules of access, {collided:,} pairs collided"
     broken_text = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
-    rows = evidence.rows(np.concatenate(list(broken.values())))
+    rows = recorded.rows(np.concatenate(list(broken.values())))
     return result(name, total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)
 
 
-def _mistimed(evidence: Evidence) -> NDArray[np.intp]:
+def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:
     """Rows that were on air before they were sent, or faster than a throttle lets them, or though given up."""
-    began = evidence.on_air_ns >= 0
-    end_ns = np.where(began, evidence.on_air_ns + evidence.airtime_ns, evidence.sent_ns)
-    left_ns = evidence.column("left_ns")
-    wrong = (began == evidence.outcome_is(*NEVER_SENT)) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
-    wrong |= began & (evidence.on_air_ns < evidence.sent_ns)
-    for planned in evidence.plan:
+    began = recorded.on_air_ns >= 0
+    end_ns = np.where(began, recorded.on_air_ns + recorded.airtime_ns, recorded.sent_ns)
+    left_ns = recorded.column("left_ns")
+    wrong = (began == recorded.outcome_is(*NEVER_SENT)) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
+    wrong |= began & (recorded.on_air_ns < recorded.sent_ns)
+    for planned in recorded.plan:
         if isinstance(planned.fault, Throttle):
-            slow = planned.nodes[evidence.sender] & evidence.acting(planned, evidence.sent_ns, -evidence.guard_ns)
-            least_ns = evidence.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
-            wrong |= began & slow & (evidence.on_air_ns - evidence.sent_ns < least_ns)
+            slow = planned.nodes[recorded.sender] & recorded.acting(planned, recorded.sent_ns, -recorded.guard_ns)
+            least_ns = recorded.column("size_bytes") * 8_000 / planned.fault.bitrate_mbps - 1
+            wrong |= began & slow & (recorded.on_air_ns - recorded.sent_ns < least_ns)
     return np.flatnonzero(wrong)
 
 
 def _without_pause(air: _Air) -> NDArray[np.intp]:
     """Transmissions that begin too early after the same sender's last."""
-    radio = air.evidence.scenario.radio
+    radio = air.recorded.scenario.radio
     assert radio.mac is not None
     match radio.congestion:
         case EtsiReactive(pause_ms=pause_ms):
@@ -230,45 +232,45 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
 
     Fading differs from frame to frame: with it nobody can say what a sender sensed.
     """
-    evidence, radio = air.evidence, air.evidence.scenario.radio
+    recorded, radio = air.recorded, air.recorded.scenario.radio
     if radio.fading is not None:
         return np.zeros(0, np.intp)
     assert radio.mac is not None
     earlier, later = air.near(times_ns(radio.mac).aifs)
     noticed = air.begin_ns[later] >= air.begin_ns[earlier] + DETECTION_NS
     earlier, later = earlier[noticed], later[noticed]
-    sent_ns = evidence.sent_ns[air.rows[earlier]]
-    power_mw = evidence.places.pair_powers_mw(air.sender[earlier], air.sender[later], sent_ns)
+    sent_ns = recorded.sent_ns[air.rows[earlier]]
+    power_mw = recorded.places.pair_powers_mw(air.sender[earlier], air.sender[later], sent_ns)
     sensed = power_mw >= milliwatts(radio.mac.carrier_sense_dbm) * (1 + ROUNDING)
     return np.unique(air.rows[later[sensed & (air.sender[earlier] != air.sender[later])]])
 
 
 def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
     """Which of these rows of the trace met a transmission that their receiver could hear, or its own."""
-    evidence = air.evidence
+    recorded = air.recorded
     place, other = air.met(rows)
-    receiver = evidence.receiver[rows][place]
-    heard = evidence.places.pairs_in_range(air.sender[other], receiver, evidence.sent_ns[air.rows[other]])
+    receiver = recorded.receiver[rows][place]
+    heard = recorded.places.pairs_in_range(air.sender[other], receiver, recorded.sent_ns[air.rows[other]])
     heard |= air.sender[other] == receiver
     return np.asarray(np.bincount(place, weights=heard, minlength=len(rows)) > 0)
 
 
 def _collided_alone(air: _Air) -> NDArray[np.intp]:
-    rows = np.flatnonzero(air.evidence.outcome_is("collided") & air.evidence.placed)
+    rows = np.flatnonzero(air.recorded.outcome_is("collided") & air.recorded.placed)
     return np.asarray(rows[~_audible(air, rows)])
 
 
 def _heard_while_sending(air: _Air) -> NDArray[np.intp]:
-    evidence = air.evidence
-    rows = np.flatnonzero(evidence.arrived & ~received_twice(evidence))
+    recorded = air.recorded
+    rows = np.flatnonzero(recorded.arrived & ~received_twice(recorded))
     place, other = air.met(rows)
-    itself = air.sender[other] == evidence.receiver[rows][place]
+    itself = air.sender[other] == recorded.receiver[rows][place]
     return np.asarray(rows[np.unique(place[itself])])
 
 
 def _too_idle(air: _Air) -> int:
     """How many busy ratios are less than what their own vehicle sent."""
-    ratio = air.evidence.busy_ratio
+    ratio = air.recorded.busy_ratio
     sent_ns = np.zeros(ratio.shape)
     for shift in range(int((air.end_ns - air.begin_ns).max(initial=0)) // WINDOW_NS + 2):
         window = air.begin_ns // WINDOW_NS + shift

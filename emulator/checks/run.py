@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.records.recorded_run import NEVER_NS, Evidence
+from emulator.records.recorded_run import NEVER_NS, RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
 from vnet.types import Mask
@@ -21,11 +21,11 @@ MEMORY_SPAN_S, MEMORY_SAMPLES = 15.0, 9
 MEMORY_FACTOR = 1.05
 
 
-def check_transport(evidence: Evidence) -> Finding:
+def check_transport(recorded: RecordedRun) -> Finding:
     """No message between agents and emulator went missing."""
     name = "transport"
-    gaps = sum(int(event.details.get("count", 1)) for event in evidence.event("transport_gap"))
-    lost = evidence.outcome_is("transport")
+    gaps = sum(int(event.details.get("count", 1)) for event in recorded.event("transport_gap"))
+    lost = recorded.outcome_is("transport")
     if gaps or lost.any():
         count = int(lost.sum())
         text = f"{gaps} gaps in sequence numbers, {count} deliveries that never arrived: the machine, not the radio"
@@ -33,63 +33,63 @@ def check_transport(evidence: Evidence) -> Finding:
     return CheckResult(name, Verdict.VALID, "no message between agents and emulator went missing", {"gaps": 0})
 
 
-def check_agents_alive(evidence: Evidence) -> Finding:
+def check_agents_alive(recorded: RecordedRun) -> Finding:
     """No process died and no program crashed, but for those that a fault ended."""
     name = "agents_alive"
-    gone = [event for event in evidence.event("died", "crashed") if not _was_killed(evidence, event)]
-    if not gone and not evidence.event("started"):
+    gone = [event for event in recorded.event("died", "crashed") if not _was_killed(recorded, event)]
+    if not gone and not recorded.event("started"):
         return unknown(name, "no event says that the run started")
     if not gone:
-        who = f"all {len(evidence.node_ids)} nodes" if evidence.node_ids else "all nodes"
+        who = f"all {len(recorded.node_ids)} nodes" if recorded.node_ids else "all nodes"
         return CheckResult(name, Verdict.VALID, f"{who} to the end")
     first = gone[0]
     why = first.details.get("error") or first.details.get("how", "")
     when = f"{first.node} {first.kind} at {first.time_ns / 1e9:.3f} s"
-    text = f"{len(gone)} of {len(evidence.node_ids) or 'the'} nodes: {when}: {why}"
+    text = f"{len(gone)} of {len(recorded.node_ids) or 'the'} nodes: {when}: {why}"
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
     return CheckResult(name, Verdict.INVALID, text, {"gone": listed})
 
 
-def _was_killed(evidence: Evidence, event: Event) -> bool:
+def _was_killed(recorded: RecordedRun, event: Event) -> bool:
     """Whether a process that died was meant to."""
-    if event.kind != "died" or event.node not in evidence.number:
+    if event.kind != "died" or event.node not in recorded.number:
         return False
-    node = evidence.number_of(event.node)
-    ended = [p for p in evidence.plan if p.fault.kind in ("kill", "restart") and p.nodes[node]]
-    return any(p.start_ns <= event.time_ns <= p.end_ns + evidence.guard_ns for p in ended)
+    node = recorded.number_of(event.node)
+    ended = [p for p in recorded.plan if p.fault.kind in ("kill", "restart") and p.nodes[node]]
+    return any(p.start_ns <= event.time_ns <= p.end_ns + recorded.guard_ns for p in ended)
 
 
-def check_progress(evidence: Evidence) -> Finding:
+def check_progress(recorded: RecordedRun) -> Finding:
     """The run came to its end: nobody span, nobody hung, nobody interrupted it."""
     name = "progress"
-    if spun := evidence.event("spun"):
+    if spun := recorded.event("spun"):
         event = spun[0]
         text = f"{event.node} goes on for ever at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
         return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
-    if stalled := evidence.event("stalled"):
+    if stalled := recorded.event("stalled"):
         event = stalled[0]
         text = f"{event.node} hangs at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
         return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
-    if interrupted := evidence.event("interrupted"):
+    if interrupted := recorded.event("interrupted"):
         return unknown(name, f"interrupted at {interrupted[0].time_ns / 1e9:.3f} s")
-    if not evidence.event("ended"):
+    if not recorded.event("ended"):
         return unknown(name, "no event says that the run ended")
-    due = evidence.scenario.duration_ns // evidence.scenario.period_ns
-    if len(evidence.metrics) != due or len(evidence.states) != due * len(evidence.node_ids):
-        text = f"{len(evidence.metrics)} periods kept, {due} due"
-        return unknown(name, text, periods=len(evidence.metrics), due=due)
-    return CheckResult(name, Verdict.VALID, f"{evidence.scenario.run.duration_s:g} s emulated to the end")
+    due = recorded.scenario.duration_ns // recorded.scenario.period_ns
+    if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
+        text = f"{len(recorded.metrics)} periods kept, {due} due"
+        return unknown(name, text, periods=len(recorded.metrics), due=due)
+    return CheckResult(name, Verdict.VALID, f"{recorded.scenario.run.duration_s:g} s emulated to the end")
 
 
-def check_finite(evidence: Evidence) -> Finding:
+def check_finite(recorded: RecordedRun) -> Finding:
     """No report holds a number that is none."""
     name = "finite"
-    if not len(evidence.metrics):
+    if not len(recorded.metrics):
         return NotExercised(name, "no period was completed")
-    reporting = int(np.sum(evidence.metrics["reporting"].to_numpy()))
+    reporting = int(np.sum(recorded.metrics["reporting"].to_numpy()))
     if reporting == 0:
         return NotExercised(name, "the program reports nothing")
-    not_finite = evidence.metrics["not_finite"].to_numpy()
+    not_finite = recorded.metrics["not_finite"].to_numpy()
     broken = int(np.sum(not_finite))
     text = f"{reporting:,} reports, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
@@ -97,12 +97,12 @@ def check_finite(evidence: Evidence) -> Finding:
     return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
 
 
-def check_kept_up(evidence: Evidence) -> Finding:
+def check_kept_up(recorded: RecordedRun) -> Finding:
     """Real time: the machine delivered on time."""
     name = "kept_up"
-    if evidence.scenario.run.pacing != "realtime":
+    if recorded.scenario.run.pacing != "realtime":
         return NotExercised(name, "in lockstep nothing can be late")
-    late = evidence.event("late_deliveries")
+    late = recorded.event("late_deliveries")
     if not late or not late[-1].details["total"]:
         return unknown(name, "no delivery was timed")
     figures = late[-1].details
@@ -111,35 +111,35 @@ def check_kept_up(evidence: Evidence) -> Finding:
     return CheckResult(name, Verdict.VALID if share <= LATE_SHARE_LIMIT else Verdict.UNKNOWN, text, figures)
 
 
-def check_liveness(evidence: Evidence) -> Finding:
+def check_liveness(recorded: RecordedRun) -> Finding:
     """Once no fault acts any more, every node that is up reports at least once a second."""
     name = "liveness"
-    if not evidence.reported.any():
+    if not recorded.reported.any():
         return NotExercised(name, "the program reports nothing")
-    window = max(2, -(-LIVENESS_NS // evidence.scenario.period_ns))
-    judged = _expected_to_report(evidence, window)
+    window = max(2, -(-LIVENESS_NS // recorded.scenario.period_ns))
+    judged = _expected_to_report(recorded, window)
     if not judged.any():
         return NotExercised(name, "no program reports once a second")
-    start_ns = evidence.period_starts_ns()
-    rested = np.flatnonzero(start_ns >= evidence.last_heal_ns)
+    start_ns = recorded.period_starts_ns()
+    rested = np.flatnonzero(start_ns >= recorded.last_heal_ns)
     if len(rested) < window:
         return NotExercised(name, "less than a second is left after the last fault")
     silent: list[dict[str, Any]] = []
     for node in np.flatnonzero(judged).tolist():
-        for from_ns, until_ns in _times_up(evidence, node):
+        for from_ns, until_ns in _times_up(recorded, node):
             mine = rested[(start_ns[rested] >= from_ns) & (start_ns[rested] < until_ns)]
-            reports = mine[evidence.reported[mine, node]]
-            if not evidence.plan and (len(reports) or len(mine) < START_UP_NS // evidence.scenario.period_ns):
-                mine = mine[mine >= reports.min(initial=evidence.periods)]  # it may take its time at the start
+            reports = mine[recorded.reported[mine, node]]
+            if not recorded.plan and (len(reports) or len(mine) < START_UP_NS // recorded.scenario.period_ns):
+                mine = mine[mine >= reports.min(initial=recorded.periods)]  # it may take its time at the start
             edges = [int(mine[0]) - 1, *reports.tolist(), int(mine[-1]) + 1] if len(mine) else []
             gaps = [(before, after) for before, after in pairwise(edges) if after - before > window]
             if gaps:
                 before, after = gaps[0]
-                silent.append({"node": evidence.node_ids[node], "last_period": before, "next_period": after})
+                silent.append({"node": recorded.node_ids[node], "last_period": before, "next_period": after})
                 break
     count = int(judged.sum())
     text = f"{count} nodes reported at least once a second after the last fault"
-    if not evidence.plan:
+    if not recorded.plan:
         text = f"{count} nodes reported at least once a second"
     broken_text = f"{len(silent)} of {count} nodes were silent for over a second, {_where(silent)}"
     return result(name, len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
@@ -149,47 +149,47 @@ def _where(silent: list[dict[str, Any]]) -> str:
     return f"{silent[0]['node']} from period {silent[0]['last_period'] + 1}" if silent else ""
 
 
-def _expected_to_report(evidence: Evidence, window: int) -> Mask:
+def _expected_to_report(recorded: RecordedRun, window: int) -> Mask:
     """Nodes that show that they report once a second, and those that a fault took whose program does elsewhere."""
-    able = np.zeros(len(evidence.node_ids), dtype=bool)
+    able = np.zeros(len(recorded.node_ids), dtype=bool)
     for node in range(len(able)):
-        periods = np.flatnonzero(evidence.reported[:, node])
+        periods = np.flatnonzero(recorded.reported[:, node])
         able[node] = len(periods) > 1 and bool((np.diff(periods) <= window).any())
-    programs = [evidence.scenario.program.of(node).entry for node in evidence.node_ids]
+    programs = [recorded.scenario.program.of(node).entry for node in recorded.node_ids]
     reporting = {programs[node] for node in np.flatnonzero(able)}
     taken = np.zeros(len(able), dtype=bool)
-    for planned in evidence.plan:
+    for planned in recorded.plan:
         taken |= planned.nodes
     elsewhere = np.array([program in reporting for program in programs], dtype=bool)
     return np.asarray(able | (taken & elsewhere))
 
 
-def _times_up(evidence: Evidence, node: int) -> list[tuple[int, int]]:
+def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
     """From when until when a node is up, each time; in real time not before its process has had time to start."""
-    start_up_ns = START_UP_NS if evidence.scenario.run.pacing == "realtime" else 0
+    start_up_ns = START_UP_NS if recorded.scenario.run.pacing == "realtime" else 0
     times, from_ns = [], 0
-    for span in sorted((span for span in evidence.down if span.node == node), key=lambda span: span.start_ns):
+    for span in sorted((span for span in recorded.down if span.node == node), key=lambda span: span.start_ns):
         if span.start_ns > from_ns:
             times.append((from_ns, span.start_ns))
         from_ns = max(from_ns, NEVER_NS if span.end_ns == NEVER_NS else span.end_ns + start_up_ns)
     return [*times, (from_ns, NEVER_NS)] if from_ns < NEVER_NS else times
 
 
-def check_presence(evidence: Evidence) -> Finding:
+def check_presence(recorded: RecordedRun) -> Finding:
     """Vehicles enter and leave when their trips say so."""
     name = "presence"
-    if not evidence.moves:
+    if not recorded.moves:
         return NotExercised(name, "vehicles stand where they are")
-    there = evidence.places.present()
-    changes = _changes(evidence, there)
-    if not changes and not evidence.event("entered", "left"):
+    there = recorded.places.present()
+    changes = _changes(recorded, there)
+    if not changes and not recorded.event("entered", "left"):
         return NotExercised(name, "all vehicles are there from the beginning to the end")
-    known_ns = len(there) * evidence.scenario.period_ns  # of what came later no states are kept
-    events = [event for event in evidence.event("entered", "left") if event.time_ns < known_ns]
+    known_ns = len(there) * recorded.scenario.period_ns  # of what came later no states are kept
+    events = [event for event in recorded.event("entered", "left") if event.time_ns < known_ns]
     told = {(event.kind, str(event.node), event.time_ns) for event in events}
-    missing = [change for change in changes if not _is_told(evidence, change, told)]
+    missing = [change for change in changes if not _is_told(recorded, change, told)]
     due = set(changes)
-    odd = [one for one in told if one not in due and not _may_come_late(evidence, one, there)]
+    odd = [one for one in told if one not in due and not _may_come_late(recorded, one, there)]
     rows = [{"what": what, "node": node, "time_ns": t, "event": "missing"} for what, node, t in missing]
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
     entered = sum(kind == "entered" for kind, _, _ in changes)
@@ -201,16 +201,16 @@ Change = tuple[str, str, int]
 """What happened (entered, left), to whom, and when in ns."""
 
 
-def _changes(evidence: Evidence, there: Mask) -> list[Change]:
+def _changes(recorded: RecordedRun, there: Mask) -> list[Change]:
     """Who enters and leaves when, as the true positions have it."""
     period, node = np.nonzero(there[1:] != there[:-1])
     kinds = np.where(there[1:][period, node], "entered", "left").tolist()
-    times_ns = ((period + 1) * evidence.scenario.period_ns).tolist()
-    names = [evidence.node_ids[number] for number in node.tolist()]
+    times_ns = ((period + 1) * recorded.scenario.period_ns).tolist()
+    names = [recorded.node_ids[number] for number in node.tolist()]
     return list(zip(kinds, names, times_ns, strict=True))
 
 
-def _is_told(evidence: Evidence, change: Change, told: set[Change]) -> bool:
+def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
     """Whether an event tells of a change, or need not: of whom an event has not told that it is there."""
     kind, node, time_ns = change
     if change in told:
@@ -218,34 +218,34 @@ def _is_told(evidence: Evidence, change: Change, told: set[Change]) -> bool:
     if kind == "left":
         before = [one for one in told if one[1] == node and one[2] < time_ns]
         last = max(before, key=lambda one: one[2], default=None)
-        absent_at_first = not evidence.places.present()[0][evidence.number[node]]
+        absent_at_first = not recorded.places.present()[0][recorded.number[node]]
         return last[0] == "left" if last else absent_at_first
-    number = evidence.number[node]
-    if evidence.deaths_ns.get(number, NEVER_NS) <= time_ns or evidence.scenario.run.pacing == "realtime":
+    number = recorded.number[node]
+    if recorded.deaths_ns.get(number, NEVER_NS) <= time_ns or recorded.scenario.run.pacing == "realtime":
         return True
-    ended = [p for p in evidence.plan if p.fault.kind in ("kill", "restart") and p.nodes[number]]
+    ended = [p for p in recorded.plan if p.fault.kind in ("kill", "restart") and p.nodes[number]]
     return any(planned.acts_at(time_ns) for planned in ended)
 
 
-def _may_come_late(evidence: Evidence, one: Change, there: Mask) -> bool:
+def _may_come_late(recorded: RecordedRun, one: Change, there: Mask) -> bool:
     """Whether a vehicle may enter at an instant at which it has been there for some time.
 
     In real time its process has to start first, and one that a fault has taken waits until it ends.
     """
     kind, node, time_ns = one
-    if kind == "left" or not there[time_ns // evidence.scenario.period_ns, evidence.number_of(node)]:
+    if kind == "left" or not there[time_ns // recorded.scenario.period_ns, recorded.number_of(node)]:
         return False
-    return evidence.scenario.run.pacing == "realtime" or any(planned.end_ns == time_ns for planned in evidence.plan)
+    return recorded.scenario.run.pacing == "realtime" or any(planned.end_ns == time_ns for planned in recorded.plan)
 
 
-def check_memory(evidence: Evidence) -> Finding:
+def check_memory(recorded: RecordedRun) -> Finding:
     """No agent's process holds hardly more in the last third of its life than in the second.
 
     Judged by the events `memory` {node, time_s, rss_kb}, a series each from the start of a process to its end; the
     emulator's own grows with the trace that it keeps, and is not judged.
     """
     name = "memory"
-    series = [event for event in evidence.event("memory") if event.node in evidence.number]
+    series = [event for event in recorded.event("memory") if event.node in recorded.number]
     if not series:
         return NotExercised(name, "nobody measured the processes' memory")
     growing, judged, most = [], 0, 0.0

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from emulator.checks.channel import received_twice
 from emulator.faults.plan import PlannedFault
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.faults import ConstPosOffset, DataReplay, DoS, GnssFault, GnssJump, GnssRamp, Sybil
 from vnet.types import Array, IntArray, Mask
@@ -22,49 +22,49 @@ CERTAIN = 1e-6
 """How unlikely sums of sound fixes are."""
 
 
-def check_copies(evidence: Evidence) -> Finding:
+def check_copies(recorded: RecordedRun) -> Finding:
     """Floods and Sybils send each frame as often as they should, and what is replayed is as old as it should be."""
     name = "copies"
-    if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in evidence.plan):
-        return NotExercised(name, "no fault sends frames again" if evidence.plan else NO_FAULTS)
-    once = ~received_twice(evidence)
-    first = _first_rows(evidence, once & ~_near_a_change(evidence))
-    originals, copies = first[evidence.copy[first] == 0], first[evidence.copy[first] > 0]
-    frame_ns = dict(_of(evidence, originals))
-    at_once = np.array([frame_ns.get(f) == t for f, t in _of(evidence, copies)], dtype=bool)
-    again, often = np.unique(evidence.frame[copies[at_once]], return_counts=True)
+    if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
+        return NotExercised(name, "no fault sends frames again" if recorded.plan else NO_FAULTS)
+    once = ~received_twice(recorded)
+    first = _first_rows(recorded, once & ~_near_a_change(recorded))
+    originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
+    frame_ns = dict(_of(recorded, originals))
+    at_once = np.array([frame_ns.get(f) == t for f, t in _of(recorded, copies)], dtype=bool)
+    again, often = np.unique(recorded.frame[copies[at_once]], return_counts=True)
     counted = np.zeros(len(originals), dtype=np.int64)
-    order = np.argsort(evidence.frame[originals])
-    place = np.searchsorted(evidence.frame[originals][order], again)
+    order = np.argsort(recorded.frame[originals])
+    place = np.searchsorted(recorded.frame[originals][order], again)
     counted[order[place]] = often
-    wrong = originals[counted != _due(evidence, originals)]
+    wrong = originals[counted != _due(recorded, originals)]
     # What is replayed may have been sent near a change.
-    odd = _replayed_wrongly(evidence, copies[~at_once], _first_rows(evidence, once & (evidence.copy == 0)))
+    odd = _replayed_wrongly(recorded, copies[~at_once], _first_rows(recorded, once & (recorded.copy == 0)))
     broken = len(wrong) + len(odd)
     text = f"{len(copies):,} frames sent again, as often and as late as they should be"
     broken_text = f"{len(wrong)} frames not sent as often as they should be, {len(odd)} replayed at another time"
-    rows = evidence.rows(np.concatenate([wrong, np.array(odd, dtype=np.intp)])) if broken else []
+    rows = recorded.rows(np.concatenate([wrong, np.array(odd, dtype=np.intp)])) if broken else []
     return result(name, broken, text, broken_text, rows, copies=len(copies), miscounted=len(wrong), odd=len(odd))
 
 
-def _of(evidence: Evidence, rows: Rows) -> list[tuple[int, int]]:
-    return list(zip(evidence.frame[rows].tolist(), evidence.sent_ns[rows].tolist(), strict=True))
+def _of(recorded: RecordedRun, rows: Rows) -> list[tuple[int, int]]:
+    return list(zip(recorded.frame[rows].tolist(), recorded.sent_ns[rows].tolist(), strict=True))
 
 
-def _near_a_change(evidence: Evidence) -> Mask:
+def _near_a_change(recorded: RecordedRun) -> Mask:
     """In real time nobody can say whether these rows' frames were sent before or after a fault began or ended."""
-    near = np.zeros(len(evidence.trace), dtype=bool)
-    for planned in evidence.plan:
+    near = np.zeros(len(recorded.trace), dtype=bool)
+    for planned in recorded.plan:
         for edge_ns in (planned.start_ns, planned.end_ns):
-            near |= np.abs(evidence.sent_ns - edge_ns) < evidence.guard_ns
+            near |= np.abs(recorded.sent_ns - edge_ns) < recorded.guard_ns
     return near
 
 
-def _due(evidence: Evidence, rows: Rows) -> IntArray:
+def _due(recorded: RecordedRun, rows: Rows) -> IntArray:
     """How many times faults send each of these frames again at once."""
     due = np.zeros(len(rows), dtype=np.int64)
-    for planned in evidence.plan:
-        acts = planned.nodes[evidence.sender[rows]] & evidence.acting(planned, evidence.sent_ns[rows])
+    for planned in recorded.plan:
+        acts = planned.nodes[recorded.sender[rows]] & recorded.acting(planned, recorded.sent_ns[rows])
         match planned.fault:
             case DoS(factor=factor):
                 due += acts * (factor - 1)
@@ -73,23 +73,23 @@ def _due(evidence: Evidence, rows: Rows) -> IntArray:
     return due
 
 
-def _first_rows(evidence: Evidence, wanted: NDArray[np.bool_]) -> Rows:
+def _first_rows(recorded: RecordedRun, wanted: NDArray[np.bool_]) -> Rows:
     """The first row of each emission (a frame, or a copy of one) among the rows `wanted`."""
     rows = np.flatnonzero(wanted)
-    return np.asarray(rows[np.unique(evidence.emission[rows], return_index=True)[1]])
+    return np.asarray(rows[np.unique(recorded.emission[rows], return_index=True)[1]])
 
 
-def _replayed_wrongly(evidence: Evidence, late: Rows, originals: Rows) -> list[int]:
+def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> list[int]:
     """Late copies that are not of the last frame that was old enough for a replay that acted on its sender."""
-    frame_ns = dict(_of(evidence, originals))
+    frame_ns = dict(_of(recorded, originals))
     sent_ns = {
-        sender: np.sort(evidence.sent_ns[originals[evidence.sender[originals] == sender]])
-        for sender in np.unique(evidence.sender[late]).tolist()
+        sender: np.sort(recorded.sent_ns[originals[recorded.sender[originals] == sender]])
+        for sender in np.unique(recorded.sender[late]).tolist()
     }
-    replays = [planned for planned in evidence.plan if isinstance(planned.fault, DataReplay)]
+    replays = [planned for planned in recorded.plan if isinstance(planned.fault, DataReplay)]
     wrong = []
-    for row, (frame, time_ns) in zip(late.tolist(), _of(evidence, late), strict=True):
-        sender = int(evidence.sender[row])
+    for row, (frame, time_ns) in zip(late.tolist(), _of(recorded, late), strict=True):
+        sender = int(recorded.sender[row])
         acting = [planned for planned in replays if planned.nodes[sender] and planned.acts_at(time_ns)]
         if frame_ns.get(frame) not in [_last_before(sent_ns[sender], time_ns, planned) for planned in acting]:
             wrong.append(row)
@@ -103,18 +103,18 @@ def _last_before(sent_ns: IntArray, time_ns: int, planned: PlannedFault) -> int 
     return int(sent_ns[place - 1]) if place else None
 
 
-def check_gnss(evidence: Evidence) -> Finding:
+def check_gnss(recorded: RecordedRun) -> Finding:
     """What fixes have beyond truth, common error, and what faults add to them, is receiver noise."""
     name = "gnss"
-    sigma_m = evidence.scenario.world.gnss.sigma_m
-    error_m = evidence.vectors("fix_m") - evidence.vectors("position_m") - evidence.vectors("common_error_m")
-    for planned in evidence.plan:
-        error_m -= _displaced(evidence, planned)
+    sigma_m = recorded.scenario.world.gnss.sigma_m
+    error_m = recorded.vectors("fix_m") - recorded.vectors("position_m") - recorded.vectors("common_error_m")
+    for planned in recorded.plan:
+        error_m -= _displaced(recorded, planned)
     usable = np.isfinite(error_m).all(axis=2)
     groups = {"no fault": usable.copy()}
-    for planned in evidence.plan:
+    for planned in recorded.plan:
         if isinstance(planned.fault, GnssFault):
-            mine = evidence.struck(planned)
+            mine = recorded.struck(planned)
             groups["no fault"] &= ~mine
             if isinstance(planned.fault, GnssJump | GnssRamp | ConstPosOffset):
                 groups[planned.label] = mine & usable
@@ -131,9 +131,9 @@ def check_gnss(evidence: Evidence) -> Finding:
     return result(name, len(rows), text, broken_text, rows, fixes=fixes)
 
 
-def _displaced(evidence: Evidence, planned: PlannedFault) -> Array:
+def _displaced(recorded: RecordedRun, planned: PlannedFault) -> Array:
     """What a fault adds to the fixes (periods, N, 2)."""
-    start_ns = evidence.period_starts_ns()
+    start_ns = recorded.period_starts_ns()
     match planned.fault:
         case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
             moved = np.tile(np.array(offset_m), (len(start_ns), 1))
@@ -141,7 +141,7 @@ def _displaced(evidence: Evidence, planned: PlannedFault) -> Array:
             moved = np.outer((start_ns - planned.start_ns) / NS_PER_S, rate_m_s)
         case _:
             return np.zeros((len(start_ns), len(planned.nodes), 2))
-    return np.asarray(moved[:, None] * evidence.struck(planned)[:, :, None])
+    return np.asarray(moved[:, None] * recorded.struck(planned)[:, :, None])
 
 
 def is_noise(error_m: Array, sigma_m: float) -> bool:

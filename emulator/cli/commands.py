@@ -45,9 +45,11 @@ from emulator.terminal.progress import Progress, show_progress
 from emulator.terminal.summary import print_checks, print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
-from vnet.errors import LinkError, ScenarioError, VnetError
+from vnet.errors import ScenarioError, TransportError, VnetError
 from vnet.runtime.host import fix_hash_seed
-from vnet.transport.access import Access, Credentials, is_tls
+from vnet.transport.access import Access, is_tls
+from vnet.transport.certificates import certifier
+from vnet.transport.credentials import Credentials
 from vnet.transport.session import quiet_zenoh
 
 
@@ -142,7 +144,7 @@ QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only err
 
 
 @dataclass(frozen=True)
-class Asked:
+class OutputOptions:
     """What was asked for beside the run itself."""
 
     log_format: LogFormat
@@ -188,7 +190,7 @@ def run(
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
-            asked = Asked(log_format, quiet, check_determinism, report)
+            asked = OutputOptions(log_format, quiet, check_determinism, report)
             _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
 
 
@@ -221,7 +223,7 @@ def simulate(
                 if sinks is not None:
                     _record_here(emulation, sinks, stack)
                 wall_s, interrupted = run_simulation(emulation)
-            asked = Asked(log_format, quiet, check_determinism, report)
+            asked = OutputOptions(log_format, quiet, check_determinism, report)
             _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
 
 
@@ -285,7 +287,7 @@ def emulator(
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
         options = LiveOptions(users, listen, connect, launch=False, record=sinks)
         where = f"credentials of the agents: {access}/credentials/NODE.json"
-        _run_live(loaded, world, folder, options, Asked(log_format, quiet, report=report), where)
+        _run_live(loaded, world, folder, options, OutputOptions(log_format, quiet, report=report), where)
 
 
 app.command(rich_help_panel=Panel.LIVE)(status)
@@ -401,7 +403,7 @@ def record(
         if sinks is None:
             raise VnetError("--rerun off: there is nothing to do")
         if sinks.serve is not None:
-            print(sinks.serve.told(), file=sys.stderr, flush=True)
+            print(sinks.serve.announcement(), file=sys.stderr, flush=True)
         record_run(connect, run, login, replace(sinks, save=out))
 
 
@@ -426,9 +428,7 @@ def _load(
 def _create_access(scenario: Scenario, world: World, listen: str = "", tls_names: Sequence[str] = ()) -> Access:
     """New users of a run; with certificates where the router listens at tls/HOST:PORT."""
     groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
-    return Access.create(
-        scenario.run.name, groups, tls_listen=listen if is_tls(listen) else None, tls_names=tls_names
-    )
+    return Access.create(scenario.run.name, groups, certifier(listen, tls_names) if is_tls(listen) else None)
 
 
 def _load_or_create_access(scenario: Scenario, world: World, folder: Path, listen: str, separate: bool) -> Access:
@@ -437,7 +437,7 @@ def _load_or_create_access(scenario: Scenario, world: World, folder: Path, liste
         access = Access.load(folder)
         nodes = {node for process in access.processes for node in process}
         if access.run != scenario.run.name or nodes != set(world.node_ids):
-            raise LinkError(
+            raise TransportError(
                 f"access folder {folder} was made for another scenario; write a new one with: vnet access"
             )
         return access
@@ -451,7 +451,7 @@ def _run_live(
     world: World,
     folder: RunFolder,
     options: LiveOptions,
-    asked: Asked,
+    asked: OutputOptions,
     first_of_all: str | None = None,
 ) -> None:
     """A live run from its folder to its summary; exits with the verdict's status."""
@@ -463,7 +463,7 @@ def _run_live(
         if first_of_all is not None:
             progress.state(first_of_all)
         if sinks is not None and sinks.serve is not None:
-            progress.state(sinks.serve.told())
+            progress.state(sinks.serve.announcement())
         wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state, on_missing=progress.awaits))
         _finish(emulation, progress, wall_s, interrupted, "run", asked)
 
@@ -482,7 +482,7 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
 
 
 def _finish(
-    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: Asked
+    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: OutputOptions
 ) -> None:
     """Judge a run and print its summary; exits with the verdict's status."""
     progress.judging()

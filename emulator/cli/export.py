@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from emulator.checks.judge import Evidence, read_evidence
+from emulator.checks.judge import RecordedRun, read_recorded_run
 from emulator.cli.viewing import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
@@ -62,7 +62,7 @@ def radio(
 ) -> None:
     """A run's radio in figures: delivery by distance, latency, time between receptions, age of information."""
     with one_line_errors():
-        metrics = radio_metrics(read_evidence(run), bin_m)
+        metrics = radio_metrics(read_recorded_run(run), bin_m)
         if out is not None:
             tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
             with _disk(out):
@@ -115,41 +115,41 @@ def export(
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
-        evidence = read_evidence(run)
+        recorded = read_recorded_run(run)
         match to:
             case Format.PCAPNG:
                 path = out or run / "frames.pcapng"
-                print(f"{_write(path, evidence, write_pcapng):,} packets in {path}")
+                print(f"{_write(path, recorded, write_pcapng):,} packets in {path}")
             case Format.MCAP:
                 path = out or run / "run.mcap"
-                print(f"{_write(path, evidence, write_mcap):,} messages in {path}")
+                print(f"{_write(path, recorded, write_mcap):,} messages in {path}")
             case Format.CSV:
                 path = out or run / "csv"
-                print(f"{', '.join(_write_folder(path, evidence))} in {path}")
+                print(f"{', '.join(_write_folder(path, recorded))} in {path}")
 
 
-def _write(path: Path, evidence: Evidence, writer: Callable[[Evidence, BinaryIO], int]) -> int:
+def _write(path: Path, recorded: RecordedRun, writer: Callable[[RecordedRun, BinaryIO], int]) -> int:
     """Have a file written beside its place, and put there when it is whole."""
     _refuse_existing(path)
     part = path.with_name(f".{path.name}.part")
     with _disk(path):
         try:
             with part.open("wb") as file:
-                count = writer(evidence, file)
+                count = writer(recorded, file)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
     return count
 
 
-def _write_folder(path: Path, evidence: Evidence) -> list[str]:
+def _write_folder(path: Path, recorded: RecordedRun) -> list[str]:
     _refuse_existing(path)
     part = path.with_name(f".{path.name}.part")
     with _disk(path):
         try:
             shutil.rmtree(part, ignore_errors=True)
             part.mkdir(parents=True)
-            names = write_csv(evidence, part)
+            names = write_csv(recorded, part)
             part.replace(path)
         finally:
             shutil.rmtree(part, ignore_errors=True)

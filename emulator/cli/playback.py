@@ -90,7 +90,7 @@ def play(
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt), _recorder(sinks, scene["name"]) as recorder:
             recorder.take(stream, scene)
-            print(f"playing {run} at {speed:g}× real time\n{place.told()}", flush=True)
+            print(f"playing {run} at {speed:g}× real time\n{place.announcement()}", flush=True)
             apart_s = scene["period_ns"] / NS_PER_S / speed
 
             def show(message: Message) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.drivers.control import read_way_in
+from emulator.drivers.control import read_control_file
 from emulator.records.run_folder import check_is_run
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
@@ -60,13 +60,13 @@ def view(
                 subprocess.run(viewer_command("--new", str(recording)))
             return
         place = place_to_serve(rerun_bind, rerun_port)
-        print(f"serving {recording} until Ctrl-C\n{place.told()}", flush=True)
+        print(f"serving {recording} until Ctrl-C\n{place.announcement()}", flush=True)
         serve_file(recording, place)
 
 
 def _is_on(run: Path) -> bool:
     """Whether a run is going on in this folder."""
-    way = read_way_in(run)
+    way = read_control_file(run)
     if way is None:
         return False
     host, _, port = way[0].partition("/")[2].rpartition(":")
@@ -76,7 +76,7 @@ def _is_on(run: Path) -> bool:
 
 
 def _tell_where(run: Path) -> None:
-    way = read_way_in(run)
+    way = read_control_file(run)
     if way is None or way[2] is None:
         raise VnetError(f"{run}: the run is on, and is not served: only vnet run --rerun serve can be watched")
-    print(f"the run is on\n{way[2].told()}")
+    print(f"the run is on\n{way[2].announcement()}")

@@ -64,7 +64,7 @@ class Attachment:
         self._observers: dict[str, zenoh.Publisher] = {}
 
     def open(self) -> None:
-        """Listen or connect, and declare what is said and heard. Raises LinkError."""
+        """Listen or connect, and declare what is said and heard. Raises TransportError."""
         stack, options = self._stack, self._options
         if self._connect is None:
             session = stack.enter_context(open_router(self.endpoint, options.access, self._lease_ms))

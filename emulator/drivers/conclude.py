@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from emulator.checks.judge import Evidence, Judgement, Verdict, judge
+from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
 from emulator.checks.replay import AGAIN, check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.radio.outcomes import Outcome
@@ -49,7 +49,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     busy = _busy(emulation)
     if busy is not None:
         folder.put(BUSY, lambda path: pq.write_table(busy, path, compression="zstd"))
-    judgement = judge(Evidence(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
+    judgement = judge(RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
     verdict = {
         "format": FORMAT,
         **_judged(judgement),

@@ -21,9 +21,10 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.status import Course, fault_state
 from emulator.scenario.faults import parse_fault
 from emulator.viewer.sinks import ServeAt, Sinks
-from vnet.errors import LinkError, ScenarioError, VnetError
+from vnet.errors import ScenarioError, TransportError, VnetError
 from vnet.transport import keys
-from vnet.transport.access import OPERATOR, Access, Credentials, write_private
+from vnet.transport.access import OPERATOR, Access
+from vnet.transport.credentials import Credentials, write_private
 from vnet.transport.session import open_client
 
 CONTROL_FILE = "control.json"
@@ -71,7 +72,7 @@ def _json(payload: bytes) -> Any:
 
 
 @contextmanager
-def way_in(folder: Path, endpoint: str, access: Access, sinks: Sinks | None = None) -> Iterator[None]:
+def control_endpoint(folder: Path, endpoint: str, access: Access, sinks: Sinks | None = None) -> Iterator[None]:
     """Keep `control.json` in the run's folder for as long as the block lasts; `sinks`: where it can be watched."""
     path = folder / CONTROL_FILE
     try:
@@ -94,12 +95,12 @@ def _connected(folder: Path, endpoint: str, login: Credentials) -> Iterator[zeno
     with ExitStack() as stack:
         try:
             session = stack.enter_context(open_client(endpoint, login, LEASE_MS))
-        except LinkError as error:
-            raise LinkError(f"{folder}: the run does not answer (was it killed?): {error}") from None
+        except TransportError as error:
+            raise TransportError(f"{folder}: the run does not answer (was it killed?): {error}") from None
         yield session
 
 
-def read_way_in(folder: Path) -> tuple[str, str, ServeAt | None] | None:
+def read_control_file(folder: Path) -> tuple[str, str, ServeAt | None] | None:
     """Endpoint and name of the run that is going on in `folder`, and where it can be watched; None if none is.
 
     A run that was killed leaves its file behind. Raises VnetError for what no run writes.
@@ -117,7 +118,7 @@ def read_way_in(folder: Path) -> tuple[str, str, ServeAt | None] | None:
 
 def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
     """Put a query to the run whose folder this is. Raises VnetError: no such run, no answer, or what it says."""
-    way = read_way_in(folder)
+    way = read_control_file(folder)
     if way is None:
         raise VnetError(f"{folder}: no run is going on there ({CONTROL_FILE} is missing)")
     endpoint, run, _ = way
@@ -132,5 +133,5 @@ def ask(folder: Path, verb: str, payload: Any = None) -> dict[str, Any]:
                 return answered
             assert reply.err is not None
             text = reply.err.payload.to_string()
-            raise LinkError("the run does not answer: is it over?" if text == "Timeout" else text)
-    raise LinkError("the run does not answer: is it over?")
+            raise TransportError("the run does not answer: is it over?" if text == "Timeout" else text)
+    raise TransportError("the run does not answer: is it over?")

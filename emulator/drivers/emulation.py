@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import distances_m, reach_of
+from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.run_folder import RunFolder, write_text
 from emulator.scenario.faults import Fault, Infrastructure
 from emulator.scenario.scenario import Scenario, dump_scenario
-from emulator.world.gnss_faults import BentGnss, clock_of
+from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
 from vnet.node import Report
 from vnet.transport import wire
@@ -50,7 +50,7 @@ class ProcessActions:
     stop: dict[str, bool]
     start: list[str]
     paused: set[str]
-    clocks: list[wire.ClockBend]
+    clocks: list[wire.ClockError]
     restarts: list[Infrastructure]
 
 
@@ -67,11 +67,11 @@ class Emulation:
         self.scenario = scenario
         self.world = world
         self.folder = folder
-        self._reach = reach_of(scenario.radio, scenario.run.seed, world.links)
+        self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
         self._placed = 0  # the period in which vehicles are where the engine has them
         self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
-        self.gnss = BentGnss(world, self.faults.faults, scenario.run.seed)
+        self.gnss = FaultyGnss(world, self.faults.faults, scenario.run.seed)
         self.incarnation = dict.fromkeys(world.node_ids, 0)
         self._outside = self._absent(0)  # whom no event says to be there
         self._newcomers = set(self._outside)
@@ -102,7 +102,7 @@ class Emulation:
         if period == self._placed:
             return self.engine.in_range
         position_m = self.world.position_m(period)
-        return self._reach.in_range(position_m, distances_m(position_m))
+        return self._connectivity.in_range(position_m, distances_m(position_m))
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Which connected component each vehicle belongs to."""

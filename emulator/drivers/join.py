@@ -14,7 +14,7 @@ from vnet.transport import wire
 
 @dataclass
 class _Member:
-    lead: str
+    process_id: str
     nonce: bytes | None  # None: it is to join again
     pid: int
     host: str
@@ -36,20 +36,20 @@ class Membership:
 
     def hello(self, key_node: str, hello: wire.Hello) -> str | None:
         """Take a hello that came on the key of `key_node`; returns why it is refused, or None."""
-        if hello.node != key_node or key_node not in self._node_ids or hello.lead not in self._node_ids:
+        if hello.node != key_node or key_node not in self._node_ids or hello.process_id not in self._node_ids:
             return f"{hello.node!r} is not a node of this run"
-        if self._alone and hello.lead != hello.node:
+        if self._alone and hello.process_id != hello.node:
             return f"{hello.node}: vehicles enter and leave one by one: start an agent for each"
         member = self._members.get(hello.node)
         if member is not None and member.nonce not in (None, hello.nonce):
             return f"{hello.node} is already present"
         if member is None or member.nonce is None:
-            if self.closed and (member is None or member.lead != hello.lead):
+            if self.closed and (member is None or member.process_id != hello.process_id):
                 return "the run has started"
-            lead = self._members.get(hello.lead)
-            if lead is not None and lead.nonce not in (None, hello.nonce):
-                return f"{hello.lead} belongs to another process"
-            member = self._members[hello.node] = _Member(hello.lead, hello.nonce, hello.pid, hello.host)
+            first = self._members.get(hello.process_id)
+            if first is not None and first.nonce not in (None, hello.nonce):
+                return f"{hello.process_id} belongs to another process"
+            member = self._members[hello.node] = _Member(hello.process_id, hello.nonce, hello.pid, hello.host)
         member.ready = member.ready or hello.ready
         return None
 
@@ -77,35 +77,37 @@ class Membership:
         member = self._members.get(node)
         if member is None or not member.ready:
             return False
-        lead = self._members.get(member.lead)
-        return lead is not None and lead.lead == member.lead and lead.nonce == member.nonce
+        first = self._members.get(member.process_id)
+        return first is not None and first.process_id == member.process_id and first.nonce == member.nonce
 
     @property
     def joined(self) -> list[str]:
         """Nodes that have said hello, or will later, in the order of their numbers."""
         return [node for node in self._node_ids if node in self._members]
 
-    def speaks_for(self, lead: str, nonce: bytes) -> bool:
-        """Whether a message on the `tx` of `lead` with this nonce is its process's own."""
-        member = self._members.get(lead)
-        return member is not None and member.nonce == nonce and member.lead == lead
+    def speaks_for(self, process_id: str, nonce: bytes) -> bool:
+        """Whether a message on the `tx` of `process_id` with this nonce is its process's own."""
+        member = self._members.get(process_id)
+        return member is not None and member.nonce == nonce and member.process_id == process_id
 
-    def nodes_with(self, lead: str) -> list[str]:
-        """The nodes of the process of `lead`, the lead first."""
-        others = [node for node in self._node_ids if node != lead and self._members[node].lead == lead]
-        return [lead, *others]
+    def nodes_with(self, process_id: str) -> list[str]:
+        """The nodes of the process of `process_id`, the lead first."""
+        others = [
+            node for node in self._node_ids if node != process_id and self._members[node].process_id == process_id
+        ]
+        return [process_id, *others]
 
     def lead_of(self, node: str) -> str:
         """The lead of a node's process."""
-        return self._members[node].lead
+        return self._members[node].process_id
 
     def processes(self) -> list[list[str]]:
         """The nodes of each process, lead first, in the order of their leads' numbers."""
         assert not self.missing, self.missing
-        groups = {node: [node] for node in self._node_ids if self._members[node].lead == node}
+        groups = {node: [node] for node in self._node_ids if self._members[node].process_id == node}
         for node in self._node_ids:
             if node not in groups:
-                groups[self._members[node].lead].append(node)
+                groups[self._members[node].process_id].append(node)
         return list(groups.values())
 
     def describe(self, node: str) -> str:

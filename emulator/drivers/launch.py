@@ -19,7 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vnet.errors import VnetError
-from vnet.transport.access import Access, Credentials, node_user
+from vnet.transport.access import Access, node_user
+from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import default_time_slice
 from vnet.transport.session import AGENT_RUNTIME
 
@@ -131,7 +132,7 @@ class Launcher:
             return ""
         return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])
 
-    def ask_where(self, name: str) -> None:
+    def request_stack(self, name: str) -> None:
         """Have a process write its stacks to its log (its faulthandler answers SIGUSR1)."""
         if name in self._processes:
             self._processes[name].send_signal(signal.SIGUSR1)
@@ -153,14 +154,14 @@ class Launcher:
         if name in self._processes:
             self._processes[name].send_signal(number)
 
-    def let_go(self, name: str) -> Callable[[float], None]:
+    def detach(self, name: str) -> Callable[[float], None]:
         """Forget a process that has been told to go: `ended` does not report it.
 
         Returns what waits so many seconds for its end, and kills it if it does not go.
         """
         process = self._processes.pop(name, None)
 
-        def see_off(patience_s: float) -> None:
+        def wait_or_kill(patience_s: float) -> None:
             if process is not None:
                 try:
                     process.wait(patience_s)
@@ -168,7 +169,7 @@ class Launcher:
                     process.kill()
                     process.wait()
 
-        return see_off
+        return wait_or_kill
 
     def wait_for(self, name: str, timeout_s: float) -> None:
         """Wait for one process to end by itself."""

@@ -21,7 +21,7 @@ from typing import Any
 import zenoh
 
 from emulator.drivers.attachment import Attachment, LiveOptions
-from emulator.drivers.control import answer, way_in
+from emulator.drivers.control import answer, control_endpoint
 from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
 from emulator.drivers.join import Membership, split_into_processes
 from emulator.drivers.launch import Exit, Launcher
@@ -33,7 +33,7 @@ from emulator.drivers.status import Course
 from emulator.scenario.faults import EmulatorRestart, Infrastructure
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.sinks import Sinks
-from vnet.errors import LinkError, ProgramError, VnetError, WireError
+from vnet.errors import ProgramError, TransportError, VnetError, WireError
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
@@ -58,7 +58,7 @@ SCENE_EVERY_PERIODS = 50
 CHILDREN_POLL_S = 0.05
 """How often ended processes are looked for where no signal tells of them."""
 
-Gate = Callable[[Lockstep], Awaitable[None]]
+HorizonCallback = Callable[[Lockstep], Awaitable[None]]
 """Sets the barrier's horizon: called before time 0, and whenever the run is held there."""
 
 
@@ -98,13 +98,14 @@ async def run_live(
     emulation: Emulation,
     options: LiveOptions,
     on_state: Callable[[str], None] = lambda text: None,
-    gate: Gate = _open,
+    before_horizon: HorizonCallback = _open,
     on_missing: Callable[[Sequence[str]], None] = lambda nodes: None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end over Zenoh; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C and SIGTERM end the run early, with the event `interrupted`. Raises VnetError if it cannot start.
-    `gate` holds a run in lockstep. `on_missing` is told which nodes have not joined, whenever that changes.
+    `before_horizon` holds a run in lockstep. `on_missing` is called with the nodes that have not joined, whenever
+    they change.
     """
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
@@ -115,9 +116,11 @@ async def run_live(
         async with _interruptible():
             if options.router is not None:
                 options.router.start(launcher)
-            run = LiveRun(emulation, options, launcher, gate)
+            run = LiveRun(emulation, options, launcher, before_horizon)
             stack.callback(run.close)
-            stack.enter_context(way_in(emulation.folder.path, run.endpoint, options.access, options.record))
+            stack.enter_context(
+                control_endpoint(emulation.folder.path, run.endpoint, options.access, options.record)
+            )
             return await run.run(on_state, on_missing)
 
 
@@ -132,11 +135,17 @@ def _lease_ms(scenario: Scenario) -> int:
 class LiveRun:
     """One live run: its attachment, its processes and its pacing."""
 
-    def __init__(self, emulation: Emulation, options: LiveOptions, launcher: Launcher, gate: Gate = _open) -> None:
+    def __init__(
+        self,
+        emulation: Emulation,
+        options: LiveOptions,
+        launcher: Launcher,
+        before_horizon: HorizonCallback = _open,
+    ) -> None:
         self._emulation = emulation
         self._options = options
         self._launcher = launcher
-        self._gate = gate
+        self._gate = before_horizon
         self._loop = asyncio.get_running_loop()
         self._name = options.access.run
         self._realtime = emulation.scenario.run.pacing == "realtime"
@@ -163,19 +172,19 @@ class LiveRun:
         self._memory = MemoryWatch(emulation.duration_ns)
         self._seen = Course(emulation)
         lease_ms = _lease_ms(emulation.scenario)
-        self._link = Attachment(
+        self._attachment = Attachment(
             options, emulation.world.node_ids, lease_ms, self._realtime, self._intake, self._intake, self._intake
         )
-        self._link.open()
+        self._attachment.open()
 
     @property
     def endpoint(self) -> str:
         """Where agents and operators connect."""
-        return self._link.endpoint
+        return self._attachment.endpoint
 
     def close(self) -> None:
         """Close what is open to the world."""
-        self._link.close()
+        self._attachment.close()
 
     # Zenoh's threads: append, and wake the loop once.
 
@@ -224,7 +233,7 @@ class LiveRun:
             self._hello(node, message)
         elif not self._members.speaks_for(node, message.nonce):
             self._refuse(node, "a message without the nonce of its process")
-        elif isinstance(message, wire.Standing):
+        elif isinstance(message, wire.StackDump):
             self._standing[node] = message.text
         elif isinstance(message, wire.Yield) and isinstance(self._pacing, Lockstep):
             self._pacing.receive(node, message)
@@ -247,13 +256,13 @@ class LiveRun:
         refusal = self._members.hello(node, hello)
         if refusal is not None:
             self._refuse(node, refusal)
-            if self._link.knows(node):
-                self._link.send(node, wire.End(hello.nonce, refusal, refused=True))
+            if self._attachment.knows(node):
+                self._attachment.send(node, wire.End(hello.nonce, refusal, refused=True))
             return
         if hello.failure is not None:
             self._join_failure = ProgramError(f"{node}: {hello.failure}")
         elif not hello.ready:
-            self._link.send(node, self._emulation.welcome(node, hello.nonce))
+            self._attachment.send(node, self._emulation.welcome(node, hello.nonce))
         self._changed.set()
 
     def _time_ns(self) -> int:
@@ -284,7 +293,7 @@ class LiveRun:
             self._loop.call_later(DEATH_GRACE_S, self._process_ended, name, how)
 
     def _process_ended(self, name: str, how: Exit) -> None:
-        if not self._link.knows(name):
+        if not self._attachment.knows(name):
             self._emulation.folder.event(self._time_ns(), "observer_ended", name, how=how.how)
         elif self._pacing is None:
             last = how.log_tail.splitlines()[-1:] or ["its log is empty"]
@@ -306,10 +315,10 @@ class LiveRun:
             details = {"how": "its connection closed", "process": self._members.describe(node)}
             self._loop.call_later(DEATH_GRACE_S, lambda: self._process_dead(node, **details))
 
-    def _process_dead(self, lead: str, **details: Any) -> None:
-        self._dead[lead] = details
+    def _process_dead(self, process_id: str, **details: Any) -> None:
+        self._dead[process_id] = details
         if isinstance(self._pacing, RealTime):
-            self._pacing.died(self._now_ns(), lead, **self._dead.pop(lead))
+            self._pacing.died(self._now_ns(), process_id, **self._dead.pop(process_id))
         self._changed.set()
 
     # The course of a run.
@@ -341,7 +350,7 @@ class LiveRun:
         finally:
             wall_s = time.monotonic() - started
             self._stand_still(set())
-            await self._farewell(patience_s)
+            await self._shut_down(patience_s)
             self._memory.write(folder, self._time_ns())
             for key, count in self._refused.items():
                 folder.event(self._time_ns(), "refused_total", key=key, count=count)
@@ -355,7 +364,7 @@ class LiveRun:
         node_ids = self._emulation.world.node_ids
         groups = split_into_processes(node_ids, run.nodes_per_process)
         groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
-        endpoint = self._link.endpoint
+        endpoint = self._attachment.endpoint
         deadline = time.monotonic() + run.join_timeout_s
         if self._options.record is not None:
             self._start_recorder(endpoint, self._options.record)
@@ -373,7 +382,7 @@ class LiveRun:
             if self._join_failure is not None:
                 raise self._join_failure
             if time.monotonic() > deadline:
-                raise LinkError(self._who_is_missing(run.join_timeout_s))
+                raise TransportError(self._who_is_missing(run.join_timeout_s))
             await self._change(0.05 if self._options.record else deadline - time.monotonic())
         self._members.closed = True
         self._tell_missing([], on_missing)
@@ -384,7 +393,7 @@ class LiveRun:
 
     def _launch(self, nodes: Sequence[str]) -> None:
         nice = REALTIME_AGENT_NICE if self._realtime else 0
-        self._launcher.start_agent(self._link.endpoint, self._options.access, nodes, nice)
+        self._launcher.start_agent(self._attachment.endpoint, self._options.access, nodes, nice)
 
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._name]
@@ -394,7 +403,7 @@ class LiveRun:
         self._launcher.start(RECORDER, arguments, credentials, environment, own_session=True)
 
     def _recorder_listens(self) -> bool:
-        return self._options.record is None or self._link.is_watched("period")
+        return self._options.record is None or self._attachment.is_watched("period")
 
     def _who_is_missing(self, timeout_s: float) -> str:
         missing = self._members.missing or ["the recorder"]
@@ -414,7 +423,7 @@ class LiveRun:
 
     async def _course(self) -> None:
         processes = self._members.processes()
-        self._link.publish("scene", self._messages.scene())
+        self._attachment.publish("scene", self._messages.scene())
         if self._emulation.scenario.run.pacing == "lockstep":
             self._pacing = lockstep = Lockstep(self._emulation, processes)
             await self._run_lockstep(lockstep)
@@ -427,27 +436,27 @@ class LiveRun:
         grants = lockstep.start()
         while grants:
             for actions in lockstep.take_actions():
-                await self._suffer(actions)
-            for lead, grant in grants.items():
-                self._link.send(lead, grant)
+                await self._apply_process_faults(actions)
+            for process_id, grant in grants.items():
+                self._attachment.send(process_id, grant)
             await self._all_yielded(lockstep)
             grants = lockstep.step()
             while lockstep.held:
                 await self._gate(lockstep)
                 grants = lockstep.step()
-        for lead in sorted(self._dead):
-            lockstep.died(lead, **self._dead[lead])
+        for process_id in sorted(self._dead):
+            lockstep.died(process_id, **self._dead[process_id])
 
     # Faults of processes.
 
-    async def _suffer(self, actions: ProcessActions) -> None:
+    async def _apply_process_faults(self, actions: ProcessActions) -> None:
         """Do to the processes what the faults of an instant do."""
         ended = {self._members.lead_of(node): killed for node, killed in actions.stop.items()}
-        for lead, killed in ended.items():
-            await self._end_process(lead, killed)
+        for process_id, killed in ended.items():
+            await self._end_process(process_id, killed)
         started = list(dict.fromkeys(map(self._members.lead_of, actions.start)))
-        for lead in started:
-            self._begin_process(lead)
+        for process_id in started:
+            self._begin_process(process_id)
         if isinstance(self._pacing, Lockstep) and started:
             await self._returned(started)
         elif started:
@@ -456,58 +465,58 @@ class LiveRun:
         for fault in actions.restarts:
             await self._restart_link(fault)
 
-    def _stand_still(self, leads: set[str]) -> None:
+    def _stand_still(self, process_ids: set[str]) -> None:
         """Stop the processes that are paused, and let the others go on. In lockstep it is enough not to grant."""
         if self._realtime:
-            for lead in sorted(self._paused - leads):
-                self._launcher.signal(lead, signal.SIGCONT)
-            for lead in sorted(leads - self._paused):
-                self._launcher.signal(lead, signal.SIGSTOP)
-        self._paused = leads
+            for process_id in sorted(self._paused - process_ids):
+                self._launcher.signal(process_id, signal.SIGCONT)
+            for process_id in sorted(process_ids - self._paused):
+                self._launcher.signal(process_id, signal.SIGSTOP)
+        self._paused = process_ids
 
     def _welcome_back(self, realtime: RealTime) -> None:
         """Real time: start what has come back."""
         missing = set(self._members.missing)
-        for lead in sorted(self._expected):
-            if not missing & set(self._members.nodes_with(lead)):
-                self._expected.discard(lead)
-                self._returning.difference_update(self._members.nodes_with(lead))
-                self._link.send(lead, realtime.returned(self._now_ns(), lead))
+        for process_id in sorted(self._expected):
+            if not missing & set(self._members.nodes_with(process_id)):
+                self._expected.discard(process_id)
+                self._returning.difference_update(self._members.nodes_with(process_id))
+                self._attachment.send(process_id, realtime.returned(self._now_ns(), process_id))
 
-    async def _end_process(self, lead: str, killed: bool) -> None:
+    async def _end_process(self, process_id: str, killed: bool) -> None:
         """End a process; those started by hand are told to go, and whoever started them may again."""
-        self._returning.update(self._members.nodes_with(lead))
-        self._expected.discard(lead)
+        self._returning.update(self._members.nodes_with(process_id))
+        self._expected.discard(process_id)
         if killed and self._options.launch:
-            self._paused.discard(lead)
-            self._launcher.kill(lead)
+            self._paused.discard(process_id)
+            self._launcher.kill(process_id)
             return
-        self._stand_still(self._paused - {lead})  # or it could not go
-        reason = "it has left" if self._emulation.has_left(lead) else "restarted by a fault"
-        self._link.send(lead, wire.End(None, "killed by a fault" if killed else reason))
+        self._stand_still(self._paused - {process_id})  # or it could not go
+        reason = "it has left" if self._emulation.has_left(process_id) else "restarted by a fault"
+        self._attachment.send(process_id, wire.End(None, "killed by a fault" if killed else reason))
         if self._options.launch:
-            going = asyncio.create_task(asyncio.to_thread(self._launcher.let_go(lead), FAREWELL_S))
+            going = asyncio.create_task(asyncio.to_thread(self._launcher.detach(process_id), FAREWELL_S))
             if self._realtime:  # nobody waits for it
                 self._going.add(going)
                 going.add_done_callback(self._going.discard)
             else:
                 await going
 
-    def _begin_process(self, lead: str) -> None:
-        nodes = self._members.nodes_with(lead)
-        if lead in self._members.later:
-            if self._members.enter(lead):
+    def _begin_process(self, process_id: str) -> None:
+        nodes = self._members.nodes_with(process_id)
+        if process_id in self._members.later:
+            if self._members.enter(process_id):
                 return
         else:
             self._members.expect(nodes)
         if self._options.launch:
             self._launch(nodes)
 
-    async def _returned(self, leads: Sequence[str]) -> None:
+    async def _returned(self, process_ids: Sequence[str]) -> None:
         """Wait until processes that start anew are there again. Raises Stalled if they are not in time."""
         timeout_s = self._emulation.scenario.run.join_timeout_s
         deadline = time.monotonic() + timeout_s
-        nodes = [node for lead in leads for node in self._members.nodes_with(lead)]
+        nodes = [node for process_id in process_ids for node in self._members.nodes_with(process_id)]
         while late := self._late(nodes):
             if not await self._change(deadline - time.monotonic()):
                 error = f"has not come back within {timeout_s:g} s"
@@ -527,60 +536,64 @@ class LiveRun:
         up = [node for node in self._emulation.world.node_ids if self._emulation.up[node]]
         living = [node for node in up if node not in self._returning]
         for node in living:
-            self._link.send(node, wire.Await(patience_s))
+            self._attachment.send(node, wire.Await(patience_s))
         await asyncio.sleep(AWAIT_WARNING_S)
         self._restarting = True
         if isinstance(fault, EmulatorRestart):
-            await asyncio.to_thread(self._link.close)
+            await asyncio.to_thread(self._attachment.close)
             await asyncio.sleep(fault.down_s)
-            await asyncio.to_thread(self._link.open)
+            await asyncio.to_thread(self._attachment.open)
         else:
             self._launcher.kill(ROUTER)
             await asyncio.sleep(fault.down_s)
             assert self._options.router is not None
             await asyncio.to_thread(self._options.router.start, self._launcher)
-        leads = {self._members.lead_of(node) for node in living}
+        process_ids = {self._members.lead_of(node) for node in living}
         if self._realtime:
-            leads -= self._paused  # they cannot answer, and have time until they go on
-        await self._all_answer(sorted(leads), patience_s)
+            process_ids -= self._paused  # they cannot answer, and have time until they go on
+        await self._all_answer(sorted(process_ids), patience_s)
         self._restarting = False
         self._emulation.folder.event(self._time_ns(), f"{fault.kind}ed", None, down_s=fault.down_s)
 
-    async def _all_answer(self, leads: Sequence[str], patience_s: float) -> None:
+    async def _all_answer(self, process_ids: Sequence[str], patience_s: float) -> None:
         """Wait until each process has answered: only then do messages pass in both directions again."""
         self._standing.clear()
         deadline = time.monotonic() + patience_s
-        while silent := [lead for lead in leads if lead not in self._standing and lead not in self._dead]:
+        while silent := [
+            process_id
+            for process_id in process_ids
+            if process_id not in self._standing and process_id not in self._dead
+        ]:
             if time.monotonic() > deadline:
                 error = f"has not found the emulator again within {patience_s:g} s"
                 self._emulation.folder.event(self._time_ns(), "stalled", silent[0], error=error)
                 raise Stalled
-            for lead in silent:
-                self._link.send(lead, wire.Where())
+            for process_id in silent:
+                self._attachment.send(process_id, wire.StackRequest())
             await asyncio.sleep(REJOIN_POLL_S)
         self._standing.clear()
 
     async def _all_yielded(self, lockstep: Lockstep) -> None:
         stall_timeout_s = self._emulation.scenario.run.stall_timeout_s
         while lockstep.owed:
-            for lead in sorted(self._dead.keys() & lockstep.owed):
-                lockstep.died(lead, **self._dead.pop(lead))
+            for process_id in sorted(self._dead.keys() & lockstep.owed):
+                lockstep.died(process_id, **self._dead.pop(process_id))
             if lockstep.owed and not await self._change(stall_timeout_s):
                 await self._stall(sorted(lockstep.owed), stall_timeout_s)
 
-    async def _stall(self, leads: list[str], timeout_s: float) -> None:
+    async def _stall(self, process_ids: list[str], timeout_s: float) -> None:
         """Ask those who do not yield where they stand, write it down and give up."""
-        for lead in leads:
-            self._link.send(lead, wire.Where())
-            self._launcher.ask_where(lead)
+        for process_id in process_ids:
+            self._attachment.send(process_id, wire.StackRequest())
+            self._launcher.request_stack(process_id)
         await asyncio.sleep(STANDING_WAIT_S)
-        for lead in leads:
-            where = self._standing.get(lead) or self._launcher.log_tail(lead)
+        for process_id in process_ids:
+            where = self._standing.get(process_id) or self._launcher.log_tail(process_id)
             self._emulation.folder.event(
                 self._time_ns(),
                 "stalled",
-                lead,
-                error=f"no yield within {timeout_s:g} s of wall clock; {self._members.describe(lead)}",
+                process_id,
+                error=f"no yield within {timeout_s:g} s of wall clock; {self._members.describe(process_id)}",
                 where=where,
             )
         raise Stalled
@@ -588,23 +601,23 @@ class LiveRun:
     async def _run_realtime(self, realtime: RealTime) -> None:
         self._origin_ns = time.monotonic_ns() + wire.HEAD_START_NS
         duration_ns = self._emulation.duration_ns
-        for lead, batch in realtime.start(self._origin_ns).items():
-            self._link.send(lead, batch)
+        for process_id, batch in realtime.start(self._origin_ns).items():
+            self._attachment.send(process_id, batch)
         await asyncio.sleep(wire.HEAD_START_NS / 1e9)
         while (now_ns := self._now_ns()) < duration_ns:
             batches = realtime.due(now_ns)
             for actions in realtime.take_actions():
-                await self._suffer(actions)
-            for lead, batch in batches.items():
-                self._link.send(lead, batch)
+                await self._apply_process_faults(actions)
+            for process_id, batch in batches.items():
+                self._attachment.send(process_id, batch)
             self._welcome_back(realtime)
             next_ns = min(realtime.next_time_ns() or duration_ns, duration_ns)
             await self._change((next_ns - self._now_ns()) / 1e9)
 
-    async def _farewell(self, patience_s: float) -> None:
+    async def _shut_down(self, patience_s: float) -> None:
         """Tell everybody that it is over, hear last words, and see every process off."""
         for node in self._members.joined:
-            self._link.send(node, wire.End(None, "the run is over"))
+            self._attachment.send(node, wire.End(None, "the run is over"))
         deadline = time.monotonic() + FAREWELL_S
         if isinstance(self._pacing, RealTime):
             while not self._pacing.all_final and await self._change(deadline - time.monotonic()):
@@ -614,7 +627,7 @@ class LiveRun:
         if not self._options.launch:  # who closes at once may take the last words along
             while self._connected and await self._change(deadline - time.monotonic()):
                 pass
-        self._link.publish("end", self._messages.end())
+        self._attachment.publish("end", self._messages.end())
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if patience_s > FAREWELL_S else 0.5)
         self._launcher.stop(patience_s)
@@ -627,12 +640,12 @@ class LiveRun:
 
     def _publish_period(self, view: PeriodView) -> None:
         """Tell who watches. A message is of a whole period: who comes within one hears of the next."""
-        was_watched, self._watched = self._watched, self._link.is_watched("period")
+        was_watched, self._watched = self._watched, self._attachment.is_watched("period")
         if not self._watched:
             return
         if not was_watched or view.instant.period % SCENE_EVERY_PERIODS == 0:  # for those who come late
-            self._link.publish("scene", self._messages.scene())
+            self._attachment.publish("scene", self._messages.scene())
         if was_watched:
-            self._link.publish("period", self._messages.period(view))
+            self._attachment.publish("period", self._messages.period(view))
         else:
             self._messages.begin()

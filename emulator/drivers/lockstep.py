@@ -39,8 +39,8 @@ class _Process:
         self.packets: dict[str, deque[wire.WirePacket]] = {node: deque(maxlen=INBOX_LIMIT) for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
-        self.bent: set[str] = set()
-        self.clocks: list[wire.ClockBend] = []
+        self.affected: set[str] = set()
+        self.clocks: list[wire.ClockError] = []
 
     @property
     def running(self) -> list[str]:
@@ -53,7 +53,7 @@ class _Process:
             self.packets[node].clear()
         return due
 
-    def take_clocks(self) -> list[wire.ClockBend]:
+    def take_clocks(self) -> list[wire.ClockError]:
         changed, self.clocks = self.clocks, []
         return changed
 
@@ -74,7 +74,7 @@ class Lockstep:
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], hosts_all: bool = False) -> None:
         self._emulation = emulation
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
-        self._lead = {node: nodes[0] for nodes in processes for node in nodes}
+        self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
         there = [nodes for nodes in processes if hosts_all or any(emulation.up[node] for node in nodes)]
         self._processes = {nodes[0]: _Process(nodes) for nodes in there}
         self._hosts_all = hosts_all
@@ -89,7 +89,7 @@ class Lockstep:
         """The first grants, to all, at time 0."""
         if self._emulation.next_change_ns() == 0:
             self._act(0)
-        if first := [lead for lead, process in self._processes.items() if process.running]:
+        if first := [process_id for process_id, process in self._processes.items() if process.running]:
             return self._grant(first)
         return self._go_on()  # all are dead or stand still
 
@@ -98,25 +98,25 @@ class Lockstep:
         actions, self._actions = self._actions, []
         return actions
 
-    def receive(self, lead: str, message: wire.Yield) -> None:
+    def receive(self, process_id: str, message: wire.Yield) -> None:
         """A process has yielded. Raises ProtocolError if it was not owed or speaks for others' nodes."""
-        process = self._processes[lead]
-        if self.owed.get(lead) != message.seq:
-            raise ProtocolError(f"yield {message.seq} of {lead}: expected {self.owed.get(lead)}")
+        process = self._processes[process_id]
+        if self.owed.get(process_id) != message.seq:
+            raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
         waiting = [*message.waiting_radio, *message.waiting_gnss]
         _check_ownership(process.nodes, message.traffic, waiting)
-        del self.owed[lead]
+        del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns
         process.waiting_radio = message.waiting_radio
         process.waiting_gnss = message.waiting_gnss
         process.traffic = message.traffic
 
-    def died(self, lead: str, **details: Any) -> None:
+    def died(self, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from this instant on, and nothing is owed by it."""
-        process = self._processes.pop(lead, None)
+        process = self._processes.pop(process_id, None)
         if process is None:  # a fault was faster
             return
-        self.owed.pop(lead, None)
+        self.owed.pop(process_id, None)
         for node in process.nodes:
             self._emulation.died(self.now_ns, node, **details)
 
@@ -133,7 +133,7 @@ class Lockstep:
         emulation = self._emulation
         while True:
             self._look_ahead()
-            wakes = {lead: self._wake_ns(process) for lead, process in self._processes.items()}
+            wakes = {process_id: self._wake_ns(process) for process_id, process in self._processes.items()}
             next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
             change_ns = emulation.next_change_ns()
             if self._hold(next_ns if change_ns is None else min(next_ns, change_ns)):
@@ -146,7 +146,7 @@ class Lockstep:
             return {}
         self.now_ns = next_ns
         self._collect_packets(next_ns)
-        return self._grant([lead for lead, wake in wakes.items() if wake == next_ns])
+        return self._grant([process_id for process_id, wake in wakes.items() if wake == next_ns])
 
     def _look_ahead(self) -> None:
         """Let the radio come as far as the first instant at which anything else happens, and no further.
@@ -186,27 +186,31 @@ class Lockstep:
                 if clock.node in process.next_fix:
                     self._bend(process, clock)
 
-    def _bend(self, process: _Process, clock: wire.ClockBend) -> None:
-        if clock.bends or clock.node in process.bent:
+    def _bend(self, process: _Process, clock: wire.ClockError) -> None:
+        if clock.is_wrong or clock.node in process.affected:
             process.clocks.append(clock)
-            process.bent.add(clock.node)
+            process.affected.add(clock.node)
 
     def _stop(self, node: str) -> None:
-        lead = self._lead[node]
+        process_id = self._process_of[node]
         if self._hosts_all:
-            self._processes[lead].packets[node].clear()
+            self._processes[process_id].packets[node].clear()
         else:
-            self._processes.pop(lead, None)
+            self._processes.pop(process_id, None)
 
     def _start(self, node: str) -> None:
-        lead = self._lead[node]
-        if lead not in self._processes:
+        process_id = self._process_of[node]
+        if process_id not in self._processes:
             # In the order of the first processes, so that nothing depends on who was gone when.
-            self._processes[lead] = _Process(self._groups[lead])
-            self._processes = {lead: self._processes[lead] for lead in self._groups if lead in self._processes}
-        process = self._processes[lead]
+            self._processes[process_id] = _Process(self._groups[process_id])
+            self._processes = {
+                process_id: self._processes[process_id]
+                for process_id in self._groups
+                if process_id in self._processes
+            }
+        process = self._processes[process_id]
         process.next_fix[node] = -(-self.now_ns // self._emulation.world.period_ns)
-        self._woken.add(lead)
+        self._woken.add(process_id)
 
     def _wake_ns(self, process: _Process, by_radio: bool = True) -> int | None:
         """When a process must run next: its next timer, or what its nodes' tasks wait for.
@@ -235,15 +239,15 @@ class Lockstep:
             node = node_ids[delivery.receiver]
             queues[node].append(_wire_packet(node, delivery.packet))
 
-    def _grant(self, leads: Sequence[str]) -> dict[str, wire.Grant]:
+    def _grant(self, process_ids: Sequence[str]) -> dict[str, wire.Grant]:
         grants = {}
-        for lead in leads:
-            process = self._processes[lead]
-            self._woken.discard(lead)
+        for process_id in process_ids:
+            process = self._processes[process_id]
+            self._woken.discard(process_id)
             fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
             packets, clocks = process.take_packets(), process.take_clocks()
-            grants[lead] = wire.Grant(process.seq, self.now_ns, packets, fixes, clocks)
-            self.owed[lead] = process.seq
+            grants[process_id] = wire.Grant(process.seq, self.now_ns, packets, fixes, clocks)
+            self.owed[process_id] = process.seq
             process.seq += 1
         return grants
 
@@ -269,21 +273,23 @@ class RealTime:
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
         self._emulation = emulation
         self._nodes = {nodes[0]: tuple(nodes) for nodes in processes}
-        self._lead = {node: nodes[0] for nodes in processes for node in nodes}
+        self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
         self._batch_seq = dict.fromkeys(self._nodes, 0)
         self._frames_seq = dict.fromkeys(self._nodes, 0)
-        self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {lead: {} for lead in self._nodes}
+        self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {process_id: {} for process_id in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
         self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
-        self._present = {lead for lead, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)}
+        self._present = {
+            process_id for process_id, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)
+        }
         self._awaited = set(self._present)
         self._paused: set[str] = set()
         self._was_paused: set[str] = set()
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._clocks: dict[str, list[wire.ClockBend]] = {lead: [] for lead in self._nodes}
-        self._bent: set[str] = set()
+        self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
+        self._affected: set[str] = set()
         self._next_period = 0
         self._origin_ns = 0
         self.gaps = 0
@@ -291,7 +297,11 @@ class RealTime:
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
         """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
         self._origin_ns = origin_ns
-        return {lead: self._batch(lead, origin_ns=origin_ns) for lead in self._nodes if lead in self._present}
+        return {
+            process_id: self._batch(process_id, origin_ns=origin_ns)
+            for process_id in self._nodes
+            if process_id in self._present
+        }
 
     def next_time_ns(self) -> int | None:
         """When `due` must be called next: the next arrival, fix or fault."""
@@ -303,20 +313,20 @@ class RealTime:
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return min(due) if due else None
 
-    def receive(self, now_ns: int, lead: str, message: wire.Frames) -> None:
+    def receive(self, now_ns: int, process_id: str, message: wire.Frames) -> None:
         """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
-        _check_ownership(self._nodes[lead], message.traffic, ())
-        if message.seq != self._frames_seq[lead]:
+        _check_ownership(self._nodes[process_id], message.traffic, ())
+        if message.seq != self._frames_seq[process_id]:
             self.gaps += 1
-        self._frames_seq[lead] = message.seq + 1
-        self._acknowledge(lead, message)
+        self._frames_seq[process_id] = message.seq + 1
+        self._acknowledge(process_id, message)
         if message.lateness is not None:
-            process = lead, self._emulation.incarnation[lead]
+            process = process_id, self._emulation.incarnation[process_id]
             before = _late(self._lateness.get(process, ()))
             self._late_in[now_ns // 10**9] += _late(message.lateness.counts) - before
             self._lateness[process] = message.lateness.counts
         if message.final:
-            self._awaited.discard(lead)
+            self._awaited.discard(process_id)
         if now_ns < self._emulation.duration_ns:
             self._emulation.take(now_ns, [message.traffic])
 
@@ -325,8 +335,8 @@ class RealTime:
         """Whether every process that lives has said its last words."""
         return not self._awaited
 
-    def _acknowledge(self, lead: str, message: wire.Frames) -> None:
-        waiting = self._unacknowledged[lead]
+    def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
+        waiting = self._unacknowledged[process_id]
         for first, last in message.missed:
             self.gaps += 1
             for seq in [seq for seq in waiting if first <= seq <= last]:
@@ -346,9 +356,10 @@ class RealTime:
         self._collect(now_ns)
         ready = self._present - self._paused
         return {
-            lead: self._batch(lead)
-            for lead in self._nodes
-            if lead in ready and (lead in self._packets or lead in self._fixes or self._clocks[lead])
+            process_id: self._batch(process_id)
+            for process_id in self._nodes
+            if process_id in ready
+            and (process_id in self._packets or process_id in self._fixes or self._clocks[process_id])
         }
 
     def take_actions(self) -> list[ProcessActions]:
@@ -359,62 +370,62 @@ class RealTime:
     def _act(self, time_ns: int) -> None:
         actions = self._emulation.act(time_ns, starts_at_once=False)
         self._actions.append(actions)
-        for lead in {self._lead[node] for node in actions.stop}:
-            self._present.discard(lead)
-            self._awaited.discard(lead)
-            self._unacknowledged[lead].clear()
-            self._packets.pop(lead, None)
-            self._fixes.pop(lead, None)
-        paused = {self._lead[node] for node in actions.paused}
+        for process_id in {self._process_of[node] for node in actions.stop}:
+            self._present.discard(process_id)
+            self._awaited.discard(process_id)
+            self._unacknowledged[process_id].clear()
+            self._packets.pop(process_id, None)
+            self._fixes.pop(process_id, None)
+        paused = {self._process_of[node] for node in actions.paused}
         self._was_paused |= self._paused - paused
         self._paused = paused
         for clock in actions.clocks:
-            if clock.bends or clock.node in self._bent:
-                self._clocks[self._lead[clock.node]].append(clock)
-                self._bent.add(clock.node)
+            if clock.is_wrong or clock.node in self._affected:
+                self._clocks[self._process_of[clock.node]].append(clock)
+                self._affected.add(clock.node)
 
-    def returned(self, now_ns: int, lead: str) -> wire.Batch:
+    def returned(self, now_ns: int, process_id: str) -> wire.Batch:
         """A process that was started anew is ready; returns the batch that starts it."""
-        self._emulation.come_back(self._nodes[lead], now_ns)
-        self._batch_seq[lead] = self._frames_seq[lead] = 0
-        self._unacknowledged[lead].clear()
-        self._present.add(lead)
-        self._awaited.add(lead)
-        return self._batch(lead, origin_ns=self._origin_ns, start_ns=now_ns)
+        self._emulation.come_back(self._nodes[process_id], now_ns)
+        self._batch_seq[process_id] = self._frames_seq[process_id] = 0
+        self._unacknowledged[process_id].clear()
+        self._present.add(process_id)
+        self._awaited.add(process_id)
+        return self._batch(process_id, origin_ns=self._origin_ns, start_ns=now_ns)
 
     def _collect(self, time_ns: int) -> None:
         """Take what arrives, and the fixes that are due, by then."""
         node_ids = self._emulation.world.node_ids
         for delivery in self._emulation.advance(time_ns):
-            lead = self._lead[node_ids[delivery.receiver]]
-            if lead in self._present:
-                self._packets.setdefault(lead, []).append(delivery)
+            process_id = self._process_of[node_ids[delivery.receiver]]
+            if process_id in self._present:
+                self._packets.setdefault(process_id, []).append(delivery)
         while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= time_ns:
             for number, node in enumerate(node_ids):
                 fix = self._emulation.gnss.fix(self._next_period, number) if self._emulation.up[node] else None
-                if fix is not None and self._lead[node] in self._present:
-                    self._fixes.setdefault(self._lead[node], []).append(wire.WireFix.of(node, fix))
+                if fix is not None and self._process_of[node] in self._present:
+                    self._fixes.setdefault(self._process_of[node], []).append(wire.WireFix.of(node, fix))
             self._next_period += 1
 
-    def _batch(self, lead: str, origin_ns: int | None = None, start_ns: int = 0) -> wire.Batch:
-        seq = self._batch_seq[lead]
-        self._batch_seq[lead] = seq + 1
-        deliveries, fixes = self._packets.pop(lead, []), self._fixes.pop(lead, [])
-        self._unacknowledged[lead][seq] = deliveries
+    def _batch(self, process_id: str, origin_ns: int | None = None, start_ns: int = 0) -> wire.Batch:
+        seq = self._batch_seq[process_id]
+        self._batch_seq[process_id] = seq + 1
+        deliveries, fixes = self._packets.pop(process_id, []), self._fixes.pop(process_id, [])
+        self._unacknowledged[process_id][seq] = deliveries
         node_ids = self._emulation.world.node_ids
         packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
-        clocks, self._clocks[lead] = self._clocks[lead], []
-        held = lead in self._was_paused
-        self._was_paused.discard(lead)
+        clocks, self._clocks[process_id] = self._clocks[process_id], []
+        held = process_id in self._was_paused
+        self._was_paused.discard(process_id)
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks)
 
-    def died(self, now_ns: int, lead: str, **details: Any) -> None:
+    def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""
-        for node in self._nodes[lead]:
+        for node in self._nodes[process_id]:
             self._emulation.died(now_ns, node, **details)
-        self._unacknowledged[lead].clear()
-        self._present.discard(lead)
-        self._awaited.discard(lead)
+        self._unacknowledged[process_id].clear()
+        self._present.discard(process_id)
+        self._awaited.discard(process_id)
 
     def finish(self) -> None:
         """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
@@ -428,7 +439,9 @@ class RealTime:
         if sum(counts):
             figures = lateness_figures(counts)
             worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
-            figures["worst"] = {f"{lead}.{start}": _late(self._lateness[lead, start]) for lead, start in worst}
+            figures["worst"] = {
+                f"{process_id}.{start}": _late(self._lateness[process_id, start]) for process_id, start in worst
+            }
             worst_s = self._late_in.most_common(WORST_SECONDS)
             figures["worst_s"] = {str(second): count for second, count in worst_s if count > 0}
             self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)

@@ -17,7 +17,7 @@ from pathlib import Path
 import zenoh
 
 from emulator.drivers.launch import Launcher
-from vnet.errors import LinkError
+from vnet.errors import TransportError
 from vnet.transport.access import Access
 
 ROUTER = "router"
@@ -37,14 +37,14 @@ class SeparateRouter:
         access.save(folder, self.endpoint, folder)
 
     def start(self, launcher: Launcher) -> None:
-        """Start the process and wait until it listens. Raises LinkError if it does not."""
+        """Start the process and wait until it listens. Raises TransportError if it does not."""
         launcher.start_service(ROUTER, ["-P", "-m", "emulator.drivers.router", str(self._config)])
         deadline = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline:
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 1.0):
                 return
             time.sleep(0.02)
-        raise LinkError(f"the separate router does not listen at {self.endpoint}: {launcher.log_tail(ROUTER)}")
+        raise TransportError(f"the separate router does not listen at {self.endpoint}: {launcher.log_tail(ROUTER)}")
 
 
 def main(config: str) -> None:

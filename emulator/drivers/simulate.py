@@ -28,14 +28,14 @@ class _RunOverError(Exception):
     """The barrier has granted nothing more."""
 
 
-def simulate(emulation: Emulation, gate: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
+def simulate(emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
     it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
-    `gate` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
+    `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     """
-    simulation = _Simulation(emulation, gate)
+    simulation = _Simulation(emulation, before_horizon)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
@@ -71,12 +71,12 @@ def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
 class _Simulation:
     """All nodes on one loop, and the barrier that this loop yields to."""
 
-    def __init__(self, emulation: Emulation, gate: Callable[[Lockstep], None] | None) -> None:
+    def __init__(self, emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None) -> None:
         node_ids = emulation.world.node_ids
-        self._lead = node_ids[0]
+        self._process_of = node_ids[0]
         self._emulation = emulation
         self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
-        self._gate = gate or (lambda lockstep: None)
+        self._gate = before_horizon or (lambda lockstep: None)
         self._seq = 0
         self.interrupted = False
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
@@ -109,7 +109,7 @@ class _Simulation:
     def _exchange(self, next_timer_ns: int | None) -> int:
         if self.interrupted:
             raise KeyboardInterrupt
-        self._lockstep.receive(self._lead, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
+        self._lockstep.receive(self._process_of, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
         grants = self._lockstep.step()
         while self._lockstep.held:
             self._gate(self._lockstep)
@@ -119,14 +119,14 @@ class _Simulation:
     def _take(self, grants: dict[str, wire.Grant]) -> int:
         if not grants:
             raise _RunOverError
-        grant = grants[self._lead]
+        grant = grants[self._process_of]
         self._seq = grant.seq
-        self._host.bend(grant.clocks, self.loop)
-        self._suffer(self._lockstep.take_actions())
+        self._host.apply_clock_error(grant.clocks, self.loop)
+        self._apply_process_faults(self._lockstep.take_actions())
         self._host.deliver(grant.packets, grant.fixes)
         return grant.time_ns
 
-    def _suffer(self, actions: Sequence[ProcessActions]) -> None:
+    def _apply_process_faults(self, actions: Sequence[ProcessActions]) -> None:
         """Do to the programs what faults do to processes."""
         for action in actions:
             for node, killed in action.stop.items():

@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from emulator.radio.connectivity import reach_of
+from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
@@ -61,7 +61,7 @@ def analyze_graph(hears: Links) -> dict[str, Any]:
     linked = mutual(hears)
     degree = linked.sum(axis=1)
     values, counts = np.unique(degree, return_counts=True)
-    reach = shortest_path(linked.astype(float), unweighted=True)
+    connectivity = shortest_path(linked.astype(float), unweighted=True)
     laplacian = np.diag(degree) - linked.astype(float)
     label = _labels(linked)
     groups = [np.flatnonzero(label == number) for number in np.argsort(-np.bincount(label), kind="stable")]
@@ -72,7 +72,7 @@ def analyze_graph(hears: Links) -> dict[str, Any]:
         "one_way_links": int((hears & ~hears.T).sum()),
         "degree": {"min": int(degree.min()), "median": float(np.median(degree)), "max": int(degree.max())},
         "degree_histogram": dict(zip(values.tolist(), counts.tolist(), strict=True)),
-        "diameter": int(reach[np.isfinite(reach)].max()),
+        "diameter": int(connectivity[np.isfinite(connectivity)].max()),
         "algebraic_connectivity": float(max(0.0, np.linalg.eigvalsh(laplacian)[1])) if len(linked) > 1 else None,
         "rules": {name: _rule_figures(make(linked), groups) for name, make in weight_rules().items()},
         "left_out": [] if has_cvxpy() else [NO_CVXPY],
@@ -116,8 +116,8 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
 def hears_matrix(scenario: Scenario, world: World) -> Links:
     """Who (row) hears whom (column) at the start, (N, N): range, links or path loss, and the peer cap."""
-    reach = reach_of(scenario.radio, scenario.run.seed, world.links)
-    topology = Topology(world.at(0).position_m, reach, scenario.radio.max_peers)
+    connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
+    topology = Topology(world.at(0).position_m, connectivity, scenario.radio.max_peers)
     return np.asarray(topology.now.admitted.T)
 
 

@@ -17,7 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import dump_scenario
 from vnet.errors import VnetError
 
@@ -76,7 +76,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 _KEPT = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
 
 
-def write_mcap(evidence: Evidence, file: BinaryIO) -> int:
+def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
     """Write a run; returns how many messages these are. Raises VnetError where the package mcap is missing."""
     try:
         from mcap.writer import Writer
@@ -90,11 +90,11 @@ def write_mcap(evidence: Evidence, file: BinaryIO) -> int:
         schema_id = writer.register_schema(name, "jsonschema", described)
         channels[topic] = writer.register_channel(topic, "json", schema_id)
     count = 0
-    for time_ns, topic, message in heapq.merge(*_streams(evidence), key=lambda one: one[0]):
+    for time_ns, topic, message in heapq.merge(*_streams(recorded), key=lambda one: one[0]):
         data = json.dumps(message, allow_nan=False).encode()
         writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
         count += 1
-    scenario = dump_scenario(evidence.scenario).encode()
+    scenario = dump_scenario(recorded.scenario).encode()
     writer.add_attachment(
         create_time=0, log_time=0, name="scenario.toml", media_type="application/toml", data=scenario
     )
@@ -102,15 +102,15 @@ def write_mcap(evidence: Evidence, file: BinaryIO) -> int:
     return count
 
 
-def _streams(evidence: Evidence) -> list[Iterator[Message]]:
+def _streams(recorded: RecordedRun) -> list[Iterator[Message]]:
     """Messages, each stream in the order of their times."""
-    return [_periods(evidence), _metrics(evidence), _frames(evidence), _events(evidence)]
+    return [_periods(recorded), _metrics(recorded), _frames(recorded), _events(recorded)]
 
 
-def _periods(evidence: Evidence) -> Iterator[Message]:
-    count = len(evidence.node_ids)
-    for start in range(0, len(evidence.states), max(count, 1)):
-        rows = evidence.states.slice(start, count).to_pylist()
+def _periods(recorded: RecordedRun) -> Iterator[Message]:
+    count = len(recorded.node_ids)
+    for start in range(0, len(recorded.states), max(count, 1)):
+        rows = recorded.states.slice(start, count).to_pylist()
         time_ns = rows[0]["time_ns"]
         yield time_ns, "/tf", {"transforms": [_transform(row) for row in rows if _there(row["position_m"])]}
         for topic, name in (("/vehicles/fix", "fix_m"), ("/vehicles/estimate", "estimate_m")):
@@ -173,36 +173,36 @@ def _transform(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _metrics(evidence: Evidence) -> Iterator[Message]:
-    for row in evidence.metrics.to_pylist():
+def _metrics(recorded: RecordedRun) -> Iterator[Message]:
+    for row in recorded.metrics.to_pylist():
         yield row["time_ns"], "/metrics", {name: _finite(value) for name, value in row.items()}
 
 
-def _events(evidence: Evidence) -> Iterator[Message]:
-    for event in sorted(evidence.events, key=lambda event: event.time_ns):
+def _events(recorded: RecordedRun) -> Iterator[Message]:
+    for event in sorted(recorded.events, key=lambda event: event.time_ns):
         yield event.time_ns, "/events", {"kind": event.kind, "node": event.node or "", "details": event.details}
 
 
-def _frames(evidence: Evidence) -> Iterator[Message]:
-    order = np.lexsort((evidence.receiver, evidence.emission, evidence.sent_ns))
-    edges = np.flatnonzero(np.diff(evidence.emission[order])) + 1
-    outcomes = evidence.trace["outcome"].cast(pa.string()).to_pylist()
-    causes = evidence.trace["cause"].cast(pa.string()).to_pylist()
-    sizes = evidence.column("size_bytes")
+def _frames(recorded: RecordedRun) -> Iterator[Message]:
+    order = np.lexsort((recorded.receiver, recorded.emission, recorded.sent_ns))
+    edges = np.flatnonzero(np.diff(recorded.emission[order])) + 1
+    outcomes = recorded.trace["outcome"].cast(pa.string()).to_pylist()
+    causes = recorded.trace["cause"].cast(pa.string()).to_pylist()
+    sizes = recorded.column("size_bytes")
     for rows in np.split(order, edges) if len(order) else ():
         by_outcome: dict[str, list[str]] = {}
         for row in rows.tolist():
-            by_outcome.setdefault(outcomes[row], []).append(evidence.node_ids[int(evidence.receiver[row])])
+            by_outcome.setdefault(outcomes[row], []).append(recorded.node_ids[int(recorded.receiver[row])])
         first = int(rows[0])
         yield (
-            int(evidence.sent_ns[first]),
+            int(recorded.sent_ns[first]),
             "/frames",
             {
-                "sender": evidence.node_ids[int(evidence.sender[first])],
-                "seq": int(evidence.seq[first]),
-                "copy": int(evidence.copy[first]),
+                "sender": recorded.node_ids[int(recorded.sender[first])],
+                "seq": int(recorded.seq[first]),
+                "copy": int(recorded.copy[first]),
                 "size_bytes": int(sizes[first]),
-                "payload_digest": f"{int(evidence.digest[first]):016x}",
+                "payload_digest": f"{int(recorded.digest[first]):016x}",
                 "cause": causes[first],
                 "outcomes": by_outcome,
             },

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 
 LINKTYPE_RADIOTAP = 127
 ETHERTYPE = 0x88B5
@@ -47,18 +47,18 @@ class _Packet:
     row: int
 
 
-def write_pcapng(evidence: Evidence, file: BinaryIO) -> int:
+def write_pcapng(recorded: RecordedRun, file: BinaryIO) -> int:
     """Write a run's frames; returns how many packets these are."""
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
-    for node in evidence.node_ids:
+    for node in recorded.node_ids:
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
         body = struct.pack("<HHI", LINKTYPE_RADIOTAP, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
-    radiotap = _radiotap(evidence.scenario.radio.bitrate_mbps)
-    fates = _Fates(evidence)
-    columns = [evidence.sender, evidence.seq, evidence.column("size_bytes")]
+    radiotap = _radiotap(recorded.scenario.radio.bitrate_mbps)
+    fates = _Fates(recorded)
+    columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
-    for packet in _packets(evidence):
+    for packet in _packets(recorded):
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
         header = radiotap + _frame_header(sender, seq)
         file.write(_packet_block(packet, header, size_bytes, fates.comment(packet)))
@@ -66,16 +66,16 @@ def write_pcapng(evidence: Evidence, file: BinaryIO) -> int:
     return count
 
 
-def _packets(evidence: Evidence) -> Iterator[_Packet]:
+def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
     """All packets in the order of their times."""
-    sent = np.unique(evidence.emission, return_index=True)[1]
+    sent = np.unique(recorded.emission, return_index=True)[1]
     # What arrives once more on its way to one receiver was sent once.
-    sent = sent[~(evidence.caused_by("duplicate") & (evidence.copy > 0))[sent]]
-    heard = np.flatnonzero(evidence.outcome_is("delivered"))
+    sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
+    heard = np.flatnonzero(recorded.outcome_is("delivered"))
     row = np.concatenate([sent, heard])
-    interface = np.concatenate([evidence.sender[sent], evidence.receiver[heard]])
-    left_ns = evidence.sent_ns[sent] if evidence.scenario.radio.mac is None else _on_air_ns(evidence, sent)
-    time_ns = np.concatenate([left_ns, evidence.arrival_ns[heard]])
+    interface = np.concatenate([recorded.sender[sent], recorded.receiver[heard]])
+    left_ns = recorded.sent_ns[sent] if recorded.scenario.radio.mac is None else _on_air_ns(recorded, sent)
+    time_ns = np.concatenate([left_ns, recorded.arrival_ns[heard]])
     direction = np.repeat([_OUTBOUND, _INBOUND], [len(sent), len(heard)])
     order = np.argsort(time_ns, kind="stable")
     columns = (column[order].tolist() for column in (interface, time_ns, direction, row))
@@ -83,32 +83,32 @@ def _packets(evidence: Evidence) -> Iterator[_Packet]:
         yield _Packet(*fields)
 
 
-def _on_air_ns(evidence: Evidence, rows: NDArray[np.intp]) -> NDArray[np.int64]:
+def _on_air_ns(recorded: RecordedRun, rows: NDArray[np.intp]) -> NDArray[np.int64]:
     """When these frames went on the air that all share; those that never did, when they were handed over."""
-    on_air_ns = evidence.column("on_air_ns")[rows]
-    return np.where(on_air_ns < 0, evidence.sent_ns[rows], on_air_ns)
+    on_air_ns = recorded.column("on_air_ns")[rows]
+    return np.where(on_air_ns < 0, recorded.sent_ns[rows], on_air_ns)
 
 
 class _Fates:
     """What is said of packets in their comments."""
 
-    def __init__(self, evidence: Evidence) -> None:
-        self._evidence = evidence
-        self._outcome = _decoded(evidence.trace["outcome"])
-        self._cause = evidence.trace["cause"].cast(pa.string()).to_pylist()
-        order = np.argsort(evidence.emission, kind="stable")
+    def __init__(self, recorded: RecordedRun) -> None:
+        self._evidence = recorded
+        self._outcome = _decoded(recorded.trace["outcome"])
+        self._cause = recorded.trace["cause"].cast(pa.string()).to_pylist()
+        order = np.argsort(recorded.emission, kind="stable")
         self._order = order
-        self._emission = evidence.emission[order]
+        self._emission = recorded.emission[order]
 
     def comment(self, packet: _Packet) -> str:
         """Whose frame it is and, for one that is sent, what became of it."""
-        evidence, row = self._evidence, packet.row
-        copy = int(evidence.copy[row])
-        name = evidence.node_ids[int(evidence.sender[row])]
-        text = f"{name} frame {int(evidence.seq[row])}{f', copy {copy}' if copy else ''}"
-        text += f"; payload {int(evidence.digest[row]):016x}"
+        recorded, row = self._evidence, packet.row
+        copy = int(recorded.copy[row])
+        name = recorded.node_ids[int(recorded.sender[row])]
+        text = f"{name} frame {int(recorded.seq[row])}{f', copy {copy}' if copy else ''}"
+        text += f"; payload {int(recorded.digest[row]):016x}"
         text += f"; {self._cause[row]}" if self._cause[row] else ""
-        return text if packet.direction == _INBOUND else f"{text}; {self._became(int(evidence.emission[row]))}"
+        return text if packet.direction == _INBOUND else f"{text}; {self._became(int(recorded.emission[row]))}"
 
     def _became(self, emission: int) -> str:
         first, end = np.searchsorted(self._emission, (emission, emission + 1))

@@ -11,30 +11,30 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from emulator.records.radio_metrics import radio_metrics
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 
 AXES = {2: ("x", "y"), 4: ("xx", "xy", "yx", "yy")}
 """What the columns of a list of so many numbers are called."""
 
 
-def write_csv(evidence: Evidence, folder: Path) -> list[str]:
+def write_csv(recorded: RecordedRun, folder: Path) -> list[str]:
     """Write all tables into a folder; returns the files' names. Raises OSError."""
     events = [
         {"time_ns": e.time_ns, "kind": e.kind, "node": e.node, "details": json.dumps(e.details)}
-        for e in evidence.events
+        for e in recorded.events
     ]
-    figures = radio_metrics(evidence)
+    figures = radio_metrics(recorded)
     tables = {
-        "trace": evidence.trace,
-        "states": evidence.states,
-        "metrics": evidence.metrics,
+        "trace": recorded.trace,
+        "states": recorded.states,
+        "metrics": recorded.metrics,
         "events": pa.Table.from_pylist(events),
         "links": figures.links,
         "vehicles": figures.vehicles,
         "distances": figures.distances,
     }
-    if evidence.busy is not None:
-        tables["busy"] = evidence.busy
+    if recorded.busy is not None:
+        tables["busy"] = recorded.busy
     for name, table in tables.items():
         pacsv.write_csv(flat(table), folder / f"{name}.csv")
     return [f"{name}.csv" for name in tables]

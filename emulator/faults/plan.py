@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from emulator.faults.selectors import Nodes, links_of, select, severed_by
+from emulator.faults.selectors import Nodes, links_of, partitioned_links, select
 from emulator.scenario.faults import (
     ConstPosOffset,
     Fault,
@@ -201,7 +201,7 @@ class _MovingPlaces:
 
 def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Places:
     if isinstance(fault, Partition):
-        severed = severed_by(fault, nodes, rng)
+        severed = partitioned_links(fault, nodes, rng)
         return _ends(severed), severed
     if isinstance(fault, LinkFault):
         links = links_of(fault, nodes, rng)

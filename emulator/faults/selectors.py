@@ -73,7 +73,7 @@ def links_of(fault: LinkFault, nodes: Nodes, rng: np.random.Generator) -> Mask:
     return (end[:, None] | end[None, :]) & sender[:, None] & receiver[None, :]
 
 
-def severed_by(fault: Partition, nodes: Nodes, rng: np.random.Generator) -> Mask:
+def partitioned_links(fault: Partition, nodes: Nodes, rng: np.random.Generator) -> Mask:
     """The links (N, N), rows are senders, that a partition cuts. Raises ScenarioError."""
     count = len(nodes.ids)
     if fault.groups == "ring":

@@ -24,33 +24,35 @@ LEAST_PAUSE_NS, MOST_PAUSE_NS = 25 * NS_PER_MS, 1000 * NS_PER_MS
 SLICES = WINDOW_NS // SLICE_NS
 
 
-class Gate(Protocol):
+class CongestionControl(Protocol):
     """Lets frames of each sender through, or holds them back. `waiting` frames of each may wait, the newest."""
 
     waiting: int
 
-    def hear(self, number: int, busy_ns: NDArray[np.int64]) -> None:
+    def observe(self, number: int, busy_ns: NDArray[np.int64]) -> None:
         """The medium was busy for so long (N,) in slice `number` of the time."""
 
-    def ask_ns(self, node: int, now_ns: int) -> int:
+    def next_poll_ns(self, node: int, now_ns: int) -> int:
         """`now_ns` if a frame of `node` may go; else when to ask again."""
 
     def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
         """A frame of `node` goes on air for so long."""
 
 
-def gate_of(congestion: EtsiReactive | Limeric | None, count: int, seed: int) -> Gate | None:
+def congestion_control_of(
+    congestion: EtsiReactive | Limeric | None, count: int, seed: int
+) -> CongestionControl | None:
     """The gate that a scenario chooses, for `count` senders."""
     match congestion:
         case EtsiReactive():
-            return ReactiveGate(congestion, Ear(count, seed))
+            return ReactiveControl(congestion, BusyRatioMeter(count, seed))
         case Limeric():
-            return LimericGate(congestion, Ear(count, seed))
+            return LimericControl(congestion, BusyRatioMeter(count, seed))
         case None:
             return None
 
 
-class Ear:
+class BusyRatioMeter:
     """How busy each of `count` senders finds the medium, in windows that begin at an instant of its own.
 
     Stations measure each on its own clock. If all measured and acted at once, all would hold back at once, and
@@ -69,7 +71,7 @@ class Ear:
     def __len__(self) -> int:
         return len(self._phase_ns)
 
-    def hear(self, number: int, busy_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def observe(self, number: int, busy_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Take one more slice; returns whose window is over with it."""
         if len(self._last) == SLICES:
             self._sum_ns -= self._last[0]
@@ -79,7 +81,7 @@ class Ear:
         self.busy_ratio[over] = self._sum_ns[over] / WINDOW_NS
         return np.asarray(over)
 
-    def ask_ns(self, node: int, open_ns: int, now_ns: int) -> int:
+    def next_poll_ns(self, node: int, open_ns: int, now_ns: int) -> int:
         """When to ask if the gate opens at `open_ns` as things stand: after the next window they may be better."""
         if open_ns <= now_ns:
             return now_ns
@@ -87,72 +89,72 @@ class Ear:
         return min(open_ns, ((now_ns - look_ns) // WINDOW_NS + 1) * WINDOW_NS + look_ns)
 
 
-class ReactiveGate:
+class ReactiveControl:
     """A state for each sender, which goes one up or down with each window; each state has its pause."""
 
-    def __init__(self, congestion: EtsiReactive, ear: Ear) -> None:
+    def __init__(self, congestion: EtsiReactive, meter: BusyRatioMeter) -> None:
         self.waiting = congestion.waiting
-        self._ear = ear
+        self._meter = meter
         self._busy = np.array(congestion.busy)
         self._pause_ns = [round(pause_ms * NS_PER_MS) for pause_ms in congestion.pause_ms]
-        self._state = np.zeros(len(ear), np.int64)
+        self._state = np.zeros(len(meter), np.int64)
         self._last_ns: dict[int, int] = {}
 
-    def hear(self, number: int, busy_ns: NDArray[np.int64]) -> None:
-        """See `Gate`."""
-        over = self._ear.hear(number, busy_ns)
-        wanted = np.searchsorted(self._busy, self._ear.busy_ratio[over], side="right")
+    def observe(self, number: int, busy_ns: NDArray[np.int64]) -> None:
+        """See `CongestionControl`."""
+        over = self._meter.observe(number, busy_ns)
+        wanted = np.searchsorted(self._busy, self._meter.busy_ratio[over], side="right")
         self._state[over] += np.sign(wanted - self._state[over])
 
-    def ask_ns(self, node: int, now_ns: int) -> int:
-        """See `Gate`."""
+    def next_poll_ns(self, node: int, now_ns: int) -> int:
+        """See `CongestionControl`."""
         if node not in self._last_ns:
             return now_ns
         open_ns = self._last_ns[node] + self._pause_ns[int(self._state[node])]
-        return self._ear.ask_ns(node, open_ns, now_ns)
+        return self._meter.next_poll_ns(node, open_ns, now_ns)
 
     def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
-        """See `Gate`."""
+        """See `CongestionControl`."""
         self._last_ns[node] = now_ns
 
 
-class LimericGate:
+class LimericControl:
     """Each sender's share of the time, which every second window moves towards one that fits the target."""
 
-    def __init__(self, congestion: Limeric, ear: Ear) -> None:
+    def __init__(self, congestion: Limeric, meter: BusyRatioMeter) -> None:
         self.waiting = congestion.waiting
-        self._ear = ear
+        self._meter = meter
         self._parameters = congestion
-        self.share = np.full(len(ear), (congestion.least + congestion.most) / 2)
+        self.share = np.full(len(meter), (congestion.least + congestion.most) / 2)
         """(N,), the part of the time that each may send; at first half of the most."""
-        self._before = np.zeros(len(ear))
-        self._smooth = np.zeros(len(ear))
+        self._before = np.zeros(len(meter))
+        self._smooth = np.zeros(len(meter))
         self._last: dict[int, tuple[int, int]] = {}
 
-    def hear(self, number: int, busy_ns: NDArray[np.int64]) -> None:
-        """See `Gate`."""
-        over = self._ear.hear(number, busy_ns)
+    def observe(self, number: int, busy_ns: NDArray[np.int64]) -> None:
+        """See `CongestionControl`."""
+        over = self._meter.observe(number, busy_ns)
         if number // SLICES % 2:
             self._adapt(over)
-        self._before[over] = self._ear.busy_ratio[over]
+        self._before[over] = self._meter.busy_ratio[over]
 
     def _adapt(self, over: NDArray[np.bool_]) -> None:
         """Steps 1 to 5 of TS 102 687 V1.2.1, 5.4, for some of the senders."""
         parameters = self._parameters
-        self._smooth[over] = 0.5 * self._smooth[over] + 0.25 * (self._before[over] + self._ear.busy_ratio[over])
+        self._smooth[over] = 0.5 * self._smooth[over] + 0.25 * (self._before[over] + self._meter.busy_ratio[over])
         step = parameters.beta * (parameters.target - self._smooth[over])
         step = np.clip(step, -parameters.most_down, parameters.most_up)
         share = (1 - parameters.alpha) * self.share[over] + step
         self.share[over] = np.clip(share, parameters.least, parameters.most)
 
-    def ask_ns(self, node: int, now_ns: int) -> int:
-        """See `Gate`."""
+    def next_poll_ns(self, node: int, now_ns: int) -> int:
+        """See `CongestionControl`."""
         if node not in self._last:
             return now_ns
         began_ns, airtime_ns = self._last[node]
         pause_ns = min(max(round(airtime_ns / self.share[node]), LEAST_PAUSE_NS), MOST_PAUSE_NS)
-        return self._ear.ask_ns(node, began_ns + pause_ns, now_ns)
+        return self._meter.next_poll_ns(node, began_ns + pause_ns, now_ns)
 
     def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
-        """See `Gate`."""
+        """See `CongestionControl`."""
         self._last[node] = now_ns, airtime_ns

@@ -11,7 +11,7 @@ from emulator.scenario.scenario import Radio
 from vnet.types import Array, Mask
 
 
-class Reach(Protocol):
+class Connectivity(Protocol):
     """A law of who is in range of whom; rows are senders, and nobody is in range of itself."""
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
@@ -21,7 +21,7 @@ class Reach(Protocol):
         """(N, N), the mean power of signals, 0 out of range; on the diagonal what a sender sends with."""
 
 
-def reach_of(radio: Radio, seed: int, links: Mask | None) -> Reach:
+def connectivity_of(radio: Radio, seed: int, links: Mask | None) -> Connectivity:
     """The law that a scenario chooses; `links` (N, N) is `radio.links` as loaded, whose rows are receivers."""
     if radio.path_loss is not None:
         return AboveFloor(MeanPower(radio.path_loss, radio.shadowing, seed), radio.path_loss.floor_dbm)
@@ -38,11 +38,11 @@ class _Equal:
     """Without a path loss all signals in range are equally strong: wherever two of them meet, neither arrives."""
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """See `Reach`."""
+        """See `Connectivity`."""
         raise NotImplementedError
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
-        """See `Reach`."""
+        """See `Connectivity`."""
         power_mw = self.in_range(position_m, distance_m).astype(float)
         np.fill_diagonal(power_mw, 1.0)
         return power_mw
@@ -55,7 +55,7 @@ class Disc(_Equal):
         self._range_m = range_m
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """See `Reach`."""
+        """See `Connectivity`."""
         return _without_itself(distance_m <= self._range_m)
 
 
@@ -66,7 +66,7 @@ class Matrix(_Equal):
         self._links = links
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """See `Reach`."""
+        """See `Connectivity`."""
         return _without_itself(self._links.T & np.isfinite(distance_m))
 
 
@@ -78,11 +78,11 @@ class AboveFloor:
         self._floor_dbm = floor_dbm
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """See `Reach`."""
+        """See `Connectivity`."""
         return _without_itself(self.mean.dbm(position_m, distance_m) >= self._floor_dbm)
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
-        """See `Reach`."""
+        """See `Connectivity`."""
         power_dbm = self.mean.dbm(position_m, distance_m)
         itself = np.eye(len(power_dbm), dtype=bool)
         heard = (power_dbm >= self._floor_dbm) | itself

@@ -9,7 +9,7 @@ were put there. Three rules make the result depend only on what was handed over 
    first; what is due at t is done only when all of them have.
 2. Whatever is handed over at t makes instants at t or later, and no arrival earlier than a microsecond after a
    frame's end. So an arrival at t is known once all before t is done, and nothing handed over at t can change it.
-3. A frame keeps what it met when it was handed over (`Surroundings`, `LinkEffects`), and its draws depend on it
+3. A frame keeps what it met when it was handed over (`TopologySnapshot`, `LinkEffects`), and its draws depend on it
    alone. So it does not matter at which of their calls the drivers move vehicles, as long as they do so between
    handing over what was sent before and what is sent after.
 
@@ -32,7 +32,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import NamedTuple
 
-from emulator.radio.congestion import Gate, gate_of
+from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.frames import Frame
 from emulator.radio.mac import Throttle
@@ -55,9 +55,9 @@ class _Station:
     """A sender: the frames that wait, and how its backoff stands.
 
     `queue` are the frames that are ready, and `coming` is how many more will be; `held` is true while congestion
-    control, which is asked again at `ask_ns`, holds them back. `wants` is true while a frame waits for the medium
-    and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium is idle, and
-    stands still while it is `busy` there. `plans` counts what was planned: of its accesses only `access` happens.
+    control, which is asked again at `next_poll_ns`, holds them back. `wants` is true while a frame waits for the
+    medium and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium
+    is idle, and pauses while it is `busy` there. `plans` counts planned accesses: of these only `access` happens.
     """
 
     node: int
@@ -65,7 +65,7 @@ class _Station:
     coming: int = 0
     ready_ns: int = 0
     held: bool = False
-    ask_ns: int = -1
+    next_poll_ns: int = -1
     on_air: bool = False
     wants: bool = False
     slots: int = 0
@@ -104,9 +104,9 @@ class Csma:
         self._limit = radio.queue_frames
         threshold = Threshold(radio.receiver or Receiver())
         self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold)
-        self._gate = gate_of(radio.congestion, count, seed)
-        if self._gate is not None:
-            self.medium.listen(self._gate.hear)
+        self._congestion = congestion_control_of(radio.congestion, count, seed)
+        if self._congestion is not None:
+            self.medium.listen(self._congestion.observe)
         self._throttle = Throttle()
         self._instants: list[_Instant] = []
         self._stations: dict[int, _Station] = {}
@@ -119,7 +119,7 @@ class Csma:
         """From now on frames of these senders come to the medium at these bitrates, and no others are slowed."""
         self._throttle.set(bitrate_mbps)
 
-    def hand_over(self, frame: Frame) -> None:
+    def enqueue(self, frame: Frame) -> None:
         """Take a frame; it is ready after its jitter, and not before those that were handed over earlier."""
         station = self._stations.get(frame.sender)
         if station is None:
@@ -152,8 +152,8 @@ class Csma:
         """
         return self._now_ns <= time_ns and (not self._instants or self._instants[0][:2] > (time_ns, READY))
 
-    def _leave(self, frame: Frame, fate: Outcome, time_ns: int) -> None:
-        frame.fate, frame.end_ns = fate, time_ns
+    def _leave(self, frame: Frame, sender_outcome: Outcome, time_ns: int) -> None:
+        frame.sender_outcome, frame.end_ns = sender_outcome, time_ns
         self.sent.append(frame)
 
     def _plan(self, time_ns: int, kind: int, station: _Station, frame: Frame | None = None) -> None:
@@ -203,32 +203,32 @@ class Csma:
         if station.queue and not station.wants and not station.on_air:
             self._want(station, now_ns)
 
-    def _is_let_through(self, station: _Station, gate: Gate, now_ns: int) -> bool:
+    def _is_let_through(self, station: _Station, congestion: CongestionControl, now_ns: int) -> bool:
         """Whether congestion control lets a station's next frame go; those that are too many never will.
 
         A frame that was held back gets to the medium with its jitter, like any other: else those that collided once
         would come, after the same pause, at the same instant again.
         """
         self.medium.count(now_ns)
-        ask_ns = gate.ask_ns(station.node, now_ns)
-        if ask_ns <= now_ns:
+        next_poll_ns = congestion.next_poll_ns(station.node, now_ns)
+        if next_poll_ns <= now_ns:
             held, station.held = station.held, False
             jitter_ns = int(self._jitter_ns * sender_draw(station.queue[0], JITTER))
             if held and jitter_ns:
                 self._plan(now_ns + jitter_ns, READY, station)
                 return False
             return True
-        if ask_ns != station.ask_ns:
-            station.ask_ns = ask_ns
-            self._plan(ask_ns, READY, station)
+        if next_poll_ns != station.next_poll_ns:
+            station.next_poll_ns = next_poll_ns
+            self._plan(next_poll_ns, READY, station)
         station.held = True
-        while len(station.queue) > gate.waiting:
+        while len(station.queue) > congestion.waiting:
             self._leave(station.queue.popleft(), Outcome.held_back, now_ns)
         return False
 
     def _want(self, station: _Station, now_ns: int) -> None:
         """Let the first frame of a station go on air as soon as it may."""
-        if self._gate is not None and not self._is_let_through(station, self._gate, now_ns):
+        if self._congestion is not None and not self._is_let_through(station, self._congestion, now_ns):
             return
         station.wants = True
         node = station.node
@@ -258,8 +258,8 @@ class Csma:
         self._counting.pop(station.node, None)
         frame.on_air_ns = now_ns
         airtime = airtime_ns(frame.size_bytes, self._bitrate_mbps)
-        if self._gate is not None:
-            self._gate.sends(station.node, now_ns, airtime)
+        if self._congestion is not None:
+            self._congestion.sends(station.node, now_ns, airtime)
         self.medium.begin(frame, now_ns)
         self._plan(now_ns + airtime, END, station, frame)
         self._look(now_ns)

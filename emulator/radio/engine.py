@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio.connectivity import reach_of
+from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
-from emulator.radio.frames import Frame, Pairs, Stage
-from emulator.radio.in_flight import NEVER_NS, Arrivals, Deliveries, Delivery
+from emulator.radio.frames import Frame, Receptions, Stage
+from emulator.radio.in_flight import NEVER_NS, Deliveries, Delivery, InFlight
 from emulator.radio.link_faults import LinkFaults
-from emulator.radio.mac import Access, TransmitQueue
+from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.reception import Reception
@@ -73,12 +73,12 @@ class Engine:
         count = len(node_ids)
         signals = Signals(seed, radio.fading, count) if radio.is_physical else None
         nakagami = signals.nakagami if signals is not None else None
-        self._topology = Topology(position_m, reach_of(radio, seed, links), radio.max_peers, nakagami)
+        self._topology = Topology(position_m, connectivity_of(radio, seed, links), radio.max_peers, nakagami)
         self._csma = (
             Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
         )
-        self._access: Access = self._csma or TransmitQueue(seed, radio)
-        self._links = LinkFaults(seed, self._access, count)
+        self._mac: Mac = self._csma or TransmitQueue(seed, radio)
+        self._links = LinkFaults(seed, self._mac, count)
         self._senders = SenderFaults(self._node_ids, self._next_copy)
         self.chain: list[Stage] = [
             in_range,
@@ -94,7 +94,7 @@ class Engine:
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
         self._copies: Counter[tuple[int, int]] = Counter()
-        self._arrivals = Arrivals(len(node_ids))
+        self._in_flight = InFlight(len(node_ids))
 
     @property
     def trace(self) -> Trace:
@@ -138,7 +138,7 @@ class Engine:
         """Frames that `node` broadcasts at `time_ns`, in order. Those of a node that is down are discarded."""
         if not self._topology.is_up(node):
             return
-        self._access.run(time_ns)
+        self._mac.run(time_ns)
         for payload in payloads:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
@@ -164,41 +164,43 @@ class Engine:
             outgoing.cause,
         )
         if frame.size_bytes > self._max_payload_bytes:  # never gets as far as the queue
-            frame.fate, frame.end_ns = Outcome.oversize, time_ns
-            self._access.sent.append(frame)
+            frame.sender_outcome, frame.end_ns = Outcome.oversize, time_ns
+            self._mac.sent.append(frame)
         else:
-            self._access.hand_over(frame)
-        if frame.effects.copying:  # its copies are numbered before the next frame's
+            self._mac.enqueue(frame)
+        if frame.effects.copy:  # its copies are numbered before the next frame's
             self._settle()
 
     # What has been sent.
 
     def _settle(self) -> None:
         """Let the stages decide on the frames that have been sent."""
-        if frames := self._access.sent:
-            self._access.sent = []
-            pairs = Pairs.of(frames, len(self._node_ids))
+        if frames := self._mac.sent:
+            self._mac.sent = []
+            receptions = Receptions.of(frames, len(self._node_ids))
             for stage in self.chain:
-                stage(frames, pairs)
-            self._book(frames, pairs)
+                stage(frames, receptions)
+            self._book(frames, receptions)
 
-    def _book(self, frames: Sequence[Frame], pairs: Pairs) -> None:
+    def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Write the rows of pairs in range, and put those that arrive where they are awaited."""
-        for (number, node), flips in pairs.flips.items():
+        for (number, node), flips in receptions.flips.items():
             frames[number].altered[node] = _flipped(frames[number].payload, flips)
         count = len(self._node_ids)
-        which = pairs.outcome != OUT_OF_RANGE
+        which = receptions.outcome != OUT_OF_RANGE
         each = np.count_nonzero(which, axis=1)
         receiver = np.broadcast_to(np.arange(count), which.shape)[which]
         self._counts[Outcome.out_of_range] += len(frames) * (count - 1) - len(receiver)
-        self._enter(frames, each, receiver, pairs.outcome[which], pairs.arrival_ns[which], pairs.cause[which])
-        for number, copied, later_ns, cause in pairs.copies:
-            again = np.flatnonzero(copied & (pairs.outcome[number] == PENDING))
+        self._enter(
+            frames, each, receiver, receptions.outcome[which], receptions.arrival_ns[which], receptions.cause[which]
+        )
+        for number, copied, later_ns, cause in receptions.copies:
+            again = np.flatnonzero(copied & (receptions.outcome[number] == PENDING))
             if len(again):
                 frame = frames[number]
                 frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
                 each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
-                arrival_ns = pairs.arrival_ns[number, again] + later_ns
+                arrival_ns = receptions.arrival_ns[number, again] + later_ns
                 self._enter([frame], each, again, pending, arrival_ns, np.int16(cause))
 
     def _enter(
@@ -225,21 +227,21 @@ class Engine:
             if number:
                 self._counts[Outcome(kind)] += number
         flying = np.flatnonzero(outcome == PENDING)
-        self._arrivals.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
+        self._in_flight.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
 
     # Arriving.
 
     def next_arrival_ns(self, node: int) -> int | None:
         """When the next frame that has been sent arrives at `node`."""
         self._settle()
-        return self._arrivals.next_ns(node)
+        return self._in_flight.next_ns(node)
 
     def next_time(self) -> int | None:
         """When `advance` must be called next: something arrives, or happens on the air."""
         self._settle()
         # What happens on the air at an instant happens right after it.
-        air_ns = self._access.next_ns()
-        times_ns = (self._arrivals.soonest_ns(), None if air_ns is None else air_ns + 1)
+        air_ns = self._mac.next_ns()
+        times_ns = (self._in_flight.soonest_ns(), None if air_ns is None else air_ns + 1)
         return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
     def look_ahead(self, time_ns: int, nodes: Sequence[int]) -> None:
@@ -263,17 +265,17 @@ class Engine:
     def pending_rows(self) -> list[int]:
         """The rows of the trace whose frames are on their way."""
         self._settle()
-        return self._arrivals.rows()
+        return self._in_flight.rows()
 
     def advance(self, time_ns: int) -> Deliveries:
         """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
-        self._access.run(time_ns)
-        if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._access.sent):
+        self._mac.run(time_ns)
+        if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._mac.sent):
             self._settle()
         return self._arrive(time_ns)
 
     def _arrive(self, time_ns: int) -> Deliveries:
-        table = self._arrivals.take(time_ns)
+        table = self._in_flight.take(time_ns)
         receiver, row = table[1], table[2]
         up = self._topology.up[receiver]
         self._trace.decide(row[up], Outcome.delivered)
@@ -282,7 +284,7 @@ class Engine:
         self._counts[Outcome.delivered] += heard
         self._counts[Outcome.receiver_down] += len(row) - heard
         self._counts[Outcome.pending] -= len(row)
-        return self._arrivals.deliveries(table[:, up], self._trace)
+        return self._in_flight.deliveries(table[:, up], self._trace)
 
     def busy_ratios(self, time_ns: int) -> list[NDArray[np.float64]]:
         """How busy each vehicle found the medium, (N,) each, in all windows that are over by `time_ns`.
@@ -303,7 +305,7 @@ class Engine:
 
     def drain(self) -> None:
         """End of the run: everything in flight arrives, and nobody is woken for it."""
-        self._access.run(None)
+        self._mac.run(None)
         self._settle()
         self._arrive(NEVER_NS - 1)
 

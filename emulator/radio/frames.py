@@ -6,18 +6,16 @@ that happens while it waits or is on air can change its fate, in whatever pieces
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
-
-if TYPE_CHECKING:
-    from emulator.radio.link_faults import LinkEffects
-    from emulator.radio.topology import Surroundings
+from emulator.radio.topology import TopologySnapshot
+from vnet.types import Mask
 
 NO_CAUSE = -1
 NOT_ON_AIR = -1
@@ -27,13 +25,14 @@ NOT_ON_AIR = -1
 class Signal:
     """A frame as it arrives at the receivers, (N,) each; at its own sender, with the power that it was sent with.
 
-    `luck` are words of 64 random bits, of which come the draws that decide about it. `power_mw` is 0 out of range.
+    `random_draws` are words of 64 random bits, which give the draws that decide about it. `power_mw` is 0 out of
+    range.
 
     `locked` is where a receiver has set itself on this frame, or None where nothing kept it from doing so.
     `pieces` are the times until which the sum of all powers on air was so much (N,); none if it was alone.
     """
 
-    luck: NDArray[np.uint64]
+    random_draws: NDArray[np.uint64]
     power_mw: NDArray[np.float64]
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
@@ -47,7 +46,7 @@ class Frame:
     `draw` tells its draws from the original's, and depends only on the fault and on what it sends again. It goes
     under `name`, and `cause` is the number of the fault that sends or changes it.
 
-    `surroundings` and `effects` are those of its handing over. `fate` is what its sender decides (oversize,
+    `topology` and `effects` are those of its handing over. `sender_outcome` is what its sender decides (oversize,
     queue_full, held_back, or pending if it was sent). It was on air from `on_air_ns`, NOT_ON_AIR if nobody knows,
     to `end_ns`. `altered` are the payloads that arrive with other bytes, by receiver.
     """
@@ -56,18 +55,40 @@ class Frame:
     seq: int
     sent_ns: int
     size_bytes: int
-    surroundings: Surroundings
+    topology: TopologySnapshot
     effects: LinkEffects
     copy: int = 0
     draw: int = 0
     payload: bytes = b""
     name: str = ""
     cause: int = NO_CAUSE
-    fate: Outcome = Outcome.pending
+    sender_outcome: Outcome = Outcome.pending
     on_air_ns: int = NOT_ON_AIR
     end_ns: int = 0
     signal: Signal | None = None
     altered: dict[int, bytes] = field(default_factory=dict)
+
+
+class LinkEffects(Protocol):
+    """The effects of link faults on the frames sent while they act."""
+
+    @property
+    def lose(self) -> bool:
+        """Whether any reception may be lost."""
+
+    @property
+    def change(self) -> bool:
+        """Whether a reception may arrive later, more than once, or with other bytes."""
+
+    @property
+    def copy(self) -> bool:
+        """Whether a reception may arrive more than once."""
+
+    def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
+        """Yield, in the order in which faults act, a fault's number and the receivers (N,) that lose the frame."""
+
+    def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
+        """Change the pending receptions of frame number `index`."""
 
 
 class Copied(NamedTuple):
@@ -80,7 +101,7 @@ class Copied(NamedTuple):
 
 
 @dataclass(slots=True)
-class Pairs:
+class Receptions:
     """The pairs of K frames with all N nodes: arrays (K, N), whose columns are receiver numbers.
 
     `outcome` of `Outcome`; `arrival_ns` is when a frame arrives where it does; `cause` is the number of the fault
@@ -95,7 +116,7 @@ class Pairs:
     flips: dict[tuple[int, int], list[tuple[int, int]]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], count: int) -> Pairs:
+    def of(cls, frames: Sequence[Frame], count: int) -> Receptions:
         """The pairs of frames with `count` nodes, nothing decided."""
         shape = len(frames), count
         arrival_ns = np.zeros(shape, np.int64)
@@ -119,5 +140,5 @@ def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
     return np.array([*numbers], np.int64)[:, None]
 
 
-Stage = Callable[[Sequence[Frame], Pairs], None]
+Stage = Callable[[Sequence[Frame], Receptions], None]
 """One step of the channel: decides pairs of frames, or changes when they arrive."""

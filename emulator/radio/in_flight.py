@@ -78,7 +78,7 @@ class Deliveries(Sequence[Delivery]):
         return Delivery(receiver, Packet(frame.name, frame.sent_ns, arrival_ns, payload), row)
 
 
-class Arrivals:
+class InFlight:
     """The pairs in flight between `count` nodes. Rows of the table: arrival, receiver, row of the trace, frame."""
 
     def __init__(self, count: int) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
-from emulator.radio.frames import Copied, Frame, Pairs
-from emulator.radio.mac import Access
+from emulator.radio.frames import Copied, Frame, Receptions
+from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
 from emulator.scenario.faults import BurstLoss, Corrupt, Delay, Duplicate, Jitter, Loss, Range, Reorder, Throttle
 from emulator.scenario.random_streams import Draws
@@ -32,7 +32,7 @@ class _Random:
 
 
 @dataclass(frozen=True)
-class LinkEffects:
+class ActiveLinkFaults:
     """What the faults of one time do to the frames that are handed over in it.
 
     `cut` are links (N, N) that a fault cuts altogether, `short` nodes and the range that a fault leaves them.
@@ -55,52 +55,57 @@ class LinkEffects:
         """Whether anything else may happen on the way."""
         return bool(self.delaying or self.copying or self.corrupting)
 
+    @property
+    def copy(self) -> bool:
+        """Whether a reception may arrive more than once."""
+        return bool(self.copying)
+
     def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
         """By which fault the frame is lost at which receivers (N,), in the order in which they act."""
         for number, cut in self.cut:
             yield number, cut[frame.sender]
         for number, nodes, range_m in self.short:
-            beyond = frame.surroundings.distance_m[frame.sender] > range_m
+            beyond = frame.topology.distance_m[frame.sender] > range_m
             yield number, beyond & (nodes | nodes[frame.sender])
         for one in self.losing:
             yield one.planned.number, _lost(one, frame) & _links(one)[frame.sender]
 
-    def changes(self, frame: Frame, place: int, pairs: Pairs) -> None:
+    def changes(self, frame: Frame, place: int, receptions: Receptions) -> None:
         """Let what is left of frame number `place` arrive later, once more, or with other bytes."""
-        pending = pairs.outcome[place] == PENDING
+        pending = receptions.outcome[place] == PENDING
         count = len(pending)
         for one in self.delaying:
             draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
             later = _links(one)[frame.sender] & pending
-            pairs.arrival_ns[place] += np.where(later, _later_ns(one.planned, draws), 0)
+            receptions.arrival_ns[place] += np.where(later, _later_ns(one.planned, draws), 0)
         for one in self.copying:
             fault = one.planned.fault
             assert isinstance(fault, Duplicate)
             draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
             again = _links(one)[frame.sender] & (draws < fault.probability)
-            pairs.copies += [
+            receptions.copies += [
                 Copied(place, again, round((number + 1) * fault.delay_ms * NS_PER_MS), one.planned.number)
                 for number in range(fault.copies)
             ]
         for one in self.corrupting:
-            _corrupt(one, frame, place, pairs, pending)
+            _corrupt(one, frame, place, receptions, pending)
 
 
 class LinkFaults:
     """The faults of the channel, and their `effects` now. `access` is told whom they throttle."""
 
-    def __init__(self, seed: int, access: Access, count: int) -> None:
+    def __init__(self, seed: int, access: Mac, count: int) -> None:
         self._seed = seed
         self._access = access
         self._count = count
         self._random: dict[int, _Random] = {}
-        self.effects = LinkEffects()
+        self.effects = ActiveLinkFaults()
 
     def update(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """From now on, at `time_ns`, these act and no others."""
         random = {p.number: self._go_on(p) for p in active if p.links is not None}
         self._random = random
-        self.effects = LinkEffects(
+        self.effects = ActiveLinkFaults(
             cut=[(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None],
             short=[(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)],
             losing=_of(random, Loss, BurstLoss),
@@ -154,7 +159,7 @@ def _lost(one: _Random, frame: Frame) -> Mask:
     return np.asarray(draws[1] < np.where(bad, fault.loss_bad, fault.loss_good))
 
 
-def _corrupt(one: _Random, frame: Frame, place: int, pairs: Pairs, pending: Mask) -> None:
+def _corrupt(one: _Random, frame: Frame, place: int, receptions: Receptions, pending: Mask) -> None:
     fault = one.planned.fault
     assert isinstance(fault, Corrupt)
     draws = one.draws.uniform(frame.sender, frame.seq, len(pending), frame.draw)
@@ -165,8 +170,8 @@ def _corrupt(one: _Random, frame: Frame, place: int, pairs: Pairs, pending: Mask
         places = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
         change = rng.integers(1, 256, size=len(places))
         flips = zip(places.tolist(), change.tolist(), strict=True)
-        pairs.flips.setdefault((place, receiver), []).extend(flips)
-        pairs.cause[place, receiver] = one.planned.number
+        receptions.flips.setdefault((place, receiver), []).extend(flips)
+        receptions.cause[place, receiver] = one.planned.number
 
 
 def _links(one: _Random) -> Mask:

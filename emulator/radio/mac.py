@@ -15,7 +15,7 @@ from emulator.scenario.scenario import Radio
 from vnet.units import NS_PER_MS
 
 
-class Access(Protocol):
+class Mac(Protocol):
     """How frames get on air, and when they have left it. `sent` are those that have, since the engine took them.
 
     What happens in between has instants of its own, which wake nobody: `run` does what lies strictly before an
@@ -24,8 +24,8 @@ class Access(Protocol):
 
     sent: list[Frame]
 
-    def hand_over(self, frame: Frame) -> None:
-        """Take a frame that is sent at `frame.sent_ns`, and set its `fate` and `end_ns` in good time."""
+    def enqueue(self, frame: Frame) -> None:
+        """Take a frame that is sent at `frame.sent_ns`, and set its `sender_outcome` and `end_ns` in good time."""
 
     def next_ns(self) -> int | None:
         """When something happens next."""
@@ -90,7 +90,7 @@ class TransmitQueue:
             self._unthrottled[sender] = _Backlog(backlog.starts_ns.copy(), backlog.busy_until_ns)
         self._throttled_mbps = dict(bitrate_mbps)
 
-    def hand_over(self, frame: Frame) -> None:
+    def enqueue(self, frame: Frame) -> None:
         """Decide `queue_full`, or when the frame has left the sender."""
         jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
         bitrate_mbps = self._bitrate_mbps
@@ -100,7 +100,7 @@ class TransmitQueue:
         backlog = self._backlogs.setdefault(frame.sender, _Backlog())
         end_ns = self._put(frame, backlog, jitter_ns, bitrate_mbps)
         if end_ns is None:
-            frame.fate, frame.end_ns = Outcome.queue_full, frame.sent_ns
+            frame.sender_outcome, frame.end_ns = Outcome.queue_full, frame.sent_ns
         else:
             frame.end_ns = end_ns
         self.sent.append(frame)

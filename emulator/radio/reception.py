@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.dot11p import COST_STEPS, PREAMBLE_NS, airtime_ns, cost
-from emulator.radio.frames import Frame, Pairs, Signal
+from emulator.radio.frames import Frame, Receptions, Signal
 from emulator.radio.outcomes import Outcome
 from emulator.radio.signals import Signals, reception_draws
 from emulator.scenario.radio import Receiver
@@ -49,27 +49,27 @@ class Reception:
         self._bitrate_mbps = radio.bitrate_mbps
         self._threshold = Threshold(radio.receiver or Receiver())
 
-    def __call__(self, frames: Sequence[Frame], pairs: Pairs) -> None:
+    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Decide about the frames that were sent."""
-        sent = [place for place, frame in enumerate(frames) if frame.fate == Outcome.pending]
+        sent = [place for place, frame in enumerate(frames) if frame.sender_outcome == Outcome.pending]
         if not sent:
             return
         signals = [self._signal(frames[place]) for place in sent]
         power_mw = np.array([signal.power_mw for signal in signals])
         # A frame arrives if what its time costs is less.
-        limit = -np.log(reception_draws(np.array([signal.luck for signal in signals]))) * COST_STEPS
+        limit = -np.log(reception_draws(np.array([signal.random_draws for signal in signals]))) * COST_STEPS
         on_air_ns = np.array([airtime_ns(frames[place].size_bytes, self._bitrate_mbps) for place in sent])
         heard = power_mw >= self._threshold.alone_mw
         snr = np.where(heard, power_mw / self._threshold.noise_mw, np.inf)
         alone = heard & (self._cost(snr) * (on_air_ns - PREAMBLE_NS)[:, None] < limit)
-        faded, collided = np.zeros_like(pairs.outcome, bool), np.zeros_like(pairs.outcome, bool)
+        faded, collided = np.zeros_like(receptions.outcome, bool), np.zeros_like(receptions.outcome, bool)
         faded[sent] = ~alone
         met = [number for number, signal in enumerate(signals) if signal.pieces]
         if met:
             at = [sent[number] for number in met]
             collided[at] = ~self._survive([frames[place] for place in at], alone[met], limit[met])
-        pairs.decide(faded, Outcome.faded)
-        pairs.decide(collided, Outcome.collided)
+        receptions.decide(faded, Outcome.faded)
+        receptions.decide(collided, Outcome.collided)
 
     def _signal(self, frame: Frame) -> Signal:
         if frame.signal is None:  # nobody has sensed it

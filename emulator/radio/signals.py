@@ -26,20 +26,20 @@ _LATENCY, _RECEPTION = np.uint64(16), np.uint64(32)
 assert QUANTILES == _STEPS
 
 
-def latency_draws(luck: Words) -> Array:
+def latency_draws(random_draws: Words) -> Array:
     """Draws in [0, 1)."""
-    return np.asarray((luck >> _LATENCY & _LAST) / _STEPS)
+    return np.asarray((random_draws >> _LATENCY & _LAST) / _STEPS)
 
 
-def reception_draws(luck: Words) -> Array:
+def reception_draws(random_draws: Words) -> Array:
     """Draws in (0, 1)."""
-    return np.asarray(((luck >> _RECEPTION) + 0.5) / (1 << 32))
+    return np.asarray(((random_draws >> _RECEPTION) + 0.5) / (1 << 32))
 
 
 def sender_draw(frame: Frame, which: int) -> float:
     """One of a sender's draws, in [0, 1)."""
     assert frame.signal is not None
-    return (int(frame.signal.luck[frame.sender]) >> which & _STEPS - 1) / _STEPS
+    return (int(frame.signal.random_draws[frame.sender]) >> which & _STEPS - 1) / _STEPS
 
 
 class Signals:
@@ -52,11 +52,11 @@ class Signals:
 
     def of(self, frame: Frame) -> Signal:
         """The signal of one frame."""
-        luck = self._draws.words(frame.sender, frame.seq, self._count, frame.draw)
-        surroundings, sender = frame.surroundings, frame.sender
-        assert surroundings.power_mw is not None
-        assert surroundings.fading is not None
-        mean_mw = surroundings.power_mw[sender]
-        power_mw = mean_mw * self.nakagami.factor(surroundings.fading[sender], luck & _LAST)
+        random_draws = self._draws.words(frame.sender, frame.seq, self._count, frame.draw)
+        topology, sender = frame.topology, frame.sender
+        assert topology.power_mw is not None
+        assert topology.fading is not None
+        mean_mw = topology.power_mw[sender]
+        power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], random_draws & _LAST)
         power_mw[sender] = mean_mw[sender]
-        return Signal(luck, power_mw)
+        return Signal(random_draws, power_mw)

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.frames import Frame, Pairs
+from emulator.radio.frames import Frame, Receptions
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.signals import latency_draws
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
+from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 MIN_LATENCY_NS = 1_000
@@ -26,44 +27,52 @@ MIN_LATENCY_NS = 1_000
 
 def rows(frames: Sequence[Frame], name: str) -> NDArray[Any]:
     """(K, N): each frame's sender's row of a matrix of its surroundings."""
-    first = frames[0].surroundings
+    first = frames[0].topology
     matrix = getattr(first, name)
-    if all(frame.surroundings is first for frame in frames):
+    if all(frame.topology is first for frame in frames):
         return np.asarray(matrix[[frame.sender for frame in frames]])
-    return np.stack([getattr(frame.surroundings, name)[frame.sender] for frame in frames])
+    return np.stack([getattr(frame.topology, name)[frame.sender] for frame in frames])
 
 
-def in_range(frames: Sequence[Frame], pairs: Pairs) -> None:
+def frame_draws(draws: Draws, frames: Sequence[Frame], count: int) -> Array:
+    """Return the draws of each frame, (K, count), to be indexed by receiver number."""
+    drawn = np.empty((len(frames), count))
+    for index, frame in enumerate(frames):
+        drawn[index] = draws.uniform(frame.sender, frame.seq, count, frame.draw)
+    return drawn
+
+
+def in_range(frames: Sequence[Frame], receptions: Receptions) -> None:
     """Whom a frame cannot reach is `out_of_range`."""
-    pairs.decide(~rows(frames, "in_range"), Outcome.out_of_range)
+    receptions.decide(~rows(frames, "in_range"), Outcome.out_of_range)
 
 
-def sender_side(frames: Sequence[Frame], pairs: Pairs) -> None:
+def sender_side(frames: Sequence[Frame], receptions: Receptions) -> None:
     """A frame that its sender did not send reaches nobody."""
     for place, frame in enumerate(frames):
-        if frame.fate:
-            row = pairs.outcome[place]
-            row[row == PENDING] = frame.fate
+        if frame.sender_outcome:
+            row = receptions.outcome[place]
+            row[row == PENDING] = frame.sender_outcome
 
 
-def peer_cap(frames: Sequence[Frame], pairs: Pairs) -> None:
+def peer_cap(frames: Sequence[Frame], receptions: Receptions) -> None:
     """Each receiver hears its nearest `radio.max_peers` live senders in range, ties by number."""
-    pairs.decide(~rows(frames, "admitted"), Outcome.peer_cap)
+    receptions.decide(~rows(frames, "admitted"), Outcome.peer_cap)
 
 
-def lose_by_faults(frames: Sequence[Frame], pairs: Pairs) -> None:
+def lose_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
     """Decide `fault` where a link was cut, or a fault loses the frame."""
     for place, frame in enumerate(frames):
         if frame.effects.lose:
             for number, lost in frame.effects.losses(frame):
-                pairs.fault(place, lost, number)
+                receptions.fault(place, lost, number)
 
 
-def change_by_faults(frames: Sequence[Frame], pairs: Pairs) -> None:
+def change_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
     """After the latency: what does not lose a pair; later arrivals, copies, other bytes."""
     for place, frame in enumerate(frames):
         if frame.effects.change:
-            frame.effects.changes(frame, place, pairs)
+            frame.effects.changes(frame, place, receptions)
 
 
 class Loss:
@@ -73,10 +82,12 @@ class Loss:
         self._draws = Draws(seed, "loss")
         self._loss = loss
 
-    def __call__(self, frames: Sequence[Frame], pairs: Pairs) -> None:
+    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Decide `lost`."""
         if self._loss > 0:
-            pairs.decide(self._draws.of(frames, pairs.outcome.shape[1]) < self._loss, Outcome.lost)
+            receptions.decide(
+                frame_draws(self._draws, frames, receptions.outcome.shape[1]) < self._loss, Outcome.lost
+            )
 
 
 class Latency:
@@ -88,18 +99,18 @@ class Latency:
         self._jitter_ns = radio.jitter_ms * NS_PER_MS
         self._tick_ns = radio.delivery_tick_us * 1_000
 
-    def __call__(self, frames: Sequence[Frame], pairs: Pairs) -> None:
+    def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Set when each pair arrives."""
-        draws = self._draws_of(frames, pairs.outcome.shape[1])
+        draws = self._draws_of(frames, receptions.outcome.shape[1])
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
-        arrival_ns = pairs.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
+        arrival_ns = receptions.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
-        pairs.arrival_ns = arrival_ns
+        receptions.arrival_ns = arrival_ns
 
     def _draws_of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
         """(K, count), those of the signals where frames have one."""
         if all(frame.signal is None for frame in frames):
-            return self._draws.of(frames, count)
+            return frame_draws(self._draws, frames, count)
         nothing = np.zeros(count, np.uint64)
-        return latency_draws(np.array([nothing if f.signal is None else f.signal.luck for f in frames]))
+        return latency_draws(np.array([nothing if f.signal is None else f.signal.random_draws for f in frames]))

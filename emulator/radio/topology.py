@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.connectivity import Reach, distances_m
+from emulator.radio.connectivity import Connectivity, distances_m
 from emulator.radio.propagation import Nakagami
 from vnet.types import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class TopologySnapshot:
     """How things stand between the vehicles, (N, N) each, rows are senders. Never changed once made.
 
     `in_range` is who is in range of whom, and `admitted` whom the receiver's cap lets in. `power_mw` is the mean
@@ -33,8 +33,10 @@ class Topology:
     Positions are (N, 2) in metres, NaN where a vehicle is not there. Powers are worked out only with `nakagami`.
     """
 
-    def __init__(self, position_m: Array, reach: Reach, max_peers: int, nakagami: Nakagami | None = None) -> None:
-        self._reach = reach
+    def __init__(
+        self, position_m: Array, connectivity: Connectivity, max_peers: int, nakagami: Nakagami | None = None
+    ) -> None:
+        self._connectivity = connectivity
         self._max_peers = max_peers
         self._nakagami = nakagami
         self.up = np.ones(len(position_m), dtype=bool)
@@ -45,13 +47,13 @@ class Topology:
         distance_m = distances_m(position_m)
         power_mw = fading = None
         if self._nakagami is None:
-            in_range = self._reach.in_range(position_m, distance_m)
+            in_range = self._connectivity.in_range(position_m, distance_m)
         else:
-            power_mw = self._reach.power_mw(position_m, distance_m)
+            power_mw = self._connectivity.power_mw(position_m, distance_m)
             in_range = power_mw > 0  # to work the powers out takes longer than all else here: once is enough
             np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
-        self.now = Surroundings(distance_m, in_range, in_range, power_mw, fading)
+        self.now = TopologySnapshot(distance_m, in_range, in_range, power_mw, fading)
         self._rank()
 
     def set_up(self, node: int, up: bool) -> None:

@@ -161,13 +161,13 @@ class Trace:
 
     def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
         """These rows as records of type `ROW`."""
-        pairs = self._pairs.records[which]
-        frames = self._frames.records[pairs["frame"]]
-        rows = np.zeros(len(pairs), ROW)
+        receptions = self._pairs.records[which]
+        frames = self._frames.records[receptions["frame"]]
+        rows = np.zeros(len(receptions), ROW)
         for name in ROW.fields or ():
-            rows[name] = pairs[name] if name in (_PAIR.fields or ()) else frames[name]
+            rows[name] = receptions[name] if name in (_PAIR.fields or ()) else frames[name]
         number = range(self._pairs.count)[which] if isinstance(which, slice) else which
-        for place in np.flatnonzero(pairs["altered"]).tolist():
+        for place in np.flatnonzero(receptions["altered"]).tolist():
             rows["payload_digest"][place] = self._altered[int(number[place])]
         return rows
 

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.connectivity import Reach, distances_m
+from emulator.radio.connectivity import Connectivity, distances_m
 from vnet.types import Array, IntArray, Mask
 
 
 class Places:
     """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
 
-    `reach` says who is in range of whom.
+    `connectivity` says who is in range of whom.
     """
 
-    def __init__(self, position_m: Array, moves: bool, period_ns: int, reach: Reach) -> None:
+    def __init__(self, position_m: Array, moves: bool, period_ns: int, connectivity: Connectivity) -> None:
         self._position_m = position_m
         self._moves = moves
         self._period_ns = period_ns
-        self._reach = reach
+        self._connectivity = connectivity
 
     def index(self, time_ns: IntArray) -> IntArray:
         """Which of the K positions count at these instants."""
@@ -47,11 +47,11 @@ class Places:
 
     def in_range(self, index: int) -> Mask:
         """(N, N), rows are senders: who is in range of whom."""
-        return self._reach.in_range(self.position_m(index), self.distance_m(index))
+        return self._connectivity.in_range(self.position_m(index), self.distance_m(index))
 
     def power_mw(self, index: int) -> Array:
         """(N, N), rows are senders: the mean power of signals, 0 out of range."""
-        return self._reach.power_mw(self.position_m(index), self.distance_m(index))
+        return self._connectivity.power_mw(self.position_m(index), self.distance_m(index))
 
     def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
         """How far the two of each pair (n,) are apart at these instants; NaN where that is not known."""

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from vnet.types import Array, IntArray, Mask
 
 NS_PER_MS = 1e6
@@ -106,41 +106,41 @@ class _Pairs:
     contact: IntArray
 
 
-def radio_metrics(evidence: Evidence, bin_m: float = BIN_M) -> RadioMetrics:
+def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M) -> RadioMetrics:
     """The radio's figures of a run; distances in bins of `bin_m`. Raises VnetError if its files do not fit."""
-    count = len(evidence.node_ids)
-    pairs = _pairs(evidence, count)
+    count = len(recorded.node_ids)
+    pairs = _pairs(recorded, count)
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
-    links = _links_table(evidence.node_ids, codes, count, figures)
-    vehicles = _vehicles_table(evidence, codes, count, figures)
-    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(evidence.busy_ratio)}
+    links = _links_table(recorded.node_ids, codes, count, figures)
+    vehicles = _vehicles_table(recorded, codes, count, figures)
+    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(recorded.busy_ratio)}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
 
-def _pairs(evidence: Evidence, count: int) -> _Pairs:
-    rows = np.flatnonzero((evidence.copy == 0) & ~evidence.outcome_is("receiver_down"))
-    link = evidence.sender[rows] * count + evidence.receiver[rows]
-    if (np.diff(evidence.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
+def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
+    rows = np.flatnonzero((recorded.copy == 0) & ~recorded.outcome_is("receiver_down"))
+    link = recorded.sender[rows] * count + recorded.receiver[rows]
+    if (np.diff(recorded.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
         order = np.argsort(link.astype(np.uint16) if count <= 256 else link, kind="stable")
     else:
-        order = np.lexsort((evidence.seq[rows], link))
+        order = np.lexsort((recorded.seq[rows], link))
     rows, link = rows[order], link[order]
-    seq, sent_ns = evidence.seq[rows], evidence.sent_ns[rows]
+    seq, sent_ns = recorded.seq[rows], recorded.sent_ns[rows]
     breaks = (np.diff(link) != 0) | (np.diff(seq) != 1)
-    if evidence.moves:
-        breaks |= _was_away(evidence, evidence.sender[rows], sent_ns)
-        breaks |= _was_away(evidence, evidence.receiver[rows], sent_ns)
+    if recorded.moves:
+        breaks |= _was_away(recorded, recorded.sender[rows], sent_ns)
+        breaks |= _was_away(recorded, recorded.receiver[rows], sent_ns)
     contact = np.concatenate([[0], np.cumsum(breaks)]) if len(rows) else np.zeros(0, np.int64)
-    distance_m = evidence.places.pair_distances_m(evidence.sender[rows], evidence.receiver[rows], sent_ns)
-    delivered = evidence.outcome_is("delivered")[rows]
-    return _Pairs(link, seq, sent_ns, evidence.arrival_ns[rows], delivered, distance_m, contact)
+    distance_m = recorded.places.pair_distances_m(recorded.sender[rows], recorded.receiver[rows], sent_ns)
+    delivered = recorded.outcome_is("delivered")[rows]
+    return _Pairs(link, seq, sent_ns, recorded.arrival_ns[rows], delivered, distance_m, contact)
 
 
-def _was_away(evidence: Evidence, node: NDArray[np.intp], sent_ns: IntArray) -> Mask:
+def _was_away(recorded: RecordedRun, node: NDArray[np.intp], sent_ns: IntArray) -> Mask:
     """(n - 1,), whether a row's vehicle was not in the network at some time between it and the next."""
-    away = np.cumsum(~evidence.places.present(), axis=0)
-    index = np.minimum(evidence.places.index(sent_ns), len(away) - 1)
+    away = np.cumsum(~recorded.places.present(), axis=0)
+    index = np.minimum(recorded.places.index(sent_ns), len(away) - 1)
     return np.asarray(away[index[1:], node[1:]] != away[index[:-1], node[1:]])
 
 
@@ -238,7 +238,9 @@ def _links_table(node_ids: list[str], codes: NDArray[np.intp], count: int, figur
     return pa.table(columns | {name: _column(values) for name, values in figures.items()}).cast(LINKS)
 
 
-def _vehicles_table(evidence: Evidence, codes: NDArray[np.intp], count: int, figures: dict[str, Array]) -> pa.Table:
+def _vehicles_table(
+    recorded: RecordedRun, codes: NDArray[np.intp], count: int, figures: dict[str, Array]
+) -> pa.Table:
     sender, receiver = divmod(codes, max(count, 1))
 
     def over(end: NDArray[np.intp], name: str) -> Array:
@@ -249,10 +251,10 @@ def _vehicles_table(evidence: Evidence, codes: NDArray[np.intp], count: int, fig
         total = np.bincount(receiver[known], figures[name][known], count)
         return _ratio(total, np.bincount(receiver[known], minlength=count).astype(float))
 
-    original = evidence.copy == 0
-    frames = np.unique(evidence.frame[original], return_index=True)[1]
+    original = recorded.copy == 0
+    frames = np.unique(recorded.frame[original], return_index=True)[1]
     columns = {
-        "frames": np.bincount(evidence.sender[original][frames], minlength=count),
+        "frames": np.bincount(recorded.sender[original][frames], minlength=count),
         "sent_pairs": over(sender, "pairs"),
         "sent_delivery_ratio": _ratio(over(sender, "delivered"), over(sender, "pairs")),
         "heard_pairs": over(receiver, "pairs"),
@@ -260,9 +262,9 @@ def _vehicles_table(evidence: Evidence, codes: NDArray[np.intp], count: int, fig
         "heard_vehicles": np.bincount(receiver[figures["delivered"] > 0], minlength=count),
         **{name: mean(name) for name in ("latency_mean_ms", "inter_reception_mean_ms", "age_mean_ms")},
     }
-    busy = evidence.busy_ratio
+    busy = recorded.busy_ratio
     columns["busy_ratio_mean"] = busy.mean(axis=0) if len(busy) else np.full(count, np.nan)
-    named = {"node": pa.array(evidence.node_ids, pa.string())}
+    named = {"node": pa.array(recorded.node_ids, pa.string())}
     return pa.table(named | {name: _column(values) for name, values in columns.items()}).cast(VEHICLES)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import reach_of
+from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
 from emulator.records.busy import busy_windows
 from emulator.records.positions import Places
@@ -54,7 +54,7 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class RecordedRun:
     """The scenario, the three tables, and the events."""
 
     scenario: Scenario
@@ -95,10 +95,10 @@ class Evidence:
     def places(self) -> Places:
         """Where the vehicles were. Raises ScenarioError if the scenario's links do not fit them."""
         radio = self.scenario.radio
-        reach = reach_of(radio, self.scenario.run.seed, load_links(radio, len(self.node_ids)))
+        connectivity = connectivity_of(radio, self.scenario.run.seed, load_links(radio, len(self.node_ids)))
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
-        return Places(some, self.moves, self.scenario.period_ns, reach)
+        return Places(some, self.moves, self.scenario.period_ns, connectivity)
 
     @cached_property
     def busy_ratio(self) -> Array:
@@ -385,18 +385,18 @@ class Evidence:
                 struck[period] = planned.placed(period * self.scenario.period_ns).nodes
         return np.asarray(struck)
 
-    def reach(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
+    def connectivity(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
         """The links (N, N), rows are senders, whose rows may name a fault, and from when until when."""
         if not self.moves or not isinstance(planned.fault, FOLLOWING):
-            yield from self._reach(planned)
+            yield from self._connectivity(planned)
             return
         period_ns = self.scenario.period_ns
         for period in range(planned.start_ns // period_ns, min(-(-planned.end_ns // period_ns), self.periods)):
             start_ns = max(planned.start_ns, period * period_ns)
-            for _, _, links in self._reach(planned.placed(start_ns), period):
+            for _, _, links in self._connectivity(planned.placed(start_ns), period):
                 yield start_ns, min(planned.end_ns, (period + 1) * period_ns), links
 
-    def _reach(self, planned: PlannedFault, period: int = 0) -> Iterator[tuple[int, int, Mask]]:
+    def _connectivity(self, planned: PlannedFault, period: int = 0) -> Iterator[tuple[int, int, Mask]]:
         """The same, for a fault that acts on the same nodes all the time, with the distances of a period."""
         fault, start_ns, end_ns = planned.fault, planned.start_ns, planned.end_ns
         if planned.links is not None:
@@ -421,7 +421,7 @@ class Evidence:
     def _reached(self, planned: PlannedFault, later_ns: int) -> Mask:
         """The same, as if every row had been sent so much later."""
         reached = np.zeros(len(self.trace), dtype=bool)
-        for start_ns, end_ns, links in self.reach(planned):
+        for start_ns, end_ns, links in self.connectivity(planned):
             rows = self.sent_between(start_ns - later_ns, end_ns - later_ns)
             reached[rows] |= links[self.sender[rows], self.receiver[rows]]
         return reached

@@ -40,7 +40,7 @@ class Comparison:
             check_is_run(folder)
         sources = Source(first), Source(second)
         for source in sources:
-            _ = source.record, source.scenario, source.evidence
+            _ = source.record, source.scenario, source.recorded
         return cls(*sources, _told(compare_folders(first, second)))
 
     @property

@@ -223,7 +223,7 @@ def outcomes(source: Source) -> Drawing:
 
 def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
     """Names of outcomes, and each row's number among them and when it was decided, in seconds."""
-    trace = source.evidence.trace
+    trace = source.recorded.trace
     if not len(trace):
         raise VnetError("no frame was sent to anybody in range")
     column = trace["outcome"].combine_chunks()
@@ -249,7 +249,7 @@ def busy(source: Source) -> Drawing:
 
 
 def totals(source: Source) -> Drawing:
-    trace = source.evidence.trace
+    trace = source.recorded.trace
     if not len(trace):
         raise VnetError("no frame was sent to anybody in range")
     bars = _bars(trace)
@@ -283,20 +283,20 @@ def _bars(trace: pa.Table) -> list[tuple[str, str, int]]:
 
 
 def links(source: Source) -> Drawing:
-    evidence = source.evidence
-    count = len(evidence.node_ids)
-    if not len(evidence.trace):
+    recorded = source.recorded
+    count = len(recorded.node_ids)
+    if not len(recorded.trace):
         raise VnetError("no frame was sent to anybody in range")
-    link = evidence.sender * count + evidence.receiver
+    link = recorded.sender * count + recorded.receiver
     rows = np.bincount(link, minlength=count * count)
     used = np.flatnonzero(rows)
-    delivered = np.bincount(link, weights=evidence.outcome_is("delivered"), minlength=count * count)
+    delivered = np.bincount(link, weights=recorded.outcome_is("delivered"), minlength=count * count)
     share = 100 * delivered[used] / rows[used]
-    apart_m = evidence.places.pair_distances_m(evidence.sender, evidence.receiver, evidence.sent_ns)
+    apart_m = recorded.places.pair_distances_m(recorded.sender, recorded.receiver, recorded.sent_ns)
     known = np.isfinite(apart_m)
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
-    physical, binned = source.scenario.radio.is_physical, evidence.moves or source.scenario.radio.is_physical
+    physical, binned = source.scenario.radio.is_physical, recorded.moves or source.scenario.radio.is_physical
     labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
     made = canvas("distance (km)", "delivered (%)", legend_rows=int(np.ceil(labels / 3)))
     if len(used) <= MOST_LINKS:
@@ -381,17 +381,17 @@ def _draw_frames(made: Canvas, bins: pa.Table) -> float:
 
 
 def _why_less(source: Source) -> str:
-    names = [name for name in ("peer_cap", "fault", "receiver_down") if source.evidence.outcome_is(name).any()]
+    names = [name for name in ("peer_cap", "fault", "receiver_down") if source.recorded.outcome_is(name).any()]
     return f" Links below it met {', '.join(names)} as well." if names else ""
 
 
 def latencies_ms(source: Source) -> Array:
     """(k,) from sending to arrival of each delivery. Raises VnetError if there is none."""
-    evidence = source.evidence
-    delivered = evidence.outcome_is("delivered")
+    recorded = source.recorded
+    delivered = recorded.outcome_is("delivered")
     if not delivered.any():
         raise VnetError("nothing was delivered")
-    return np.asarray((evidence.arrival_ns[delivered] - evidence.sent_ns[delivered]) / 1e6)
+    return np.asarray((recorded.arrival_ns[delivered] - recorded.sent_ns[delivered]) / 1e6)
 
 
 def latency(source: Source) -> Drawing:
@@ -412,10 +412,10 @@ def latency(source: Source) -> Drawing:
 
 
 def degrees(source: Source) -> Drawing:
-    evidence = source.evidence
-    if not evidence.node_ids:
+    recorded = source.recorded
+    if not recorded.node_ids:
         raise VnetError("no period was completed, so nobody's position is known")
-    degree = evidence.places.mean_senders_in_range()
+    degree = recorded.places.mean_senders_in_range()
     step = int(np.ceil((degree.max() + 1) / 40))
     edges = np.arange(0, degree.max() + step + 1, step) - 0.5
     counts, _ = np.histogram(degree, edges)
@@ -433,17 +433,17 @@ def degrees(source: Source) -> Drawing:
     how = f"within {radio.range_m / 1000:g} km" if radio.links is None else "by the scenario's links"
     if radio.path_loss is not None:
         how = f"with {radio.path_loss.floor_dbm:g} dBm or more on average"
-    if evidence.moves:
+    if recorded.moves:
         return Drawing(
             made, f"How many vehicles each can hear, {how}, in the mean over the time in which it is there."
         )
-    parts = int(components(evidence.places.position_m(0), radio.range_m, evidence.places.in_range(0)).max()) + 1
+    parts = int(components(recorded.places.position_m(0), radio.range_m, recorded.places.in_range(0)).max()) + 1
     network = "one connected network" if parts == 1 else f"{parts} networks that do not hear each other"
     return Drawing(made, f"How many vehicles each can hear, {how}: {network}.")
 
 
 def weights(source: Source) -> Drawing:
-    ids = source.evidence.node_ids
+    ids = source.recorded.node_ids
     matrix = mean_weights(source)
     if len(ids) > MOST_IN_MATRIX:
         raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
@@ -482,18 +482,18 @@ def mean_weights(source: Source) -> Array:
 
     Raises VnetError if nobody reported any.
     """
-    evidence = source.evidence
-    count = len(evidence.node_ids)
-    lists = evidence.states["values"].combine_chunks().cast(pa.list_(_PAIR))
+    recorded = source.recorded
+    count = len(recorded.node_ids)
+    lists = recorded.states["values"].combine_chunks().cast(pa.list_(_PAIR))
     row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
     key, value = pair.field("key"), pair.field("value")
     single = pc.and_(pc.starts_with(key, _WEIGHT), pc.equal(pc.list_value_length(value), 1))
     chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
     names = key.take(pa.array(chosen)).dictionary_encode()
-    numbers = [evidence.number.get(name.removeprefix(_WEIGHT), -1) for name in names.dictionary.to_pylist()]
+    numbers = [recorded.number.get(name.removeprefix(_WEIGHT), -1) for name in names.dictionary.to_pylist()]
     of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
     weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
-    node = np.array([evidence.number[node] for node in evidence.states["node"].to_pylist()], dtype=np.intp)
+    node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
     at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
     if not fits.any():
         raise VnetError("no program reported any (as values named weight.ID)")

@@ -18,7 +18,7 @@ from emulator.pages.canvas import Span
 from emulator.records.busy import busy_windows, read_busy
 from emulator.records.metrics import STATES as ALL_STATES
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import Event, read_events
 from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.scenario import Scenario
@@ -108,24 +108,24 @@ class Source:
         """(windows, N), how busy each vehicle found the medium. Raises VnetError if senders share none."""
         if self.scenario.radio.mac is None:
             raise VnetError("senders share no medium ([radio.mac])")
-        windows = busy_windows(read_busy(self.folder), self.evidence.node_ids)
+        windows = busy_windows(read_busy(self.folder), self.recorded.node_ids)
         if not len(windows):
             raise VnetError("the run was over within the first window")
         return windows
 
     @cached_property
-    def evidence(self) -> Evidence:
+    def recorded(self) -> RecordedRun:
         """The tables, so far as reports need them, as arrays."""
         on_air = {} if self.scenario.radio.mac is None else ON_AIR
         trace, states = self._table("trace", TRACE | on_air), self._table("states", STATES)
         busy = maybe(lambda: read_busy(self.folder)) if on_air else None
         not_needed = pa.table({})  # the metrics: what can be drawn without them is drawn
-        return Evidence(self.scenario, trace, states, not_needed, self.events, busy=busy)
+        return RecordedRun(self.scenario, trace, states, not_needed, self.events, busy=busy)
 
     @cached_property
     def radio(self) -> RadioMetrics:
         """The radio in figures."""
-        return radio_metrics(self.evidence)
+        return radio_metrics(self.recorded)
 
     @cached_property
     def metrics(self) -> pa.Table:

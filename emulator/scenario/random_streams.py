@@ -8,14 +8,9 @@ counter is the frame. So arrival order cannot matter, and one more vehicle chang
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from emulator.radio.frames import Frame
 
 
 class Draws:
@@ -44,10 +39,3 @@ class Draws:
         counter = self._counter
         counter[0], counter[1], counter[2], counter[3] = 0, seq, sender, copy
         self._bits.state = self._state
-
-    def of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
-        """(K, count): the draws of each frame."""
-        draws = np.empty((len(frames), count))
-        for place, frame in enumerate(frames):
-            draws[place] = self.uniform(frame.sender, frame.seq, count, frame.draw)
-        return draws

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.connectivity import distances_m, reach_of
+from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
 from emulator.records.metrics import PeriodFigures, collect
@@ -61,7 +61,7 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
     """
     start = world.at(0)
     radio = scenario.radio
-    reach = reach_of(radio, scenario.run.seed, world.links)
+    reach = connectivity_of(radio, scenario.run.seed, world.links)
     in_range = reach.in_range(start.position_m, distances_m(start.position_m))
     label = components(start.position_m, radio.range_m, in_range)
     return {

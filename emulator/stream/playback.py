@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from emulator.records.busy import busy_windows, mean_busy, read_busy
 from emulator.records.metrics import PeriodFigures
-from emulator.records.recorded_run import Evidence
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import Event, check_is_run, read_events
 from emulator.records.run_tables import StatesReader, TableFile, TraceReader
 from emulator.scenario.scenario import Scenario, load_scenario
@@ -73,14 +73,14 @@ class _Playback:
         # Who was up, and which faults there are, is told by the events and the positions.
         nothing = pa.table({})
         course_m = self.world.course_m if self.world.moves else None
-        evidence = Evidence(self.scenario, nothing, self.states.first(), nothing, self.events, course_m)
-        down = _Down(evidence)
+        recorded = RecordedRun(self.scenario, nothing, self.states.first(), nothing, self.events, course_m)
+        down = _Down(recorded)
         states = self.states.periods()
         for figures, happened in zip(self.figures, events, strict=False):
             if (state := next(states, None)) is None:
                 raise self._misfit("fewer")
             start_ns, end_ns = figures.time_ns, figures.time_ns + self.world.period_ns
-            faults = [planned.label for planned in evidence.plan if planned.acts_between(start_ns, end_ns)]
+            faults = [planned.label for planned in recorded.plan if planned.acts_between(start_ns, end_ns)]
             up = ~down.at(end_ns - 1)
             rows = self.trace.until(end_ns)
             instant, beliefs = state
@@ -99,11 +99,11 @@ class _Playback:
 class _Down:
     """Who was down when."""
 
-    def __init__(self, evidence: Evidence) -> None:
-        self._count = len(evidence.node_ids)
-        self._node = np.array([span.node for span in evidence.down], dtype=np.intp)
-        self._start_ns = np.array([span.start_ns for span in evidence.down], dtype=np.int64)
-        self._end_ns = np.array([span.end_ns for span in evidence.down], dtype=np.int64)
+    def __init__(self, recorded: RecordedRun) -> None:
+        self._count = len(recorded.node_ids)
+        self._node = np.array([span.node for span in recorded.down], dtype=np.intp)
+        self._start_ns = np.array([span.start_ns for span in recorded.down], dtype=np.int64)
+        self._end_ns = np.array([span.end_ns for span in recorded.down], dtype=np.int64)
 
     def at(self, time_ns: int) -> NDArray[np.bool_]:
         """Who was down at an instant (n,)."""

@@ -30,9 +30,9 @@ from emulator.records.run_folder import RUNS
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.schedules import WEIGHTS, Ground, draw_fault, known_kinds
+from emulator.testing.schedules import WEIGHTS, ScheduleConstraints, draw_fault, known_kinds
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
-from emulator.testing.trial import Trial, Workshop
+from emulator.testing.trial import Trial, TrialPool
 from vnet.errors import ScenarioError, VnetError
 from vnet.runtime.host import load_program
 
@@ -66,7 +66,7 @@ class Plan:
             )
         kinds = known_kinds(None if faults == "random" else faults.split(","))
         plain = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()})
-        Ground.of(plain)
+        ScheduleConstraints.of(plain)
         load_program(plain.program.entry)
         return cls(plain, runs, seed, kinds, **options)
 
@@ -77,9 +77,9 @@ class Plan:
         if self.scenario.network.kind == "generated":
             changes["network.seed"] = seed
         scenario = make_scenario(self.scenario, changes)
-        choose, ground = _Random(seed), Ground.of(scenario)
+        choose, ground = _Random(seed), ScheduleConstraints.of(scenario)
         weighted = [kind for kind in self.kinds for _ in range(WEIGHTS.get(kind, 1))]
-        faults = [draw_fault(choose, ground, weighted) for _ in range(choose.whole(1, MOST_FAULTS))]
+        faults = [draw_fault(choose, ground, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
         return make_scenario(scenario, {"faults": faults})
 
 
@@ -89,14 +89,14 @@ class _Random:
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
 
-    def whole(self, low: int, high: int) -> int:
+    def integer(self, low: int, high: int) -> int:
         return int(self._rng.integers(low, high, endpoint=True))
 
-    def one(self, items: Sequence[T]) -> T:
-        return items[self.whole(0, len(items) - 1)]
+    def choice(self, items: Sequence[T]) -> T:
+        return items[self.integer(0, len(items) - 1)]
 
-    def some(self, items: Sequence[T], most: int) -> list[T]:
-        chosen = self._rng.permutation(len(items))[: self.whole(1, most)]
+    def subset(self, items: Sequence[T], most: int) -> list[T]:
+        chosen = self._rng.permutation(len(items))[: self.integer(1, most)]
         return [items[number] for number in sorted(chosen.tolist())]
 
 
@@ -175,7 +175,7 @@ class Campaign:
         self._progress = progress
         self._lock = threading.Lock()
         self._numbers = count(1)
-        self._workshop = Workshop(plan.limit_s, [plan.scenario.program.entry.partition(":")[0]])
+        self._workshop = TrialPool(plan.limit_s, [plan.scenario.program.entry.partition(":")[0]])
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 

@@ -31,25 +31,25 @@ AT_STEPS, DURATION_STEPS = 100, 10
 class Chooser(Protocol):
     """Whoever makes the choices."""
 
-    def whole(self, low: int, high: int) -> int:
+    def integer(self, low: int, high: int) -> int:
         """A whole number, low ≤ n ≤ high."""
 
-    def one(self, items: Sequence[T]) -> T:
+    def choice(self, items: Sequence[T]) -> T:
         """One of these."""
 
-    def some(self, items: Sequence[T], most: int) -> list[T]:
+    def subset(self, items: Sequence[T], most: int) -> list[T]:
         """At least one of these, and so many at most."""
 
 
 @dataclass(frozen=True)
-class Ground:
+class ScheduleConstraints:
     """What schedules must fit: the vehicles by process, and when all faults must have healed."""
 
     processes: tuple[tuple[str, ...], ...]
     healed_s: float
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Ground:
+    def of(cls, scenario: Scenario) -> ScheduleConstraints:
         """The ground of a scenario. Raises ScenarioError if there is no time for faults."""
         if scenario.healed_s * DURATION_STEPS < 1:
             raise ScenarioError(
@@ -74,12 +74,12 @@ def known_kinds(kinds: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(kinds) if kinds else SIMULATED_KINDS
 
 
-def draw_fault(choose: Chooser, ground: Ground, kinds: Sequence[str]) -> Fault:
+def draw_fault(choose: Chooser, ground: ScheduleConstraints, kinds: Sequence[str]) -> Fault:
     """A fault of one of these kinds."""
-    kind = choose.one(kinds)
+    kind = choose.choice(kinds)
     last = round(ground.healed_s * AT_STEPS) - AT_STEPS // DURATION_STEPS
-    at_s = choose.whole(0, last) / AT_STEPS
-    duration_s = choose.whole(1, int((ground.healed_s - at_s) * DURATION_STEPS + 1e-6)) / DURATION_STEPS
+    at_s = choose.integer(0, last) / AT_STEPS
+    duration_s = choose.integer(1, int((ground.healed_s - at_s) * DURATION_STEPS + 1e-6)) / DURATION_STEPS
     what = {"kind": kind, "at_s": at_s, "duration_s": duration_s}
     return parse_fault(what | _where(choose, ground, kind) | _parameters(choose, kind))
 
@@ -88,17 +88,17 @@ def _half(count: int) -> int:
     return max(1, count // 2)
 
 
-def _where(choose: Chooser, ground: Ground, kind: str) -> dict[str, Any]:
+def _where(choose: Chooser, ground: ScheduleConstraints, kind: str) -> dict[str, Any]:
     if kind == "partition":
-        shape = choose.one(("named", "halves", "one", "ring"))
+        shape = choose.choice(("named", "halves", "one", "ring"))
         ids = ground.ids
-        return {"groups": [choose.some(ids, _half(len(ids)))] if shape == "named" else shape}
+        return {"groups": [choose.subset(ids, _half(len(ids)))] if shape == "named" else shape}
     if kind in OF_PROCESSES:
-        chosen = choose.some(ground.processes, _half(len(ground.processes)))
+        chosen = choose.subset(ground.processes, _half(len(ground.processes)))
         return {"nodes": {"ids": [node for process in chosen for node in process]}}
-    ids = choose.some(ground.ids, _half(len(ground.ids)))
+    ids = choose.subset(ground.ids, _half(len(ground.ids)))
     ends = ("nodes", "senders", "receivers") if kind in OF_LINKS else ("nodes",)
-    return {choose.one(ends): {"ids": ids}}
+    return {choose.choice(ends): {"ids": ids}}
 
 
 OF_LINKS = ("block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplicate", "corrupt")
@@ -106,45 +106,45 @@ OF_LINKS = ("block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplic
 
 def _parameters(choose: Chooser, kind: str) -> dict[str, Any]:
     def point(most: int) -> tuple[float, float]:
-        return float(choose.whole(-most, most)), float(choose.whole(-most, most))
+        return float(choose.integer(-most, most)), float(choose.integer(-most, most))
 
     def share(most_tenths: int) -> float:
-        return choose.whole(1, most_tenths) / 10
+        return choose.integer(1, most_tenths) / 10
 
     match kind:
         case "loss":
             return {"probability": share(10)}
         case "burst_loss":
-            return {"enter": choose.whole(1, 30) / 100, "leave": share(10)}
+            return {"enter": choose.integer(1, 30) / 100, "leave": share(10)}
         case "delay":
-            return {"delay_ms": choose.whole(1, 500)}
+            return {"delay_ms": choose.integer(1, 500)}
         case "jitter":
-            return {"jitter_ms": choose.whole(1, 300)}
+            return {"jitter_ms": choose.integer(1, 300)}
         case "reorder":
-            return {"probability": share(5), "delay_ms": choose.whole(1, 400)}
+            return {"probability": share(5), "delay_ms": choose.integer(1, 400)}
         case "duplicate":
-            return {"probability": share(5), "copies": choose.whole(1, 3), "delay_ms": choose.whole(1, 100)}
+            return {"probability": share(5), "copies": choose.integer(1, 3), "delay_ms": choose.integer(1, 100)}
         case "corrupt":
-            return {"probability": share(5), "flips": choose.whole(1, 8)}
+            return {"probability": share(5), "flips": choose.integer(1, 8)}
         case "throttle":
-            return {"bitrate_mbps": choose.whole(1, 40) / 20}
+            return {"bitrate_mbps": choose.integer(1, 40) / 20}
         case "range":
-            return {"range_m": 100 * choose.whole(1, 20)}
+            return {"range_m": 100 * choose.integer(1, 20)}
         case "gnss_jump" | "ConstPosOffset":
             return {"offset_m": point(50)}
         case "gnss_ramp":
             return {"rate_m_s": point(3)}
         case "RandomPos":
-            return {"radius_m": choose.whole(1, 300)}
+            return {"radius_m": choose.integer(1, 300)}
         case "skew":
-            return {"offset_ms": choose.whole(-1000, 1000)}
+            return {"offset_ms": choose.integer(-1000, 1000)}
         case "drift":
-            return {"rate_ppm": 100 * choose.whole(-500, 500)}
+            return {"rate_ppm": 100 * choose.integer(-500, 500)}
         case "DataReplay" | "StaleMessages":
-            return {"age_s": choose.whole(1, 30) / 10}
+            return {"age_s": choose.integer(1, 30) / 10}
         case "DoS":
-            return {"factor": choose.whole(2, 10)}
+            return {"factor": choose.integer(2, 10)}
         case "Sybil":
-            return {"ghosts": choose.whole(1, 3)}
+            return {"ghosts": choose.integer(1, 3)}
         case _:
             return {}

@@ -99,7 +99,7 @@ class SteppedLiveRun(SteppedRun):
         self._loop.call_soon_threadsafe(self._next.set_result, horizon_ns)
 
     def _drive(self) -> None:
-        asyncio.run(run_live(self.emulation, self._options, gate=self._gate))
+        asyncio.run(run_live(self.emulation, self._options, before_horizon=self._gate))
 
     async def _gate(self, lockstep: Lockstep) -> None:
         self._loop = asyncio.get_running_loop()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from emulator.scenario.faults import Fault
 from emulator.testing.scenarios import Source, make_scenario
-from emulator.testing.schedules import Ground, draw_fault, known_kinds
+from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
 
 T = TypeVar("T")
 
@@ -25,14 +25,14 @@ class _Drawn:
     def __init__(self, draw: st.DrawFn) -> None:
         self._draw = draw
 
-    def whole(self, low: int, high: int) -> int:
+    def integer(self, low: int, high: int) -> int:
         return self._draw(st.integers(low, high))
 
-    def one(self, items: Sequence[T]) -> T:
+    def choice(self, items: Sequence[T]) -> T:
         return self._draw(st.sampled_from(items))
 
-    def some(self, items: Sequence[T], most: int) -> list[T]:
-        chosen = {self.whole(0, len(items) - 1) for _ in range(self.whole(1, most))}
+    def subset(self, items: Sequence[T], most: int) -> list[T]:
+        chosen = {self.integer(0, len(items) - 1) for _ in range(self.integer(1, most))}
         return [items[number] for number in sorted(chosen)]
 
 
@@ -47,8 +47,8 @@ def faults(
     allowed = known_kinds(kinds)
 
     @cache
-    def ground() -> Ground:
-        return Ground.of(make_scenario(scenario, changes))
+    def ground() -> ScheduleConstraints:
+        return ScheduleConstraints.of(make_scenario(scenario, changes))
 
     @st.composite
     def fault(draw: st.DrawFn) -> Fault:

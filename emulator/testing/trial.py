@@ -86,7 +86,7 @@ def _greatest(emulation: Emulation) -> float:
 
 
 @dataclass
-class Workshop:
+class TrialPool:
     """Runs trials in processes of their own, forked from a server that has imported everything, `limit_s` each.
 
     May be used from several threads at once. `close` ends all that are left.

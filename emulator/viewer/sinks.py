@@ -76,7 +76,7 @@ class ServeAt:
         host = "*" if ipaddress.ip_address(self.address).is_unspecified else self.host
         return f"http://{host}:{self.web_port}"
 
-    def told(self) -> str:
+    def announcement(self) -> str:
         """Both addresses, for people; with a warning where others than this machine can reach them."""
         text = f"viewer: rerun --connect {self.url}\nbrowser: {self.web_url}"
         if not ipaddress.ip_address(self.address).is_loopback:

@@ -24,7 +24,7 @@ from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from vnet.errors import WireError
 from vnet.transport import keys, wire
-from vnet.transport.access import Credentials
+from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import DEFAULT_SLICE, set_time_slice
 from vnet.transport.session import open_client
 
@@ -95,7 +95,7 @@ class Inbox:
 def record_run(endpoint: str, run: str, credentials: Credentials | None, sinks: Sinks) -> None:
     """Record `run` into `sinks` until its end; see the module's text.
 
-    Raises LinkError if there is no router at `endpoint` or it refuses, VnetError if the file cannot be written.
+    Raises TransportError if no router at `endpoint` accepts, VnetError if the file cannot be written.
     """
     inbox = Inbox()
 

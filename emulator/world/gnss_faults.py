@@ -22,12 +22,12 @@ from emulator.scenario.faults import (
 )
 from emulator.world.world import Instant, World
 from vnet.node import Fix
-from vnet.transport.wire import ClockBend
+from vnet.transport.wire import ClockError
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
 
-class BentGnss:
+class FaultyGnss:
     """The fixes of a run as the receivers give them: the world's, and what faults make of them."""
 
     def __init__(self, world: World, faults: Sequence[PlannedFault], seed: int) -> None:
@@ -90,7 +90,7 @@ class BentGnss:
                 return position_m
 
 
-def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockBend:
+def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockError:
     """How the clock of a vehicle goes at `time_ns`: skews add up; drifts multiply, so that it never stands."""
     acting = [planned for planned in faults if planned.acts_at(time_ns) and planned.nodes[number]]
     offset_ns = sum(p.fault.offset_ms * 1e6 for p in acting if isinstance(p.fault, Skew))
@@ -99,4 +99,4 @@ def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: in
     for start_ns, rate in [*sorted(drifts), (time_ns, 0.0)]:
         offset_ns += (pace - 1) * (start_ns - since_ns)
         pace, since_ns = pace * (1 + rate), start_ns
-    return ClockBend(node, time_ns, round(offset_ns), pace - 1)
+    return ClockError(node, time_ns, round(offset_ns), pace - 1)

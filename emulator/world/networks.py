@@ -204,7 +204,7 @@ class _Town:
         vehicle = int(rng.integers(len(self.position_m)))
         step_m = REFERENCE_RANGE_M * (0.1, 0.4, 1.2)[int(rng.integers(3))]
         new_m = self.position_m[vehicle] + step_m * rng.normal(size=2)
-        luck = rng.random()
+        random_draw = rng.random()
         if np.any(new_m < self._low_m[vehicle]) or np.any(new_m > self._high_m[vehicle]):
             return
         old_m, old_links = self.position_m[vehicle].copy(), self.linked[vehicle].copy()
@@ -216,7 +216,7 @@ class _Town:
         self.position_m[vehicle] = new_m
         self.linked[vehicle] = self.linked[:, vehicle] = links
         cost = self._cost(degree)
-        if cost > self.cost and luck >= math.exp((self.cost - cost) / max(temperature, 1e-9)):
+        if cost > self.cost and random_draw >= math.exp((self.cost - cost) / max(temperature, 1e-9)):
             self.position_m[vehicle] = old_m
             self.linked[vehicle] = self.linked[:, vehicle] = old_links
         else:

@@ -26,9 +26,9 @@ reals = st.floats(allow_nan=False, allow_infinity=False)
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 2**32), st.tuples(reals, reals, reals), names, names)
 def test_a_frame_comes_back_as_it_was(
-    epoch: int, total: tuple[float, float, float], takers: frozenset[str], heard: frozenset[str]
+    epoch: int, total: tuple[float, float, float], out_neighbours: frozenset[str], heard: frozenset[str]
 ) -> None:
-    share = Share(epoch, total, takers, heard)
+    share = Share(epoch, total, out_neighbours, heard)
     assert decode(encode(share)) == share
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison
 from benchmarks.ns3.figure import draw
-from benchmarks.ns3.ground import RATE_HZ, Curve, Ground, Outcome
+from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
 from benchmarks.ns3.simulators import ours
 from tests.support.paths import ROOT
 
@@ -26,7 +26,7 @@ def curve(pairs: list[int], share: list[float]) -> Curve:
 @pytest.mark.parametrize("fading", [False, True])
 def test_delivery_by_distance_and_the_busy_ratio_are_those_of_ns3(fading: bool, tmp_path: Path) -> None:
     recorded = next(one for one in RECORDED if one["vehicles"] == 50 and one["fading"] == fading)
-    ground = Ground.of(50, SECONDS)
+    ground = ScheduleConstraints.of(50, SECONDS)
     outcome = ours(ground, fading)
     ours_now = Curve.of(ground, outcome)
     theirs = curve(recorded["pairs"], recorded["delivered_ns3"])
@@ -56,7 +56,7 @@ def test_a_comparison_holds_only_within_its_limits_and_where_there_are_enough_pa
 
 
 def test_the_ground_is_the_same_for_both_simulators() -> None:
-    ground = Ground.of(7, 2.0)
+    ground = ScheduleConstraints.of(7, 2.0)
     assert ground.sent.tolist() == [2 * RATE_HZ] * 7
     assert (np.diff(ground.time_ns) >= 0).all()
     lines = ground.text().splitlines()
@@ -68,7 +68,7 @@ def test_the_ground_is_the_same_for_both_simulators() -> None:
 
 
 def test_a_curve_counts_every_pair_at_its_distance() -> None:
-    ground = Ground(np.array([0.0, 60.0, 70.0]), np.array([5, 6, 7]), np.array([0, 0, 1]), 1.0)
+    ground = ScheduleConstraints(np.array([0.0, 60.0, 70.0]), np.array([5, 6, 7]), np.array([0, 0, 1]), 1.0)
     received = np.array([[0, 2, 1], [0, 0, 1], [0, 0, 0]])
     found = Curve.of(ground, Outcome(received, np.zeros(3), 1.0, 1.0))
     assert found.pairs[:3].tolist() == [1, 5, 0], "0 → 1 and 0 → 2 twice each, 1 → 0 once: 50 m; 1 → 2 once: 0 m"

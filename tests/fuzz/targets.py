@@ -31,11 +31,12 @@ from emulator.world.networks import load_network
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
 from tests.support import maps
-from vnet.errors import LONGEST_MESSAGE, LinkError, ScenarioError, VnetError, WireError
+from vnet.errors import LONGEST_MESSAGE, ScenarioError, TransportError, VnetError, WireError
 from vnet.node import Report
 from vnet.roads.road_map import RoadMap
 from vnet.transport import wire
-from vnet.transport.access import Access, Credentials
+from vnet.transport.access import Access
+from vnet.transport.credentials import Credentials
 
 OVERRIDE = b"\n--set "
 """Stands between a scenario file and each override in one input of the scenario target."""
@@ -212,7 +213,7 @@ _TX = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import"),
     wire.Yield(b"n" * 16, 3, 100, ["v01"], [], _TRAFFIC),
     wire.Frames(b"n" * 16, 3, 3, [(1, 2)], _TRAFFIC, wire.Lateness([1, 2]), True),
-    wire.Standing(b"n" * 16, "File …"),
+    wire.StackDump(b"n" * 16, "File …"),
 )
 _RX = (
     wire.Welcome(
@@ -230,9 +231,9 @@ _RX = (
         100,
         "b",
     ),
-    wire.Grant(1, 100, [_PACKET], [_FIX], [wire.ClockBend("v01", 5, -3, 0.5)]),
+    wire.Grant(1, 100, [_PACKET], [_FIX], [wire.ClockError("v01", 5, -3, 0.5)]),
     wire.Batch([_FIX], 1, [_PACKET], 12345, 5, True),
-    wire.Where(),
+    wire.StackRequest(),
     wire.Await(1.5),
     wire.End(None, "over", False),
 )
@@ -447,8 +448,10 @@ TARGETS = (  # the slowest first
     Target("fault", _read_fault, ScenarioError, _FAULT_SEEDS, _FAULT_WORDS),
     Target("control query", _read_query, VnetError, _QUERIES, _FAULT_WORDS),
     Target("links CSV", _read_links, ScenarioError, (b"0,1\n1,0\n", b"0,1.0\n\n0,0\n"), _CSV_WORDS),
-    Target("access.json", _read_access, LinkError, (_ACCESS,), _JSON_WORDS),
-    Target("credentials", _read_credentials, LinkError, (b'{"user": "node-v01", "password": "p"}',), _JSON_WORDS),
+    Target("access.json", _read_access, TransportError, (_ACCESS,), _JSON_WORDS),
+    Target(
+        "credentials", _read_credentials, TransportError, (b'{"user": "node-v01", "password": "p"}',), _JSON_WORDS
+    ),
     Target("cooperative frame", _read_frame, cooperative_frame.FrameError, _frame_seeds()),
     Target(
         "observation", _read_observation, WireError, (wire.encode_observation({"a": [1, b"x"]}),), _MSGPACK_WORDS

@@ -73,21 +73,23 @@ def run_apart(scenario: Scenario) -> Emulation:
         nodes[0]: nodes for nodes in split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     }
     lockstep = Lockstep(emulation, list(groups.values()))
-    processes = {lead: _Process(emulation, nodes) for lead, nodes in groups.items() if emulation.up[lead]}
+    processes = {
+        process_id: _Process(emulation, nodes) for process_id, nodes in groups.items() if emulation.up[process_id]
+    }
     try:
         grants = lockstep.start()
         while grants:
             for actions in lockstep.take_actions():
-                for lead, nodes in groups.items():
+                for process_id, nodes in groups.items():
                     killed = [actions.stop[node] for node in nodes if node in actions.stop]
                     if killed:
-                        processes.pop(lead).end(killed=any(killed))
+                        processes.pop(process_id).end(killed=any(killed))
                     if any(node in actions.start for node in nodes):
-                        processes[lead] = _Process(emulation, nodes)
-            for lead, grant in grants.items():
-                processes[lead].grants.put(wire.encode(grant))
-            for lead in grants:
-                lockstep.receive(lead, processes[lead].take_yield())
+                        processes[process_id] = _Process(emulation, nodes)
+            for process_id, grant in grants.items():
+                processes[process_id].grants.put(wire.encode(grant))
+            for process_id in grants:
+                lockstep.receive(process_id, processes[process_id].take_yield())
             grants = lockstep.step()
     finally:
         for process in processes.values():
@@ -136,7 +138,7 @@ class _Process:
         grant = wire.decode_rx(item)
         assert isinstance(grant, wire.Grant)
         self._seq = grant.seq
-        self._host.bend(grant.clocks, self._loop)
+        self._host.apply_clock_error(grant.clocks, self._loop)
         self._host.deliver(grant.packets, grant.fixes)
         return grant.time_ns
 

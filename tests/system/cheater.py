@@ -10,9 +10,9 @@ import threading
 
 import zenoh
 
-from vnet.errors import LinkError
+from vnet.errors import TransportError
 from vnet.transport import keys, wire
-from vnet.transport.access import Credentials
+from vnet.transport.credentials import Credentials
 from vnet.transport.session import open_client, quiet_zenoh
 
 VICTIM = "v01"
@@ -23,7 +23,7 @@ def try_to_log_in(endpoint: str, credentials: Credentials | None) -> bool:
     try:
         with open_client(endpoint, credentials, 2000):
             return True
-    except LinkError:
+    except TransportError:
         return False
 
 

@@ -14,7 +14,7 @@ from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
 from vnet.transport import keys
-from vnet.transport.access import Credentials
+from vnet.transport.credentials import Credentials
 from vnet.transport.session import open_client
 
 LOSS = {"kind": "loss", "duration_s": 3000.0, "probability": 1.0}
@@ -80,10 +80,10 @@ def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Pat
 def test_a_bad_query_gets_one_line_of_error_and_changes_nothing(
     running: tuple[Path, dict[str, str]], verb: str, payload: bytes, said: str
 ) -> None:
-    folder, way_in = running
+    folder, control_endpoint = running
     login = Credentials.load(folder / OPERATOR_FILE)
-    with open_client(way_in["endpoint"], login, 10_000) as session:
-        replies = list(session.get(keys.control(way_in["run"], verb), payload=payload, timeout=TIMEOUT_S))
+    with open_client(control_endpoint["endpoint"], login, 10_000) as session:
+        replies = list(session.get(keys.control(control_endpoint["run"], verb), payload=payload, timeout=TIMEOUT_S))
     assert len(replies) == 1
     assert replies[0].err is not None
     text = replies[0].err.payload.to_string()

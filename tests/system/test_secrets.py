@@ -15,7 +15,9 @@ from emulator.scenario.scenario import load_scenario
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world
 from tests.system.conftest import ROOT, running_agents
-from vnet.transport.access import Access, KeyPair
+from vnet.transport.access import Access
+from vnet.transport.certificates import certifier
+from vnet.transport.credentials import KeyPair
 from vnet.transport.session import open_router
 
 NODES = [["v01"], ["v02"], ["v03"]]
@@ -24,7 +26,7 @@ endpoints = pytest.mark.parametrize("listen", LISTEN.values(), ids=LISTEN.keys()
 
 
 def create(listen: str) -> Access:
-    return Access.create("beacon", NODES, listen if listen.startswith("tls/") else None)
+    return Access.create("beacon", NODES, certifier(listen) if listen.startswith("tls/") else None)
 
 
 def secrets_of(access: Access) -> list[bytes]:

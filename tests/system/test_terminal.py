@@ -18,13 +18,13 @@ from pathlib import Path
 import pytest
 
 from emulator.cli.commands import app
-from emulator.drivers.control import ask, way_in
+from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
 from emulator.terminal.console import run_app
 from tests.support.screen import Screen
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
 from tests.system.test_failures import long_run
-from vnet.errors import LinkError
+from vnet.errors import TransportError
 from vnet.transport import session
 from vnet.transport.access import Access
 
@@ -276,7 +276,9 @@ def test_a_run_that_was_killed_is_said_to_be(tmp_path: Path, monkeypatch: pytest
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         endpoint = f"tcp/127.0.0.1:{nobody.getsockname()[1]}"
         with (
-            way_in(tmp_path, endpoint, Access.create("town", [["v01"]])),
-            pytest.raises(LinkError, match=r"the run does not answer \(was it killed\?\): cannot connect to tcp/"),
+            control_endpoint(tmp_path, endpoint, Access.create("town", [["v01"]])),
+            pytest.raises(
+                TransportError, match=r"the run does not answer \(was it killed\?\): cannot connect to tcp/"
+            ),
         ):
             ask(tmp_path, "status")

@@ -13,10 +13,12 @@ import zenoh
 
 from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
 from tests.system.test_by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents, start_emulator
-from vnet.errors import LinkError
+from vnet.errors import TransportError
 from vnet.transport import keys, session
-from vnet.transport.access import Access, Certificates, Credentials, Identity, node_user
-from vnet.transport.certificates import issue_certificates
+from vnet.transport.access import Access, node_user
+from vnet.transport.authority import issue_certificates
+from vnet.transport.certificates import certifier
+from vnet.transport.credentials import Certificates, Credentials, Identity
 from vnet.transport.session import open_client, open_router, router_endpoint
 
 LISTEN = "tls/127.0.0.1:0"
@@ -25,7 +27,7 @@ V01, V02 = node_user("v01"), node_user("v02")
 
 
 def create() -> Access:
-    return Access.create("r", [["v01"], ["v02"]], LISTEN)
+    return Access.create("r", [["v01"], ["v02"]], certifier(LISTEN))
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def joins(router: zenoh.Session, credentials: Credentials) -> bool:
     try:
         with open_client(router_endpoint(router), credentials, LEASE_MS):
             return True
-    except LinkError as error:
+    except TransportError as error:
         assert "refused the credentials" in str(error)
         return False
 

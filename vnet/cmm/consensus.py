@@ -29,14 +29,14 @@ from vnet.types import Array
 
 @dataclass(frozen=True)
 class Share:
-    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `takers`.
+    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `out_neighbours`.
 
     Averaging needs no epoch (it is 0) and says (state x, state y, degree) instead of a sum.
     """
 
     epoch: int
     running_sum: tuple[float, float, float]
-    takers: frozenset[str]
+    out_neighbours: frozenset[str]
     heard: frozenset[str]
 
 
@@ -48,8 +48,9 @@ class ConsensusConfig:
     last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start; if epoch follows
     epoch, for `serve_rounds` at most.
     `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
-    `blame`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
-    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to `worst`.
+    `penalty`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
+    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to
+    `max_penalty`.
     """
 
     silence_rounds: int = 20
@@ -57,9 +58,9 @@ class ConsensusConfig:
     settle_rounds: int = 30
     serve_rounds: int = 100
     gate_m: float = math.inf
-    blame: int = 10
+    penalty: int = 10
     blame_rounds: int = 100
-    worst: int = 4
+    max_penalty: int = 4
 
 
 LEAST_MASS = 0.1
@@ -134,7 +135,7 @@ class RatioConsensus:
     def __init__(
         self, node: str, config: ConsensusConfig | None = None, rejected: Counter[str] | None = None
     ) -> None:
-        """`rejected` counts shares that are not believed, by reason: `sums`, `exile`."""
+        """`rejected` counts shares that are not believed, by reason: `sums`, `banned`."""
         self._node = node
         self._config = config or ConsensusConfig()
         self._rejected = Counter() if rejected is None else rejected
@@ -184,16 +185,18 @@ class RatioConsensus:
         is left is the mean all the same.
         """
         leak = 1 / self._config.blame_rounds
-        self._blamed = {p: (blame - leak, epoch) for p, (blame, epoch) in self._blamed.items() if blame > leak}
+        self._blamed = {
+            p: (penalty - leak, epoch) for p, (penalty, epoch) in self._blamed.items() if penalty > leak
+        }
         self._blame_for_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._blame_of(peer) > self._config.blame:
+            if self._blame_of(peer) > self._config.penalty:
                 self._rejected["exile"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["sums"] += 1
-                self._blame(peer, self._config.blame, share.epoch)
+                self._blame(peer, self._config.penalty, share.epoch)
             else:
                 believed[peer] = share
         return believed
@@ -208,21 +211,21 @@ class RatioConsensus:
             first = [peer for peer, share in shares.items() if share.epoch == newest]
             for peer in first:
                 if newest > self._blamed.get(peer, (0.0, 0))[1]:
-                    self._blame(peer, min(newest - self._highest, self._config.worst) / len(first), newest)
+                    self._blame(peer, min(newest - self._highest, self._config.max_penalty) / len(first), newest)
 
     def _blame_of(self, peer: str) -> float:
         return self._blamed[peer][0] if peer in self._blamed else 0.0
 
     def _blame(self, peer: str, more: float, epoch: int) -> None:
-        blame = self._blame_of(peer) + more
+        penalty = self._blame_of(peer) + more
         if peer in self._blamed or len(self._blamed) < MOST_BLAMED:
-            self._blamed[peer] = blame, epoch
-        if blame > self._config.blame:
+            self._blamed[peer] = penalty, epoch
+        if penalty > self._config.penalty:
             self._peers.drop(peer)
 
     def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
         """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
-        if share.epoch != self.epoch or self._node not in share.takers:
+        if share.epoch != self.epoch or self._node not in share.out_neighbours:
             return True
         seen = self._seen.get(peer)
         s_x, s_y, w = share.running_sum if seen is None else (np.array(share.running_sum) - seen).tolist()
@@ -242,18 +245,18 @@ class RatioConsensus:
             self._mass[:2] += value - self._input
             self._age += 1
 
-    def _start(self, epoch: int, value: Array, takers: frozenset[str]) -> None:
+    def _start(self, epoch: int, value: Array, out_neighbours: frozenset[str]) -> None:
         self.epoch = self._highest = epoch
         self._mass = np.array([value[0], value[1], 1.0])
         self._usual_weight = 1.0
         self._running_sum = np.zeros(3)
-        self._takers = takers
+        self._takers = out_neighbours
         self._changed_rounds = 0
         self._age = 0
         self._seen = {}
 
     def _take(self, peer: str, share: Share) -> None:
-        if share.epoch != self.epoch or self._node not in share.takers:
+        if share.epoch != self.epoch or self._node not in share.out_neighbours:
             return
         total = np.array(share.running_sum)
         self._mass += total - self._seen.get(peer, 0.0)

@@ -42,8 +42,8 @@ def fuse(rbpf: Rbpf, clouds: Sequence[Cloud], weights: Array, rng: np.random.Gen
     own = systematic(rbpf.weight, kept, rng) if kept else np.empty(0, dtype=np.intp)
     common = np.concatenate([_evenly(cloud.common_m, count, rng) for cloud, count in used])
     stacked = (rbpf.common_m[:, own].sum(axis=1) + common.sum(axis=0)) / rbpf.config.particles
-    supplied = rbpf.supply(common)
-    if rbpf.config.roads_apart:
+    supplied = rbpf.condition_on(common)
+    if rbpf.config.separate_map_update:
         log_weight = np.zeros(kept + imported)
     else:
         batch = np.repeat(np.arange(len(used)), [count for _, count in used])

@@ -40,7 +40,7 @@ class RbpfConfig:
     offset in the lane (see the module's text). `gate_sigmas`: fixes further off are outliers. `forget_s`: vehicles
     not heard for that long are dropped. `memory_s`: how old a fix may be. `start_m`, `start_sigma_m`: where the
     cloud starts, else around 0 with `common_sigma_m`. The paper's: `one_sided` lanes are bounded on the right only;
-    with `roads_apart` a step does not look at roads, `weigh_roads` does. `least_log_road`: no road says
+    with `separate_map_update` a step does not look at roads, `update_from_map` does. `least_log_road`: no road says
     less of a vehicle, so that one whose fixes are false moves the cloud by no more (a truncated likelihood).
 
     On the map of a city: `off_road` is the share of vehicles on no road, and vehicles drive, with accelerations of
@@ -60,7 +60,7 @@ class RbpfConfig:
     start_m: tuple[float, float] = (0.0, 0.0)
     start_sigma_m: float | None = None
     one_sided: bool = False
-    roads_apart: bool = False
+    separate_map_update: bool = False
     least_log_road: float = -np.inf
     off_road: float = 0.1
     driving_m2_s4: tuple[float, float] = (16.0, 4.0)
@@ -102,7 +102,7 @@ class Rbpf:
         self._acceleration = np.empty((0, 4, 4))  # white acceleration of each vehicle, in all four blocks
         self._age_s = np.empty(0)  # how far each vehicle's filter is behind
         self._unseen_s = np.empty(0)
-        self._unlooked_s = np.empty(0)  # since a road was looked at for its sake; inf for never
+        self._since_map_update_s = np.empty(0)  # since a road was looked at for its sake; inf for never
         self._heading_rad = np.empty(0)  # as each vehicle's latest fix that bore one says; else NaN
         self._anchor_m = np.empty((0, 2))  # where its lateral offset was new evidence the last time, and on a lane
         self._anchor_rad = np.empty(0)  # of which heading
@@ -132,7 +132,7 @@ class Rbpf:
                 seen[len(self.vehicles)] = observations[name]
                 self._add(name, observations[name])
         rows = np.array(list(seen), dtype=np.intp)
-        if not self.config.roads_apart:
+        if not self.config.separate_map_update:
             self._match_map(rows)
         self._forget()
         self._resample_if_due(dt_s)
@@ -156,7 +156,7 @@ class Rbpf:
         self.common_m += spread_m * self._rng.standard_normal(self.common_m.shape)
         self._age_s += dt_s
         self._unseen_s += dt_s
-        self._unlooked_s += dt_s
+        self._since_map_update_s += dt_s
         self._remember(dt_s)
 
     def _remember(self, dt_s: float) -> None:
@@ -264,7 +264,7 @@ class Rbpf:
         self._acceleration = np.concatenate([self._acceleration, np.tile(acceleration, (1, 2, 2))])
         self._age_s = np.append(self._age_s, observation.age_s)
         self._unseen_s = np.append(self._unseen_s, observation.age_s)
-        self._unlooked_s = np.append(self._unlooked_s, np.inf)
+        self._since_map_update_s = np.append(self._since_map_update_s, np.inf)
         self._heading_rad = np.append(self._heading_rad, heading_rad)
         self._anchor_m = np.concatenate([self._anchor_m, [[np.nan, np.nan]]])
         self._anchor_rad = np.append(self._anchor_rad, np.nan)
@@ -281,7 +281,7 @@ class Rbpf:
         self.mean, self.covariance = self.mean[kept], self.covariance[kept]
         self._acceleration = self._acceleration[kept]
         self._age_s, self._unseen_s = self._age_s[kept], self._unseen_s[kept]
-        self._unlooked_s, self._heading_rad = self._unlooked_s[kept], self._heading_rad[kept]
+        self._since_map_update_s, self._heading_rad = self._since_map_update_s[kept], self._heading_rad[kept]
         self._anchor_m, self._anchor_rad = self._anchor_m[kept], self._anchor_rad[kept]
         self._log_road = self._log_road[kept]
         new_row = np.cumsum(~gone) - 1
@@ -290,25 +290,27 @@ class Rbpf:
 
     def _match_map(self, rows: NDArray[np.intp]) -> None:
         """Weigh the particles by what the roads say of those vehicles in `rows` whose turn it is."""
-        unlooked_s = self._unlooked_s[rows]
-        due = unlooked_s > LOOK_S - SAME_TIME_S
-        rows, unlooked_s = rows[due], unlooked_s[due]
-        stays = np.maximum(0.0, 1 - unlooked_s / self.config.lateral_tau_s)
+        since_map_update_s = self._since_map_update_s[rows]
+        due = since_map_update_s > LOOK_S - SAME_TIME_S
+        rows, since_map_update_s = rows[due], since_map_update_s[due]
+        stays = np.maximum(0.0, 1 - since_map_update_s / self.config.lateral_tau_s)
         if self._roads.drives and len(rows):
-            rows, unlooked_s, stays = self._find_lanes(rows, unlooked_s)
+            rows, since_map_update_s, stays = self._find_lanes(rows, since_map_update_s)
         if not len(rows) or not len(self._lane):
             return
         log_road = self.log_road(self.mean, self.covariance, rows)
-        self._unlooked_s[rows] = LOOK_S / 2 * (np.isinf(unlooked_s) & (rows % 2 == 1))
+        self._since_map_update_s[rows] = LOOK_S / 2 * (np.isinf(since_map_update_s) & (rows % 2 == 1))
         self.log_weight += log_road.sum(axis=0) - stays @ self._log_road[rows]
         self._log_road[rows] = log_road
 
-    def _find_lanes(self, rows: NDArray[np.intp], unlooked_s: Array) -> tuple[NDArray[np.intp], Array, Array]:
+    def _find_lanes(
+        self, rows: NDArray[np.intp], since_map_update_s: Array
+    ) -> tuple[NDArray[np.intp], Array, Array]:
         """Seek anew the lanes on which vehicles that drive may be.
 
-        Returns the rows that have any, their `unlooked_s`, and how much of each one's evidence so far the new look
-        replaces: all of it where the vehicle stands, because its offset is what it was; less the further it has
-        driven; and nothing once it has turned, because another offset across another road says something else.
+        Returns the rows that have any, their `since_map_update_s`, and how much of each one's evidence so far the
+        new look replaces: all of it where the vehicle stands, because its offset is what it was; less the further
+        it has driven; nothing once it has turned, because another offset across another road says something else.
         """
         place_m = self.mean[rows, :2]
         middle_m = place_m @ self.weight
@@ -340,12 +342,12 @@ class Rbpf:
         anew = rows[new > 0]
         self._anchor_m[anew] = middle_m[new > 0]
         self._anchor_rad[rows[turned]] = along_rad[turned]
-        return rows, unlooked_s[some], np.maximum(0.0, 1 - new)
+        return rows, since_map_update_s[some], np.maximum(0.0, 1 - new)
 
-    def weigh_roads(self) -> None:
+    def update_from_map(self) -> None:
         """Weigh the particles by the roads of all vehicles, and resample: the paper's order, after stacking."""
         if self._roads.drives and self.vehicles:
-            self._find_lanes(np.arange(len(self.vehicles)), self._unlooked_s)
+            self._find_lanes(np.arange(len(self.vehicles)), self._since_map_update_s)
         self._log_road = self.log_road(self.mean, self.covariance)
         self.log_weight = self.log_weight + self._log_road.sum(axis=0)
         self.resample()
@@ -438,7 +440,7 @@ class Rbpf:
 
     def shift(self, by_m: Array) -> None:
         """Move the cloud by (2,), and what goes with it along the regression on c. Nothing is resampled."""
-        mean, past, log_road = self.slopes()
+        mean, past, log_road = self.regression_on_common_error()
         self.common_m = self.common_m + by_m[:, None]
         self.mean += (mean @ by_m)[..., None]
         self._past_m += (past @ by_m)[..., None]
@@ -448,7 +450,7 @@ class Rbpf:
         """`count` equally likely hypotheses of c as (count, 2), for others."""
         return np.asarray(self.common_m[:, systematic(self.weight, count, self._rng)].T)
 
-    def supply(self, common_m: Array) -> tuple[Array, Array, Array]:
+    def condition_on(self, common_m: Array) -> tuple[Array, Array, Array]:
         """What this filter makes of hypotheses (n, 2): means (M, 4, n), past (L, 2, n), log P on road (M, n).
 
         Each hypothesis is paired with a particle of this filter, whose vehicles and past are moved along the
@@ -457,7 +459,7 @@ class Rbpf:
         count = len(common_m)
         partner = self._rng.permutation(systematic(self.weight, count, self._rng))
         by_m = common_m.T - self.common_m[:, partner]
-        mean_slope, past_slope, road_slope = self.slopes()
+        mean_slope, past_slope, road_slope = self.regression_on_common_error()
         mean = self.mean.take(partner, axis=-1) + mean_slope @ by_m
         past = self._past_m.take(partner, axis=-1) + past_slope @ by_m
         log_road = self.log_road(mean, self.covariance)
@@ -466,7 +468,7 @@ class Rbpf:
             log_road[bare] = self._log_road[bare][:, partner] + road_slope[bare] @ by_m
         return mean, past, log_road
 
-    def slopes(self) -> tuple[Array, Array, Array]:
+    def regression_on_common_error(self) -> tuple[Array, Array, Array]:
         """Regression on c, Cov(·, c) Cov(c)⁻¹: of the means (M, 4, 2), of the past (L, 2, 2), of log_road (M, 2).
 
         Where the cloud has collapsed: −I for positions (a vehicle is where its fix says, less c), I, and 0.
@@ -492,7 +494,7 @@ class Rbpf:
         supplied: tuple[Array, Array, Array],
         log_weight: Array,
     ) -> None:
-        """Go on with the particles `own` (indices, m of them) and hypotheses (n, 2) as `supply` made them.
+        """Go on with the particles `own` (indices, m of them) and hypotheses (n, 2) as `condition_on` made them.
 
         `log_weight` (m + n,) are their weights, own first; resampled to K.
         """

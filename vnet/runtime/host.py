@@ -22,7 +22,7 @@ from typing import Any
 from vnet.errors import ProgramError
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
-from vnet.runtime.virtual_time import BendableLoop, LoopAbandonedError, SpinError, VirtualTimeLoop
+from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
 Program = Callable[[Node], Awaitable[None]]
@@ -84,8 +84,8 @@ class Host:
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = {welcome.node: welcome.runs for welcome in welcomes}
-        self._clocks: dict[str, wire.ClockBend] = {}
-        self._past_clocks: dict[str, list[wire.ClockBend]] = {}
+        self._clocks: dict[str, wire.ClockError] = {}
+        self._past_clocks: dict[str, list[wire.ClockError]] = {}
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
 
@@ -105,8 +105,8 @@ class Host:
 
     def now_ns(self, node: str) -> int:
         """Emulated time in nanoseconds, by the clock of `node`."""
-        bend = self._clocks.get(node)
-        return self._clock() if bend is None else max(bend.shown_ns(self._clock()), 0)
+        clock_error = self._clocks.get(node)
+        return self._clock() if clock_error is None else max(clock_error.shown_ns(self._clock()), 0)
 
     def send_frame(self, node: str, payload: bytes) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
@@ -140,7 +140,7 @@ class Host:
     def stop(self, node: str, killed: bool) -> None:
         """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
         gone = self.nodes[node]
-        gone.sever()
+        gone.disconnect()
         self._active[node] = False
         if killed:
             self._killed[gone] = self._tasks_of(gone)
@@ -168,30 +168,30 @@ class Host:
 
     def _hold(self) -> None:
         assert isinstance(self._loop, VirtualTimeLoop)
-        self._loop.hold(self._stands_still)
+        self._loop.hold(self._is_paused)
 
-    def _stands_still(self, handle: asyncio.Handle) -> bool:
+    def _is_paused(self, handle: asyncio.Handle) -> bool:
         owner = _owner(handle)
         return owner is not None and (owner.id in self._paused or owner in self._killed)
 
-    def bend(self, clocks: Iterable[wire.ClockBend], loop: BendableLoop) -> None:
+    def apply_clock_error(self, clocks: Iterable[wire.ClockError], loop: SkewedLoop) -> None:
         """Take new clocks of nodes."""
         for clock in clocks:
             self._past_clocks.setdefault(clock.node, []).append(clock)
             self._clocks.pop(clock.node, None)
-            if clock.bends:
+            if clock.is_wrong:
                 self._clocks[clock.node] = clock
-        loop.bend_of = self._bend_of_task if self._clocks else _no_bend
+        loop.clock_error_of = self._bend_of_task if self._clocks else _no_bend
 
-    def _bend_of_task(self) -> wire.ClockBend | None:
+    def _bend_of_task(self) -> wire.ClockError | None:
         node = _current_node.get()
         return None if node is None else self._clocks.get(node.id)
 
     def _shown_ns(self, node: str, time_ns: int) -> int:
         """What the clock of `node` showed at `time_ns`, as it went then."""
-        for bend in reversed(self._past_clocks.get(node, ())):
-            if bend.since_ns <= time_ns:
-                return max(bend.shown_ns(time_ns), 0)
+        for clock_error in reversed(self._past_clocks.get(node, ())):
+            if clock_error.since_ns <= time_ns:
+                return max(clock_error.shown_ns(time_ns), 0)
         return time_ns
 
     def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
@@ -319,7 +319,7 @@ def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
         coroutine = coroutine.cr_await
 
 
-def _no_bend() -> wire.ClockBend | None:
+def _no_bend() -> wire.ClockError | None:
     """All clocks are right."""
     return None
 

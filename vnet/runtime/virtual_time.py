@@ -23,7 +23,7 @@ from itertools import count
 from typing import Any, NoReturn
 
 from vnet.errors import VirtualTimeError
-from vnet.transport.wire import ClockBend
+from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
 
 LATEST_S = 1e9
@@ -41,13 +41,13 @@ class LoopAbandonedError(VirtualTimeError):
     """A loop that was told to end, but whose tasks still wait for something."""
 
 
-class BendableLoop(asyncio.SelectorEventLoop):
-    """A loop that shows some tasks another time: `bend_of` gives the clock of the task that asks, or None.
+class SkewedLoop(asyncio.SelectorEventLoop):
+    """A loop that shows some tasks another time: `clock_error_of` gives the clock of the task that asks, or None.
 
     Timers are kept in the loop's own time.
     """
 
-    bend_of: Callable[[], ClockBend | None] = staticmethod(lambda: None)
+    clock_error_of: Callable[[], ClockError | None] = staticmethod(lambda: None)
 
     @property
     def now_ns(self) -> int:
@@ -56,11 +56,11 @@ class BendableLoop(asyncio.SelectorEventLoop):
 
     def time(self) -> float:
         """Seconds, as asyncio counts, on the clock of the task that asks."""
-        bend = self.bend_of()
-        if bend is None:
+        clock_error = self.clock_error_of()
+        if clock_error is None:
             return self.own_time()
         now_ns = self.now_ns
-        return self.own_time() + (bend.shown_ns(now_ns) - now_ns) / NS_PER_S
+        return self.own_time() + (clock_error.shown_ns(now_ns) - now_ns) / NS_PER_S
 
     def own_time(self) -> float:
         """Seconds on the loop's own clock."""
@@ -74,8 +74,8 @@ class BendableLoop(asyncio.SelectorEventLoop):
 
     def _own_when(self, when: float) -> float:
         """When, on the loop's own clock, the clock of the task that asks shows `when`."""
-        bend = self.bend_of()
-        return when if bend is None else self.own_time() + (when - self.time()) / (1 + bend.rate)
+        clock_error = self.clock_error_of()
+        return when if clock_error is None else self.own_time() + (when - self.time()) / (1 + clock_error.rate)
 
 
 class _Timer(asyncio.TimerHandle):
@@ -95,7 +95,7 @@ class _Timer(asyncio.TimerHandle):
         return (self._when, self._number) < (other._when, other._number)  # type: ignore[attr-defined]
 
 
-class VirtualTimeLoop(BendableLoop):
+class VirtualTimeLoop(SkewedLoop):
     """An event loop in virtual time; see the module's text.
 
     `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.

@@ -16,9 +16,10 @@ from typing import Any
 
 import zenoh
 
-from vnet.errors import LinkError
+from vnet.errors import TransportError
 from vnet.transport import wire
-from vnet.transport.access import Access, Credentials, Identity, as_base64, is_tls, router_config, write_private
+from vnet.transport.access import Access, is_tls, router_config
+from vnet.transport.credentials import Credentials, Identity, as_base64, write_private
 
 AGENT_RUNTIME = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:2))"
 """`ZENOH_RUNTIME` of an agent: fewer threads, 30 % less CPU. Zenoh reads it when it starts."""
@@ -32,7 +33,7 @@ _NO_CONFIGURATIONS = "zenoh::api::session=off"
 def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Session]:
     """A session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
 
-    Raises LinkError if the endpoint cannot be listened on, or speaks TLS where the users have no certificates.
+    Raises TransportError if the endpoint cannot be listened on, or speaks TLS where the users have no certificates.
     """
     access.check_endpoint(listen)
     with tempfile.TemporaryDirectory(prefix="vnet-") as folder:
@@ -49,11 +50,11 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
 
 @contextmanager
 def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -> Iterator[zenoh.Session]:
-    """A client session of the router at `endpoint`. Raises LinkError if it is not there or refuses."""
+    """A client session of the router at `endpoint`. Raises TransportError if it is not there or refuses."""
     identity = None if credentials is None else credentials.tls
     if is_tls(endpoint) != (identity is not None):
         has = "have a certificate: connect to tls/HOST:PORT" if identity else "have no certificate"
-        raise LinkError(f"cannot connect to {endpoint}: the credentials {has}")
+        raise TransportError(f"cannot connect to {endpoint}: the credentials {has}")
     config: dict[str, Any] = {
         "mode": "client",
         "connect": {
@@ -82,7 +83,7 @@ def router_endpoint(session: zenoh.Session) -> str:
         if reply.ok is not None:
             locators = json.loads(reply.ok.payload.to_string())["locators"]
             return str(locators[0])
-    raise LinkError("the embedded router does not say where it listens")
+    raise TransportError("the embedded router does not say where it listens")
 
 
 def quiet_zenoh() -> None:
@@ -120,7 +121,7 @@ def _open(config: dict[str, Any], failure: str) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError as error:
-        raise LinkError(f"{failure}: {_reason(str(error))}") from None
+        raise TransportError(f"{failure}: {_reason(str(error))}") from None
 
 
 def _reason(text: str) -> str:

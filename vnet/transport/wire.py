@@ -1,7 +1,7 @@
 """The messages on the keys of a node: typed records <-> msgpack, without any I/O.
 
-`tx` carries what an agent says (`Hello`, `Yield`, `Frames`, `Standing`), `rx` what the emulator says
-(`Welcome`, `Grant`, `Batch`, `Where`, `End`). Decoding checks every type and bound; what does not fit is a
+`tx` carries what an agent says (`Hello`, `Yield`, `Frames`, `StackDump`), `rx` what the emulator says
+(`Welcome`, `Grant`, `Batch`, `StackRequest`, `End`). Decoding checks every type and bound; what does not fit is a
 `WireError`. All times are integer nanoseconds from the start of the run.
 """
 
@@ -90,14 +90,14 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(Message, frozen=True):
-    """A node asks to join. `lead` is the first node of its process, whose keys carry the process's traffic.
+    """A node asks to join. `process_id` is the first node of its process, whose keys carry the process's traffic.
 
     `nonce` is a secret of the process: later messages bear it, so that nobody else can speak for the node.
     Said again with `ready` once the welcome has come and the program is loaded, or with the `failure` to.
     """
 
     node: str
-    lead: str
+    process_id: str
     nonce: bytes
     pid: int
     host: str
@@ -134,8 +134,8 @@ class Frames(Message, frozen=True):
     final: bool = False
 
 
-class Standing(Message, frozen=True):
-    """The answer to `Where`: the stacks of the process's program threads."""
+class StackDump(Message, frozen=True):
+    """The answer to `StackRequest`: the stacks of the process's program threads."""
 
     nonce: bytes
     text: str
@@ -163,7 +163,7 @@ class Welcome(Message, frozen=True):
     runs: bool = True
 
 
-class ClockBend(msgspec.Struct, frozen=True, array_like=True):
+class ClockError(msgspec.Struct, frozen=True, array_like=True):
     """How the clock of `node` goes wrong: at time t it shows t + offset_ns + rate · (t − since_ns)."""
 
     node: str
@@ -172,7 +172,7 @@ class ClockBend(msgspec.Struct, frozen=True, array_like=True):
     rate: Annotated[float, msgspec.Meta(gt=-1, lt=2**20)] = 0.0
 
     @property
-    def bends(self) -> bool:
+    def is_wrong(self) -> bool:
         """Whether the clock is wrong at all."""
         return bool(self.offset_ns or self.rate)
 
@@ -192,7 +192,7 @@ class Grant(Message, frozen=True):
     time_ns: TimeNs
     packets: Sequence[WirePacket] = ()
     fixes: Sequence[WireFix] = ()
-    clocks: Sequence[ClockBend] = ()
+    clocks: Sequence[ClockError] = ()
 
 
 class Batch(Message, frozen=True):
@@ -208,10 +208,10 @@ class Batch(Message, frozen=True):
     origin_ns: int | None = None
     start_ns: TimeNs = 0
     held: bool = False
-    clocks: Sequence[ClockBend] = ()
+    clocks: Sequence[ClockError] = ()
 
 
-class Where(Message, frozen=True):
+class StackRequest(Message, frozen=True):
     """The emulator waits too long for this process: where does it stand?"""
 
 
@@ -229,8 +229,8 @@ class End(Message, frozen=True):
     refused: bool = False
 
 
-AgentMessage = Hello | Yield | Frames | Standing
-EmulatorMessage = Welcome | Grant | Batch | Where | Await | End
+AgentMessage = Hello | Yield | Frames | StackDump
+EmulatorMessage = Welcome | Grant | Batch | StackRequest | Await | End
 
 _M = TypeVar("_M")
 _encoder = msgspec.msgpack.Encoder()

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict
 from emulator.records.run_folder import Event
 from tests.emulator.checks.test_faults import not_valid, simulated
 from tests.emulator.checks.test_judge import result, verdict
@@ -34,7 +34,7 @@ def run(
     from_s: float = 0,
     to_s: float = 0,
     by_m: float = 0,
-) -> Evidence:
+) -> RecordedRun:
     """Eight vehicles in a world without a common error, one of which errs for a time."""
     wrong = {"node": "v03", "what": what, "from_s": from_s, "to_s": to_s, "by_m": by_m} if what else {}
     return simulated(
@@ -48,66 +48,66 @@ def run(
 
 
 def test_vehicles_that_agree_and_recover_are_valid() -> None:
-    evidence = run(BLOCK)
-    assert not_valid(evidence) == {}
-    assert all(isinstance(result(evidence, name), CheckResult) for name in COOPERATION)
+    recorded = run(BLOCK)
+    assert not_valid(recorded) == {}
+    assert all(isinstance(result(recorded, name), CheckResult) for name in COOPERATION)
 
 
 def test_programs_without_beliefs_leave_nothing_to_judge() -> None:
-    evidence = simulated(BLOCK)
-    assert all(isinstance(result(evidence, name), NotExercised) for name in COOPERATION)
+    recorded = simulated(BLOCK)
+    assert all(isinstance(result(recorded, name), NotExercised) for name in COOPERATION)
 
 
 @pytest.mark.parametrize(("to_s", "found"), [(6.5, {"bounded_error": Verdict.INVALID}), (5.9, {})])
 def test_a_vehicle_that_is_lost_for_five_seconds_is_found(to_s: float, found: dict[str, Verdict]) -> None:
-    evidence = run(duration_s=9.0, what="common_error_m", from_s=1.0, to_s=to_s, by_m=12.0)
-    assert not_valid(evidence) == found
+    recorded = run(duration_s=9.0, what="common_error_m", from_s=1.0, to_s=to_s, by_m=12.0)
+    assert not_valid(recorded) == found
 
 
 def test_a_vehicle_whose_receiver_is_bent_may_be_lost() -> None:
     jump = {"kind": "gnss_jump", "at_s": 1.0, "duration_s": 2.0, "offset_m": [50.0, 0.0], "nodes": {"ids": ["v03"]}}
-    evidence = run(jump, duration_s=9.0, what="common_error_m", from_s=1.0, to_s=8.0, by_m=12.0)
-    assert verdict(evidence, "bounded_error") is Verdict.VALID
+    recorded = run(jump, duration_s=9.0, what="common_error_m", from_s=1.0, to_s=8.0, by_m=12.0)
+    assert verdict(recorded, "bounded_error") is Verdict.VALID
 
 
 def test_a_mean_that_is_none_is_found() -> None:
-    evidence = run(duration_s=11.0, what="mean_m", from_s=3.0, to_s=11.0, by_m=2.0)
-    assert not_valid(evidence) == {"consensus_mean": Verdict.INVALID}
-    rows = result(evidence, "consensus_mean").figures["rows"]
+    recorded = run(duration_s=11.0, what="mean_m", from_s=3.0, to_s=11.0, by_m=2.0)
+    assert not_valid(recorded) == {"consensus_mean": Verdict.INVALID}
+    rows = result(recorded, "consensus_mean").figures["rows"]
     assert [row["node"] for row in rows] == ["v03"]
     assert rows[0]["off_m"] == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_mean_has_some_seconds_to_settle() -> None:
-    evidence = run(duration_s=4.0, what="mean_m", from_s=1.0, to_s=6.0, by_m=2.0)
-    assert isinstance(result(evidence, "consensus_mean"), NotExercised)
+    recorded = run(duration_s=4.0, what="mean_m", from_s=1.0, to_s=6.0, by_m=2.0)
+    assert isinstance(result(recorded, "consensus_mean"), NotExercised)
 
 
 def test_who_is_down_has_no_mean_and_is_no_part_of_it() -> None:
-    evidence = run(duration_s=8.0, what="mean_m", from_s=3.0, to_s=9.0, by_m=2.0)
-    dead = replace(evidence, events=[*evidence.events, Event(3_000_000_000, "finished", "v03", {})])
+    recorded = run(duration_s=8.0, what="mean_m", from_s=3.0, to_s=9.0, by_m=2.0)
+    dead = replace(recorded, events=[*recorded.events, Event(3_000_000_000, "finished", "v03", {})])
     assert verdict(dead, "consensus_mean") is Verdict.VALID
 
 
 @pytest.mark.parametrize(("to_s", "found"), [(12.5, {}), (14.0, {"convergence": Verdict.INVALID})])
 def test_agreement_must_come_back_within_ten_seconds(to_s: float, found: dict[str, Verdict]) -> None:
-    evidence = run(BLOCK, what="common_error_m", from_s=2.5, to_s=to_s, by_m=4.0)
-    assert not_valid(evidence) == found
+    recorded = run(BLOCK, what="common_error_m", from_s=2.5, to_s=to_s, by_m=4.0)
+    assert not_valid(recorded) == found
 
 
 def test_agreement_that_had_no_ten_seconds_to_come_back_is_unknown() -> None:
-    evidence = run(BLOCK, duration_s=8.0, what="common_error_m", from_s=2.5, to_s=8.0, by_m=4.0)
-    assert not_valid(evidence) == {"convergence": Verdict.UNKNOWN}
+    recorded = run(BLOCK, duration_s=8.0, what="common_error_m", from_s=2.5, to_s=8.0, by_m=4.0)
+    assert not_valid(recorded) == {"convergence": Verdict.UNKNOWN}
 
 
 def test_a_mean_that_has_not_settled_yet_is_unknown() -> None:
-    evidence = run(duration_s=6.0, what="mean_m", from_s=3.0, to_s=6.0, by_m=2.0)
-    assert not_valid(evidence) == {"consensus_mean": Verdict.UNKNOWN}
+    recorded = run(duration_s=6.0, what="mean_m", from_s=3.0, to_s=6.0, by_m=2.0)
+    assert not_valid(recorded) == {"consensus_mean": Verdict.UNKNOWN}
 
 
 def test_a_heal_that_the_next_fault_cuts_short_is_not_judged() -> None:
     second = {**BLOCK, "at_s": 4.0}
-    evidence = run(BLOCK, second, what="common_error_m", from_s=2.5, to_s=6.0, by_m=4.0)
-    found = result(evidence, "convergence")
+    recorded = run(BLOCK, second, what="common_error_m", from_s=2.5, to_s=6.0, by_m=4.0)
+    found = result(recorded, "convergence")
     assert isinstance(found, CheckResult)
     assert found.figures["recovered_s"] == [pytest.approx(1.0)]

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, judge
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.metrics import STATES
 from emulator.records.run_folder import Event
 from emulator.scenario.faults import KINDS, parse_fault
@@ -56,7 +56,7 @@ def simulated(
     program: str = f"{__name__}:hears",
     options: dict[str, Any] | None = None,
     **sections: Any,
-) -> Evidence:
+) -> RecordedRun:
     """Eight vehicles for six seconds."""
     settings = {
         "run": {"duration_s": 6.0, "settle_s": 2.0},
@@ -70,21 +70,21 @@ def simulated(
 
 
 @cache
-def with_fault(kind: str) -> Evidence:
+def with_fault(kind: str) -> RecordedRun:
     """A run with one fault of a kind; the same for all tests."""
     return simulated(fault(kind))
 
 
-def not_valid(evidence: Evidence) -> dict[str, Verdict]:
-    checks = judge(evidence).checks
+def not_valid(recorded: RecordedRun) -> dict[str, Verdict]:
+    checks = judge(recorded).checks
     return {check.name: check.verdict for check in checks if check.verdict is not Verdict.VALID}
 
 
-def shifted(evidence: Evidence, seconds: float) -> Evidence:
+def shifted(recorded: RecordedRun, seconds: float) -> RecordedRun:
     """The same files, as if its fault had been planned at another time."""
-    first = evidence.scenario.fault[0]
+    first = recorded.scenario.fault[0]
     moved = first.model_copy(update={"at_s": first.at_s + seconds})
-    return replace(evidence, scenario=evidence.scenario.model_copy(update={"fault": (moved,)}))
+    return replace(recorded, scenario=recorded.scenario.model_copy(update={"fault": (moved,)}))
 
 
 def with_cells(table: pa.Table, column: str, rows: Any, value: Any) -> pa.Table:
@@ -98,36 +98,36 @@ def with_cells(table: pa.Table, column: str, rows: Any, value: Any) -> pa.Table:
     return timely(changed) if column == "outcome" else changed
 
 
-def without_reports(evidence: Evidence, node: str, from_s: float) -> Evidence:
+def without_reports(recorded: RecordedRun, node: str, from_s: float) -> RecordedRun:
     """The states as if a node had reported nothing any more."""
     empty = {name: None for name in STATES.names if name.endswith(("estimate_m", "covariance_m2"))}
     rows = [
         {**row, **empty, "values": []} if row["node"] == node and row["time_ns"] >= from_s * 1e9 else row
-        for row in evidence.states.to_pylist()
+        for row in recorded.states.to_pylist()
     ]
-    return replace(evidence, states=pa.Table.from_pylist(rows, schema=STATES))
+    return replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
 
 
-def some(evidence: Evidence, *outcomes: str, cause: str = "", copies: bool = False) -> np.ndarray:
+def some(recorded: RecordedRun, *outcomes: str, cause: str = "", copies: bool = False) -> np.ndarray:
     """The rows with these outcomes, of this cause."""
-    named = np.array(evidence.trace["cause"].to_pylist()) == cause
-    return np.flatnonzero(evidence.outcome_is(*outcomes) & named & ((evidence.copy > 0) == copies))
+    named = np.array(recorded.trace["cause"].to_pylist()) == cause
+    return np.flatnonzero(recorded.outcome_is(*outcomes) & named & ((recorded.copy > 0) == copies))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_run_with_a_fault_of_any_kind_is_valid_and_the_fault_bit(kind: str) -> None:
-    evidence = with_fault(kind)
-    assert not_valid(evidence) == {}
-    bit = result(evidence, f"bit:{kind}-0")
+    recorded = with_fault(kind)
+    assert not_valid(recorded) == {}
+    bit = result(recorded, f"bit:{kind}-0")
     left_out = kind in ("skew", "drift", *RESTARTS)  # this program sends at each fix, whatever its clock says
     assert isinstance(bit, NotExercised if left_out else CheckResult)
 
 
 @pytest.mark.parametrize("kind", ["skew", "drift"])
 def test_a_bent_clock_shows_where_a_program_sends_by_its_clock(kind: str) -> None:
-    evidence = simulated(fault(kind), program=f"{__name__}:sends_by_the_clock")
-    assert not_valid(evidence) == {}
-    assert verdict(evidence, f"bit:{kind}-0") is Verdict.VALID
+    recorded = simulated(fault(kind), program=f"{__name__}:sends_by_the_clock")
+    assert not_valid(recorded) == {}
+    assert verdict(recorded, f"bit:{kind}-0") is Verdict.VALID
 
 
 async def sends_by_the_clock(node: Node) -> None:
@@ -141,16 +141,16 @@ def test_many_faults_at_once_are_told_apart() -> None:
     kinds = ("partition", "kill", "pause", "loss", "burst_loss", "duplicate", "corrupt", "delay", "jitter", "DoS")
     kinds += ("Sybil", "DataReplay", "StaleMessages", "swizzle", "range", "throttle", "gnss_outage", "gnss_jump")
     faults = [fault(kind, at_s=0.5 + 0.1 * place) for place, kind in enumerate(kinds)]
-    evidence = simulated(*faults, radio={"loss": 0.1, "max_peers": 3, "queue_frames": 3, "delivery_tick_us": 100})
-    invalid = {name for name, verdict in not_valid(evidence).items() if verdict is Verdict.INVALID}
+    recorded = simulated(*faults, radio={"loss": 0.1, "max_peers": 3, "queue_frames": 3, "delivery_tick_us": 100})
+    invalid = {name for name, verdict in not_valid(recorded).items() if verdict is Verdict.INVALID}
     assert invalid == set()
 
 
 @pytest.mark.parametrize("queue_frames", [2, 64])
 def test_what_a_throttle_left_waiting_does_not_make_later_frames_too_early(queue_frames: int) -> None:
     slow = [fault("throttle", bitrate_mbps=0.0005), fault("throttle", bitrate_mbps=0.002, at_s=4.0, duration_s=1.0)]
-    evidence = simulated(*slow, run={"duration_s": 8.0, "settle_s": 2.0}, radio={"queue_frames": queue_frames})
-    assert not_valid(evidence) == {}
+    recorded = simulated(*slow, run={"duration_s": 8.0, "settle_s": 2.0}, radio={"queue_frames": queue_frames})
+    assert not_valid(recorded) == {}
 
 
 def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
@@ -162,9 +162,9 @@ def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
 
 
 def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None:
-    evidence = simulated(fault("kill", duration_s=1e-10))
-    assert not_valid(evidence) == {}
-    assert result(evidence, "bit:kill-0") == NotExercised("bit:kill-0", "it was healed before it began")
+    recorded = simulated(fault("kill", duration_s=1e-10))
+    assert not_valid(recorded) == {}
+    assert result(recorded, "bit:kill-0") == NotExercised("bit:kill-0", "it was healed before it began")
 
 
 @pytest.mark.parametrize("kind", ["DoS", "Sybil", "DataReplay", "StaleMessages"])
@@ -180,46 +180,46 @@ def test_a_vehicle_that_other_faults_keep_down_need_not_be_seen_to_misbehave(kin
 
 @pytest.mark.parametrize("kind", ["partition", "block", "range", "swizzle"])
 def test_a_pair_that_passed_a_cut_is_found(kind: str) -> None:
-    evidence = with_fault(kind)
-    row = some(evidence, "fault", cause=f"{kind}-0")[5]
-    forged = with_cells(with_cells(evidence.trace, "cause", row, ""), "outcome", row, "delivered")
-    found = damaged(evidence, forged)
+    recorded = with_fault(kind)
+    row = some(recorded, "fault", cause=f"{kind}-0")[5]
+    forged = with_cells(with_cells(recorded.trace, "cause", row, ""), "outcome", row, "delivered")
+    found = damaged(recorded, forged)
     assert set(found) == {"partition_respected"}
-    assert [shown["seq"] for shown in found["partition_respected"].figures["rows"]] == [int(evidence.seq[row])]
+    assert [shown["seq"] for shown in found["partition_respected"].figures["rows"]] == [int(recorded.seq[row])]
 
 
 @pytest.mark.parametrize("cause", ["", "meteor-7", "partition-1"])
 def test_a_pair_that_no_fault_explains_is_found(cause: str) -> None:
-    evidence = with_fault("partition")
-    row = some(evidence, "fault", cause="partition-0")[0]
-    assert set(damaged(evidence, with_cells(evidence.trace, "cause", row, cause))) == {"causes"}
+    recorded = with_fault("partition")
+    row = some(recorded, "fault", cause="partition-0")[0]
+    assert set(damaged(recorded, with_cells(recorded.trace, "cause", row, cause))) == {"causes"}
 
 
 def test_a_fault_outside_its_time_or_its_links_is_found() -> None:
-    evidence = with_fault("block")
-    outside = some(evidence, "lost")[0]
-    assert evidence.sent_ns[outside] < AT_S * 1e9
-    forged = with_cells(with_cells(evidence.trace, "outcome", outside, "fault"), "cause", outside, "block-0")
-    assert set(damaged(evidence, forged)) == {"causes"}
-    free = ~evidence.plan[0].links[evidence.sender, evidence.receiver]
-    within = np.flatnonzero(free & evidence.outcome_is("lost") & (abs(evidence.sent_ns / 1e9 - 3) < 0.9))[0]
-    forged = with_cells(with_cells(evidence.trace, "outcome", within, "fault"), "cause", within, "block-0")
-    assert set(damaged(evidence, forged)) == {"causes"}
+    recorded = with_fault("block")
+    outside = some(recorded, "lost")[0]
+    assert recorded.sent_ns[outside] < AT_S * 1e9
+    forged = with_cells(with_cells(recorded.trace, "outcome", outside, "fault"), "cause", outside, "block-0")
+    assert set(damaged(recorded, forged)) == {"causes"}
+    free = ~recorded.plan[0].links[recorded.sender, recorded.receiver]
+    within = np.flatnonzero(free & recorded.outcome_is("lost") & (abs(recorded.sent_ns / 1e9 - 3) < 0.9))[0]
+    forged = with_cells(with_cells(recorded.trace, "outcome", within, "fault"), "cause", within, "block-0")
+    assert set(damaged(recorded, forged)) == {"causes"}
 
 
 def test_without_faults_nothing_may_be_their_doing() -> None:
-    evidence = simulated()
-    assert isinstance(result(evidence, "causes"), NotExercised)
-    row = some(evidence, "lost")[0]
-    assert set(damaged(evidence, with_cells(evidence.trace, "outcome", row, "fault"))) == {"causes"}
+    recorded = simulated()
+    assert isinstance(result(recorded, "causes"), NotExercised)
+    row = some(recorded, "lost")[0]
+    assert set(damaged(recorded, with_cells(recorded.trace, "outcome", row, "fault"))) == {"causes"}
 
 
 @pytest.mark.parametrize("kind", ["kill", "restart"])
 def test_a_packet_for_a_node_that_is_down_is_found(kind: str) -> None:
-    evidence = with_fault(kind)
+    recorded = with_fault(kind)
     for outcomes in (("receiver_down", "delivered"), ("delivered", "receiver_down")):
-        row = some(evidence, outcomes[0])[7]
-        forged = damaged(evidence, with_cells(evidence.trace, "outcome", row, outcomes[1]))
+        row = some(recorded, outcomes[0])[7]
+        forged = damaged(recorded, with_cells(recorded.trace, "outcome", row, outcomes[1]))
         assert set(forged) == {"down_respected"}
         assert len(forged["down_respected"].figures["rows"]) == 1
 
@@ -247,37 +247,37 @@ def test_a_fix_in_an_outage_or_none_without_is_found(seconds: float) -> None:
 
 @pytest.mark.parametrize("kind", ["loss", "burst_loss"])
 def test_a_fault_that_loses_too_little_or_too_much_is_found(kind: str) -> None:
-    evidence = with_fault(kind)
+    recorded = with_fault(kind)
     label = f"{kind}-0"
-    hit = some(evidence, "fault", cause=label)
-    spared = with_cells(evidence.trace, "cause", hit[: 4 * len(hit) // 5], "")
+    hit = some(recorded, "fault", cause=label)
+    spared = with_cells(recorded.trace, "cause", hit[: 4 * len(hit) // 5], "")
     spared = with_cells(spared, "outcome", hit[: 4 * len(hit) // 5], "delivered")
-    assert set(damaged(evidence, spared)) == {f"loss_rate:{label}"}
-    passed = [row for row in some(evidence, "delivered") if AT_S <= evidence.sent_ns[row] / 1e9 < AT_S + DURATION_S]
-    more = with_cells(evidence.trace, "cause", passed[:150], label)
+    assert set(damaged(recorded, spared)) == {f"loss_rate:{label}"}
+    passed = [row for row in some(recorded, "delivered") if AT_S <= recorded.sent_ns[row] / 1e9 < AT_S + DURATION_S]
+    more = with_cells(recorded.trace, "cause", passed[:150], label)
     more = with_cells(more, "outcome", passed[:150], "fault")
-    assert f"loss_rate:{label}" in damaged(evidence, more)
+    assert f"loss_rate:{label}" in damaged(recorded, more)
 
 
 @pytest.mark.parametrize("late_ms", [0.5, 40.0])
 @pytest.mark.parametrize("kind", ["gnss_jump", "delay", "throttle"])
 def test_an_arrival_that_is_too_early_or_too_late_is_found(kind: str, late_ms: float) -> None:
-    evidence = with_fault(kind)
-    row = some(evidence, "delivered")[3]
-    arrival_ns = int(evidence.sent_ns[row] + late_ms * 1e6)
-    found = damaged(evidence, with_cells(evidence.trace, "arrival_ns", row, arrival_ns))
+    recorded = with_fault(kind)
+    row = some(recorded, "delivered")[3]
+    arrival_ns = int(recorded.sent_ns[row] + late_ms * 1e6)
+    found = damaged(recorded, with_cells(recorded.trace, "arrival_ns", row, arrival_ns))
     assert set(found) == {"latency"}
     assert len(found["latency"].figures["rows"]) == 1
 
 
 def test_latencies_that_are_all_possible_and_together_are_not() -> None:
-    evidence = with_fault("gnss_jump")
-    arrived = np.flatnonzero(evidence.arrived)
-    arrivals = evidence.trace["arrival_ns"].to_pylist()
+    recorded = with_fault("gnss_jump")
+    arrived = np.flatnonzero(recorded.arrived)
+    arrivals = recorded.trace["arrival_ns"].to_pylist()
     for row in arrived.tolist():
-        arrivals[row] = int(evidence.sent_ns[row]) + 2_500_000
-    index = evidence.trace.column_names.index("arrival_ns")
-    assert set(damaged(evidence, evidence.trace.set_column(index, "arrival_ns", pa.array(arrivals)))) == {"latency"}
+        arrivals[row] = int(recorded.sent_ns[row]) + 2_500_000
+    index = recorded.trace.column_names.index("arrival_ns")
+    assert set(damaged(recorded, recorded.trace.set_column(index, "arrival_ns", pa.array(arrivals)))) == {"latency"}
 
 
 def test_a_delay_that_a_fault_owed_is_missed() -> None:
@@ -288,45 +288,45 @@ def test_a_delay_that_a_fault_owed_is_missed() -> None:
 
 @pytest.mark.parametrize("kind", ["gnss_jump", "duplicate", "DoS", "DataReplay"])
 def test_other_bytes_than_were_sent_are_found(kind: str) -> None:
-    evidence = with_fault(kind)
+    recorded = with_fault(kind)
     copies = kind != "gnss_jump"
-    row = some(evidence, "delivered", cause=f"{kind}-0" if copies else "", copies=copies)[2]
-    assert set(damaged(evidence, with_cells(evidence.trace, "payload_digest", row, 12345))) == {"isolation"}
+    row = some(recorded, "delivered", cause=f"{kind}-0" if copies else "", copies=copies)[2]
+    assert set(damaged(recorded, with_cells(recorded.trace, "payload_digest", row, 12345))) == {"isolation"}
 
 
 def test_a_stale_frame_of_another_age_is_found() -> None:
-    evidence = with_fault("StaleMessages")
+    recorded = with_fault("StaleMessages")
     label = "StaleMessages-0"
-    rows = np.concatenate([some(evidence, outcome, cause=label) for outcome in ("delivered", "lost")])
-    same = rows[evidence.frame[rows] == evidence.frame[rows[0]]]
+    rows = np.concatenate([some(recorded, outcome, cause=label) for outcome in ("delivered", "lost")])
+    same = rows[recorded.frame[rows] == recorded.frame[rows[0]]]
     assert len(same) > 1
-    assert set(damaged(evidence, with_cells(evidence.trace, "payload_digest", same, 12345))) == {"isolation"}
+    assert set(damaged(recorded, with_cells(recorded.trace, "payload_digest", same, 12345))) == {"isolation"}
 
 
 def test_a_program_that_heard_more_than_arrived_is_found() -> None:
-    evidence = with_fault("partition")
-    rows = evidence.states.to_pylist()
+    recorded = with_fault("partition")
+    rows = recorded.states.to_pylist()
     rows[-1]["values"] = [("heard", [2000.0])]
-    found = not_valid(replace(evidence, states=pa.Table.from_pylist(rows, schema=STATES)))
+    found = not_valid(replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES)))
     assert found == {"isolation": Verdict.INVALID}
 
 
 def test_copies_without_a_cause_or_with_a_number_missing_break_conservation() -> None:
-    evidence = with_fault("DoS")
-    row = some(evidence, "delivered", cause="DoS-0", copies=True)[0]
-    assert set(damaged(evidence, with_cells(evidence.trace, "cause", row, ""))) == {"conservation"}
-    kept = evidence.trace.filter(pa.array(evidence.emission != evidence.emission[row]))
-    assert damaged(evidence, kept)["conservation"].figures["missing_frames"] == 1
-    assert set(damaged(evidence, kept)) == {"conservation", "copies"}
+    recorded = with_fault("DoS")
+    row = some(recorded, "delivered", cause="DoS-0", copies=True)[0]
+    assert set(damaged(recorded, with_cells(recorded.trace, "cause", row, ""))) == {"conservation"}
+    kept = recorded.trace.filter(pa.array(recorded.emission != recorded.emission[row]))
+    assert damaged(recorded, kept)["conservation"].figures["missing_frames"] == 1
+    assert set(damaged(recorded, kept)) == {"conservation", "copies"}
 
 
 @pytest.mark.parametrize("kind", ["DoS", "Sybil"])
 def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) -> None:
-    evidence = with_fault(kind)
-    rows = some(evidence, "delivered", "lost", cause=f"{kind}-0", copies=True)
-    last = rows[evidence.copy[rows] == evidence.copy.max()][0]
-    kept = evidence.trace.filter(pa.array(evidence.emission != evidence.emission[last]))
-    found = damaged(evidence, kept)
+    recorded = with_fault(kind)
+    rows = some(recorded, "delivered", "lost", cause=f"{kind}-0", copies=True)
+    last = rows[recorded.copy[rows] == recorded.copy.max()][0]
+    kept = recorded.trace.filter(pa.array(recorded.emission != recorded.emission[last]))
+    found = damaged(recorded, kept)
     assert set(found) == {"copies"}
     assert found["copies"].figures["miscounted"] == 1
 
@@ -340,46 +340,46 @@ def test_a_replay_of_another_age_is_found() -> None:
 
 @pytest.mark.parametrize(("kind", "key"), [("gnss_jump", "offset_m"), ("gnss_ramp", "rate_m_s")])
 def test_fixes_that_stray_otherwise_than_they_should_are_found(kind: str, key: str) -> None:
-    evidence = with_fault(kind)
-    less = evidence.scenario.fault[0].model_copy(update={key: (4.0, 2.0)})
-    scenario = evidence.scenario.model_copy(update={"fault": (less,)})
-    assert not_valid(replace(evidence, scenario=scenario)) == {"gnss": Verdict.INVALID}
-    assert result(replace(evidence, scenario=scenario), "gnss").figures["rows"][0]["under"] == f"{kind}-0"
+    recorded = with_fault(kind)
+    less = recorded.scenario.fault[0].model_copy(update={key: (4.0, 2.0)})
+    scenario = recorded.scenario.model_copy(update={"fault": (less,)})
+    assert not_valid(replace(recorded, scenario=scenario)) == {"gnss": Verdict.INVALID}
+    assert result(replace(recorded, scenario=scenario), "gnss").figures["rows"][0]["under"] == f"{kind}-0"
 
 
 def test_a_receiver_that_is_too_good_or_too_bad_is_found() -> None:
-    evidence = with_fault("partition")
+    recorded = with_fault("partition")
     for sigma_m in (0.8, 1.3):
-        gnss = evidence.scenario.world.gnss.model_copy(update={"sigma_m": sigma_m})
-        world = evidence.scenario.world.model_copy(update={"gnss": gnss})
-        forged = replace(evidence, scenario=evidence.scenario.model_copy(update={"world": world}))
+        gnss = recorded.scenario.world.gnss.model_copy(update={"sigma_m": sigma_m})
+        world = recorded.scenario.world.model_copy(update={"gnss": gnss})
+        forged = replace(recorded, scenario=recorded.scenario.model_copy(update={"world": world}))
         assert not_valid(forged) == {"gnss": Verdict.INVALID}
 
 
 def test_bytes_that_a_corruption_left_alone_show_none() -> None:
-    evidence = with_fault("corrupt")
-    rows = some(evidence, "delivered", cause="corrupt-0")
-    said = {int(evidence.frame[row]): int(evidence.digest[row]) for row in some(evidence, "delivered", "lost")}
-    digests = evidence.trace["payload_digest"].to_pylist()
+    recorded = with_fault("corrupt")
+    rows = some(recorded, "delivered", cause="corrupt-0")
+    said = {int(recorded.frame[row]): int(recorded.digest[row]) for row in some(recorded, "delivered", "lost")}
+    digests = recorded.trace["payload_digest"].to_pylist()
     for row in rows.tolist():
-        digests[row] = said.get(int(evidence.frame[row]), digests[row])
-    index = evidence.trace.column_names.index("payload_digest")
-    spared = evidence.trace.set_column(index, "payload_digest", pa.array(digests, pa.uint64()))
-    assert not_valid(replace(evidence, trace=spared)) == {"bit:corrupt-0": Verdict.UNKNOWN}
+        digests[row] = said.get(int(recorded.frame[row]), digests[row])
+    index = recorded.trace.column_names.index("payload_digest")
+    spared = recorded.trace.set_column(index, "payload_digest", pa.array(digests, pa.uint64()))
+    assert not_valid(replace(recorded, trace=spared)) == {"bit:corrupt-0": Verdict.UNKNOWN}
 
 
 def test_a_copy_of_nothing_breaks_conservation() -> None:
-    evidence = with_fault("duplicate")
-    row = some(evidence, "delivered", cause="duplicate-0", copies=True)[0]
-    found = damaged(evidence, with_cells(evidence.trace, "seq", row, 59))
+    recorded = with_fault("duplicate")
+    row = some(recorded, "delivered", cause="duplicate-0", copies=True)[0]
+    found = damaged(recorded, with_cells(recorded.trace, "seq", row, 59))
     assert found["conservation"].figures["orphans"] == 1
 
 
 def test_an_arrival_before_the_sending_or_without_a_time_breaks_conservation() -> None:
-    evidence = with_fault("gnss_jump")
-    row = some(evidence, "delivered")[0]
-    for arrival_ns, checks in ((None, {"conservation"}), (int(evidence.sent_ns[row]), {"conservation", "latency"})):
-        found = damaged(evidence, with_cells(evidence.trace, "arrival_ns", row, arrival_ns))
+    recorded = with_fault("gnss_jump")
+    row = some(recorded, "delivered")[0]
+    for arrival_ns, checks in ((None, {"conservation"}), (int(recorded.sent_ns[row]), {"conservation", "latency"})):
+        found = damaged(recorded, with_cells(recorded.trace, "arrival_ns", row, arrival_ns))
         assert set(found) == checks
         assert found["conservation"].figures["mistimed"] == 1
 
@@ -394,32 +394,32 @@ def test_a_fault_that_acts_on_nobody_is_unknown(kind: str) -> None:
 
 
 def test_a_fault_that_the_run_did_not_come_to_is_unknown() -> None:
-    evidence = with_fault("loss")
-    cut = replace(evidence, events=[*evidence.events, Event(1_500_000_000, "interrupted", None, {})])
+    recorded = with_fault("loss")
+    cut = replace(recorded, events=[*recorded.events, Event(1_500_000_000, "interrupted", None, {})])
     assert verdict(cut, "bit:loss-0") is Verdict.UNKNOWN
 
 
 def test_restarts_of_the_router_need_an_event_where_there_is_a_router() -> None:
-    evidence = with_fault("router_restart")
-    live = [Event(0, "started", None, {"start_up_s": 2.0}), *evidence.events[1:]]
-    assert verdict(replace(evidence, events=live), "bit:router_restart-0") is Verdict.UNKNOWN
+    recorded = with_fault("router_restart")
+    live = [Event(0, "started", None, {"start_up_s": 2.0}), *recorded.events[1:]]
+    assert verdict(replace(recorded, events=live), "bit:router_restart-0") is Verdict.UNKNOWN
     told = [*live, Event(2_000_000_000, "router_restarted", None, {"fault": "router_restart-0"})]
-    assert verdict(replace(evidence, events=told), "bit:router_restart-0") is Verdict.VALID
+    assert verdict(replace(recorded, events=told), "bit:router_restart-0") is Verdict.VALID
 
 
 @pytest.mark.parametrize("kind", ["kill", "loss"])
 def test_a_node_that_falls_silent_after_the_last_fault_is_found(kind: str) -> None:
-    evidence = with_fault(kind)
-    node = evidence.node_ids[int(np.flatnonzero(evidence.plan[0].nodes)[0])]
-    silent = without_reports(evidence, node, AT_S if kind == "kill" else 4.5)
+    recorded = with_fault(kind)
+    node = recorded.node_ids[int(np.flatnonzero(recorded.plan[0].nodes)[0])]
+    silent = without_reports(recorded, node, AT_S if kind == "kill" else 4.5)
     assert not_valid(silent) == {"liveness": Verdict.INVALID}
     assert result(silent, "liveness").figures["rows"][0]["node"] == node
 
 
 def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:
-    evidence = with_fault("loss")
-    assert not_valid(without_reports(evidence, "v03", 5.1)) == {}
-    dead = replace(evidence, events=[*evidence.events, Event(4_500_000_000, "crashed", "v03", {"error": "tired"})])
+    recorded = with_fault("loss")
+    assert not_valid(without_reports(recorded, "v03", 5.1)) == {}
+    dead = replace(recorded, events=[*recorded.events, Event(4_500_000_000, "crashed", "v03", {"error": "tired"})])
     assert verdict(without_reports(dead, "v03", 4.5), "liveness") is Verdict.VALID
 
 
@@ -433,8 +433,8 @@ async def starts_late_and_ends(node: Node) -> None:
 
 
 def test_a_program_may_start_late_and_end_with_a_report() -> None:
-    evidence = simulated(program=f"{__name__}:starts_late_and_ends")
-    assert verdict(evidence, "liveness") is verdict(evidence, "down_respected") is Verdict.VALID
+    recorded = simulated(program=f"{__name__}:starts_late_and_ends")
+    assert verdict(recorded, "liveness") is verdict(recorded, "down_respected") is Verdict.VALID
 
 
 def test_where_the_machine_did_not_keep_up_silence_is_unknown() -> None:
@@ -444,11 +444,11 @@ def test_where_the_machine_did_not_keep_up_silence_is_unknown() -> None:
 
 
 def test_a_death_that_a_fault_wanted_is_none() -> None:
-    evidence = with_fault("kill")
-    killed = evidence.node_ids[int(np.flatnonzero(evidence.plan[0].nodes)[0])]
+    recorded = with_fault("kill")
+    killed = recorded.node_ids[int(np.flatnonzero(recorded.plan[0].nodes)[0])]
     for time_s, expected in ((2.1, Verdict.VALID), (1.9, Verdict.INVALID)):
         died = Event(round(time_s * 1e9), "died", killed, {"how": "SIGKILL"})
-        assert verdict(replace(evidence, events=[*evidence.events, died]), "agents_alive") is expected
+        assert verdict(replace(recorded, events=[*recorded.events, died]), "agents_alive") is expected
 
 
 @pytest.mark.parametrize(
@@ -456,23 +456,23 @@ def test_a_death_that_a_fault_wanted_is_none() -> None:
     [(0.0, "v01", Verdict.VALID), (500.0, "v01", Verdict.INVALID), (500.0, "emulator", None)],
 )
 def test_memory_is_judged_by_its_growth(growth_kb_per_s: float, node: str, expected: Verdict | None) -> None:
-    evidence = with_fault("loss")
+    recorded = with_fault("loss")
     time_s = [2.0 * n for n in range(30)]
     rss_kb = [90_000 + round(growth_kb_per_s * t) for t in time_s]
     measured = Event(60_000_000_000, "memory", node, {"time_s": time_s, "rss_kb": rss_kb})
-    judged = replace(evidence, events=[*evidence.events, measured])
+    judged = replace(recorded, events=[*recorded.events, measured])
     if expected is None:
         assert isinstance(result(judged, "memory"), NotExercised)
     else:
         assert verdict(judged, "memory") is expected
-    assert isinstance(result(evidence, "memory"), NotExercised)
+    assert isinstance(result(recorded, "memory"), NotExercised)
 
 
 def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> None:
-    evidence = with_fault("DataReplay")
-    replayed = some(evidence, "delivered", "lost", cause="DataReplay-0", copies=True)
-    original = evidence.sent_ns[(evidence.copy == 0) & (evidence.frame == evidence.frame[replayed[5]])][0]
+    recorded = with_fault("DataReplay")
+    replayed = some(recorded, "delivered", "lost", cause="DataReplay-0", copies=True)
+    original = recorded.sent_ns[(recorded.copy == 0) & (recorded.frame == recorded.frame[replayed[5]])][0]
     other = parse_fault({"kind": "gnss_outage", "at_s": original / 1e9, "duration_s": 0.5, "nodes": {"random": 1}})
-    run = evidence.scenario.run.model_copy(update={"pacing": "realtime"})
-    both = evidence.scenario.model_copy(update={"run": run, "fault": (*evidence.scenario.fault, other)})
-    assert verdict(replace(evidence, scenario=both), "copies") is Verdict.VALID
+    run = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
+    both = recorded.scenario.model_copy(update={"run": run, "fault": (*recorded.scenario.fault, other)})
+    assert verdict(replace(recorded, scenario=both), "copies") is Verdict.VALID

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binom
 
-from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -29,32 +29,32 @@ async def first_only(node: Node) -> None:
             await node.radio.broadcast(b"hello")
 
 
-def run(folder: Path, program: str = "agents.beacon:main", vehicles: int = 5, **sections: dict) -> Evidence:
+def run(folder: Path, program: str = "agents.beacon:main", vehicles: int = 5, **sections: dict) -> RecordedRun:
     """Simulate a small dense network and keep it in `folder`."""
     settings = {"network": {"vehicles": vehicles, "layout": "dense"}, "program": {"entry": program}}
     return run_scenario(folder, Scenario.model_validate({"run": {"duration_s": 1.0}, **settings, **sections}))
 
 
-def run_scenario(folder: Path, scenario: Scenario) -> Evidence:
+def run_scenario(folder: Path, scenario: Scenario) -> RecordedRun:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
     tables = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
-    return Evidence(scenario, read_trace(folder / "trace.parquet"), *tables, read_events(folder))
+    return RecordedRun(scenario, read_trace(folder / "trace.parquet"), *tables, read_events(folder))
 
 
 @pytest.fixture(scope="module")
-def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return run(tmp_path_factory.mktemp("checks") / "run", radio={"loss": 0.2})
 
 
-def result(evidence: Evidence, name: str) -> CheckResult | NotExercised:
-    judgement = judge(evidence)
+def result(recorded: RecordedRun, name: str) -> CheckResult | NotExercised:
+    judgement = judge(recorded)
     return next(check for check in [*judgement.checks, *judgement.not_exercised] if check.name == name)
 
 
-def verdict(evidence: Evidence, name: str) -> Verdict:
-    found = result(evidence, name)
+def verdict(recorded: RecordedRun, name: str) -> Verdict:
+    found = result(recorded, name)
     assert isinstance(found, CheckResult)
     return found.verdict
 
@@ -83,17 +83,17 @@ def figures(check: CheckResult | NotExercised) -> dict:
     return {name: figure for name, figure in check.figures.items() if name != "rows"}
 
 
-def test_without_events_nothing_is_known_of_the_course_of_a_run(evidence: Evidence) -> None:
-    silent = replace(evidence, events=[])
+def test_without_events_nothing_is_known_of_the_course_of_a_run(recorded: RecordedRun) -> None:
+    silent = replace(recorded, events=[])
     assert verdict(silent, "agents_alive") is Verdict.UNKNOWN
     assert verdict(silent, "progress") is Verdict.UNKNOWN
-    assert verdict(replace(evidence, events=[Event(0, "started", None, {})]), "progress") is Verdict.UNKNOWN
+    assert verdict(replace(recorded, events=[Event(0, "started", None, {})]), "progress") is Verdict.UNKNOWN
 
 
 @pytest.mark.parametrize("table", ["states", "metrics"])
-def test_a_run_that_kept_half_its_periods_is_unknown(evidence: Evidence, table: str) -> None:
-    rows = getattr(evidence, table)
-    half = replace(evidence, **{table: rows.slice(0, len(rows) // 2)})
+def test_a_run_that_kept_half_its_periods_is_unknown(recorded: RecordedRun, table: str) -> None:
+    rows = getattr(recorded, table)
+    half = replace(recorded, **{table: rows.slice(0, len(rows) // 2)})
     assert verdict(half, "progress") is Verdict.UNKNOWN
 
 
@@ -112,45 +112,45 @@ def test_one_vehicle_alone_has_no_radio_to_judge(tmp_path: Path) -> None:
 
 def test_a_cap_that_could_act_and_never_did_is_unknown(tmp_path: Path) -> None:
     radio = {"max_peers": 2}
-    evidence = run(tmp_path / "run", program=f"{__name__}:first_only", vehicles=6, radio=radio)
-    assert verdict(evidence, "peer_cap") is Verdict.VALID
-    uncapped = evidence.trace.filter(pa.array(~evidence.outcome_is("peer_cap")))
-    assert verdict(replace(evidence, trace=uncapped), "peer_cap") is Verdict.UNKNOWN
+    recorded = run(tmp_path / "run", program=f"{__name__}:first_only", vehicles=6, radio=radio)
+    assert verdict(recorded, "peer_cap") is Verdict.VALID
+    uncapped = recorded.trace.filter(pa.array(~recorded.outcome_is("peer_cap")))
+    assert verdict(replace(recorded, trace=uncapped), "peer_cap") is Verdict.UNKNOWN
 
 
-def test_an_outcome_outside_the_closed_set_breaks_conservation(evidence: Evidence) -> None:
+def test_an_outcome_outside_the_closed_set_breaks_conservation(recorded: RecordedRun) -> None:
     for word in ("vanished", "out_of_range", "pending"):
-        forged = replace(evidence, trace=with_names(evidence.trace, "outcome", 3, word))
+        forged = replace(recorded, trace=with_names(recorded.trace, "outcome", 3, word))
         assert verdict(forged, "conservation") is Verdict.INVALID
 
 
-def test_a_row_of_a_receiver_that_was_not_in_range_breaks_conservation(evidence: Evidence) -> None:
-    row = int(np.flatnonzero(evidence.outcome_is("lost"))[0])
-    sender = evidence.trace["sender"].cast(pa.string()).to_pylist()[row]
-    forged = result(replace(evidence, trace=with_names(evidence.trace, "receiver", row, sender)), "conservation")
+def test_a_row_of_a_receiver_that_was_not_in_range_breaks_conservation(recorded: RecordedRun) -> None:
+    row = int(np.flatnonzero(recorded.outcome_is("lost"))[0])
+    sender = recorded.trace["sender"].cast(pa.string()).to_pylist()[row]
+    forged = result(replace(recorded, trace=with_names(recorded.trace, "receiver", row, sender)), "conservation")
     assert isinstance(forged, CheckResult)
     assert forged.verdict is Verdict.INVALID
     assert forged.figures["not_in_range"] == 1
 
 
-def test_a_trace_of_another_run_is_refused_in_one_line(evidence: Evidence) -> None:
+def test_a_trace_of_another_run_is_refused_in_one_line(recorded: RecordedRun) -> None:
     with pytest.raises(VnetError, match="'ghost'"):
-        judge(replace(evidence, trace=with_names(evidence.trace, "receiver", 0, "ghost")))
+        judge(replace(recorded, trace=with_names(recorded.trace, "receiver", 0, "ghost")))
 
 
-def test_deliveries_that_were_never_timed_leave_real_time_unknown(evidence: Evidence) -> None:
-    settings = evidence.scenario.run.model_copy(update={"pacing": "realtime"})
-    scenario = evidence.scenario.model_copy(update={"run": settings})
+def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: RecordedRun) -> None:
+    settings = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
+    scenario = recorded.scenario.model_copy(update={"run": settings})
     for count, total, expected in ((0, 0, Verdict.UNKNOWN), (1, 5000, Verdict.VALID), (9, 5000, Verdict.UNKNOWN)):
         late = Event(0, "late_deliveries", None, {"count": count, "total": total, "p99_ms": 1.0})
-        timed = replace(evidence, scenario=scenario, events=[*evidence.events, late])
+        timed = replace(recorded, scenario=scenario, events=[*recorded.events, late])
         assert verdict(timed, "kept_up") is expected
 
 
 HEADER = "id,x_m,y_m,heading_rad"
 
 
-def four(folder: Path, program: str = "agents.beacon:main", **sections: dict) -> Evidence:
+def four(folder: Path, program: str = "agents.beacon:main", **sections: dict) -> RecordedRun:
     """Four vehicles on a line, a kilometre apart; with a range of 2.1 km the ends do not hear each other."""
     lines = [HEADER, *(f"v{number},{1000 * number},0,1.5" for number in range(4))]
     (folder / "four.csv").write_text("\n".join(lines) + "\n")
@@ -161,36 +161,36 @@ def four(folder: Path, program: str = "agents.beacon:main", **sections: dict) ->
 
 
 @pytest.fixture(scope="module")
-def line(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def line(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return four(tmp_path_factory.mktemp("line"))
 
 
-def damaged(evidence: Evidence, trace: pa.Table) -> dict[str, CheckResult]:
+def damaged(recorded: RecordedRun, trace: pa.Table) -> dict[str, CheckResult]:
     """The checks that a changed trace turns away from valid."""
-    checks = judge(replace(evidence, trace=trace)).checks
+    checks = judge(replace(recorded, trace=trace)).checks
     return {check.name: check for check in checks if check.verdict is not Verdict.VALID}
 
 
-def first(evidence: Evidence, outcome: str) -> int:
-    return int(np.flatnonzero(evidence.outcome_is(outcome))[0])
+def first(recorded: RecordedRun, outcome: str) -> int:
+    return int(np.flatnonzero(recorded.outcome_is(outcome))[0])
 
 
 def without(table: pa.Table, row: int) -> pa.Table:
     return pa.concat_tables([table.slice(0, row), table.slice(row + 1)])
 
 
-def with_lost(evidence: Evidence, count: int) -> pa.Table:
+def with_lost(recorded: RecordedRun, count: int) -> pa.Table:
     """The trace with exactly `count` of the pairs that came as far as the loss lost."""
-    drawn = np.flatnonzero(evidence.outcome_is("lost", "delivered"))
-    names = np.array(evidence.trace["outcome"].cast(pa.string()).to_pylist(), dtype=object)
+    drawn = np.flatnonzero(recorded.outcome_is("lost", "delivered"))
+    names = np.array(recorded.trace["outcome"].cast(pa.string()).to_pylist(), dtype=object)
     names[drawn] = "delivered"
     names[drawn[:count]] = "lost"
-    index = evidence.trace.column_names.index("outcome")
+    index = recorded.trace.column_names.index("outcome")
     column = pa.array(names.tolist(), pa.string()).dictionary_encode()
-    return timely(evidence.trace.set_column(index, "outcome", column))
+    return timely(recorded.trace.set_column(index, "outcome", column))
 
 
-def test_an_honest_line_of_four_is_valid_with_its_figures(line: Evidence) -> None:
+def test_an_honest_line_of_four_is_valid_with_its_figures(line: RecordedRun) -> None:
     assert damaged(line, line.trace) == {}
     conservation, range_ = result(line, "conservation"), result(line, "range")
     assert isinstance(conservation, CheckResult)
@@ -211,21 +211,21 @@ def test_an_honest_line_of_four_is_valid_with_its_figures(line: Evidence) -> Non
 
 
 @pytest.mark.parametrize("outcome", ["lost", "delivered"])
-def test_a_dropped_row_is_a_frame_with_too_few_pairs(line: Evidence, outcome: str) -> None:
+def test_a_dropped_row_is_a_frame_with_too_few_pairs(line: RecordedRun, outcome: str) -> None:
     found = damaged(line, without(line.trace, first(line, outcome)))
     assert {name: check.verdict for name, check in found.items()} == {"conservation": Verdict.INVALID}
     assert found["conservation"].figures["wrong_count"] == 1
     assert found["conservation"].figures["pairs"] == len(line.trace) - 1
 
 
-def test_a_repeated_row_is_one_too_many(line: Evidence) -> None:
+def test_a_repeated_row_is_one_too_many(line: RecordedRun) -> None:
     row = first(line, "lost")
     found = damaged(line, pa.concat_tables([line.trace, line.trace.slice(row, 1)]))
     assert {name: check.verdict for name, check in found.items()} == {"conservation": Verdict.INVALID}
     assert found["conservation"].figures["repeated"] == 1
 
 
-def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: Evidence) -> None:
+def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: RecordedRun) -> None:
     senders = line.nodes("sender")
     row = int(np.flatnonzero(line.outcome_is("delivered") & (senders == 0))[0])
     found = damaged(line, with_names(line.trace, "receiver", row, "v3"))
@@ -238,7 +238,7 @@ def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: 
     assert found["conservation"].figures["not_in_range"] == 1
 
 
-def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(line: Evidence) -> None:
+def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(line: RecordedRun) -> None:
     drawn = int(line.outcome_is("lost", "delivered").sum())
     low, high = (int(edge) for edge in binom.interval(0.999, drawn, 0.2))
     assert damaged(line, with_lost(line, low)) == damaged(line, with_lost(line, high)) == {}
@@ -257,18 +257,18 @@ def test_the_loss_rate_is_valid_up_to_the_border_of_its_band_and_invalid_beyond(
 
 @pytest.mark.parametrize(("loss", "wrong"), [(0.0, 1), (1.0, -1)])
 def test_without_chance_a_single_pair_decides(tmp_path: Path, loss: float, wrong: int) -> None:
-    evidence = four(tmp_path, radio={"loss": loss})
-    lost = int(evidence.outcome_is("lost").sum())
-    assert verdict(evidence, "loss_rate") is Verdict.VALID
-    assert damaged(evidence, with_lost(evidence, lost + wrong))["loss_rate"].verdict is Verdict.INVALID
+    recorded = four(tmp_path, radio={"loss": loss})
+    lost = int(recorded.outcome_is("lost").sum())
+    assert verdict(recorded, "loss_rate") is Verdict.VALID
+    assert damaged(recorded, with_lost(recorded, lost + wrong))["loss_rate"].verdict is Verdict.INVALID
 
 
 def test_when_everything_is_lost_nothing_is_known_of_the_range(tmp_path: Path) -> None:
-    evidence = four(tmp_path, radio={"loss": 1.0})
-    judgement = judge(evidence)
+    recorded = four(tmp_path, radio={"loss": 1.0})
+    judgement = judge(recorded)
     unseen = {check.name for check in judgement.checks if check.verdict is not Verdict.VALID}
     assert unseen == {"range", "latency", "isolation"}
-    assert verdict(evidence, "range") is Verdict.UNKNOWN
+    assert verdict(recorded, "range") is Verdict.UNKNOWN
     assert check_run(tmp_path / "run").exit_status == judgement.exit_status == 3
 
 
@@ -283,37 +283,37 @@ async def dies_early(node: Node) -> None:
 
 
 def test_a_death_makes_room_under_the_cap_and_is_told_with_its_figures(tmp_path: Path) -> None:
-    evidence = four(tmp_path, f"{__name__}:dies_early", radio={"max_peers": 1, "loss": 0.0})
-    assert verdict(evidence, "peer_cap") is Verdict.VALID
-    alive = result(evidence, "agents_alive")
+    recorded = four(tmp_path, f"{__name__}:dies_early", radio={"max_peers": 1, "loss": 0.0})
+    assert verdict(recorded, "peer_cap") is Verdict.VALID
+    alive = result(recorded, "agents_alive")
     assert isinstance(alive, CheckResult)
     assert alive.verdict is Verdict.INVALID
     assert [(gone["node"], gone["time_ns"], gone["kind"]) for gone in alive.figures["gone"]] == [
         ("v1", 500_000_000, "crashed")
     ]
-    assert judge(evidence).exit_status == check_run(tmp_path / "run").exit_status == 1
+    assert judge(recorded).exit_status == check_run(tmp_path / "run").exit_status == 1
     # v0 hears v1 as long as v1 lives, and then v2: without the death v2 would be beyond the cap for ever.
-    found = judge(replace(evidence, events=[e for e in evidence.events if e.kind != "crashed"])).checks
+    found = judge(replace(recorded, events=[e for e in recorded.events if e.kind != "crashed"])).checks
     wrong = next(check for check in found if check.name == "peer_cap")
     assert wrong.verdict is Verdict.INVALID
     assert wrong.figures["wrong"] > 0
 
 
 def test_each_pair_on_the_wrong_side_of_the_cap_is_counted(tmp_path: Path) -> None:
-    evidence = four(tmp_path, radio={"max_peers": 1, "loss": 0.0})
-    capped, heard = first(evidence, "peer_cap"), first(evidence, "delivered")
-    forged = with_names(with_names(evidence.trace, "outcome", capped, "delivered"), "outcome", heard, "peer_cap")
-    found = damaged(evidence, forged)
+    recorded = four(tmp_path, radio={"max_peers": 1, "loss": 0.0})
+    capped, heard = first(recorded, "peer_cap"), first(recorded, "delivered")
+    forged = with_names(with_names(recorded.trace, "outcome", capped, "delivered"), "outcome", heard, "peer_cap")
+    found = damaged(recorded, forged)
     assert {name: check.verdict for name, check in found.items()} == {"peer_cap": Verdict.INVALID}
     assert figures(found["peer_cap"]) == {
         "cap": 1,
         "largest_in_range": 3,
-        "capped": int(evidence.outcome_is("peer_cap").sum()),
+        "capped": int(recorded.outcome_is("peer_cap").sum()),
         "wrong": 2,
     }
 
 
-def test_deliveries_that_the_machine_lost_are_unknown_and_not_the_radio(line: Evidence) -> None:
+def test_deliveries_that_the_machine_lost_are_unknown_and_not_the_radio(line: RecordedRun) -> None:
     found = damaged(line, with_names(line.trace, "outcome", first(line, "delivered"), "transport"))
     assert {name: check.verdict for name, check in found.items()} == {"transport": Verdict.UNKNOWN}
     assert found["transport"].figures == {"gaps": 0, "lost": 1}
@@ -334,11 +334,11 @@ def test_numbers_that_are_none_are_counted(tmp_path: Path) -> None:
 
 
 def test_programs_that_report_nothing_have_nothing_to_be_finite(tmp_path: Path) -> None:
-    evidence = four(tmp_path, f"{__name__}:dies_early")
-    assert result(evidence, "finite") == NotExercised("finite", "the program reports nothing")
+    recorded = four(tmp_path, f"{__name__}:dies_early")
+    assert result(recorded, "finite") == NotExercised("finite", "the program reports nothing")
 
 
-def test_invalid_wins_over_unknown_over_valid_in_a_run(line: Evidence) -> None:
+def test_invalid_wins_over_unknown_over_valid_in_a_run(line: RecordedRun) -> None:
     unknown = with_names(line.trace, "outcome", first(line, "delivered"), "transport")
     both = without(unknown, first(line, "lost"))
     statuses = [judge(replace(line, trace=trace)).exit_status for trace in (line.trace, unknown, both)]
@@ -353,21 +353,21 @@ def test_a_matrix_run_is_judged_by_its_matrix(tmp_path: Path, written: bool) -> 
     """Vehicles 0 and 3 are out of range, 1 and 0 well within it: only the matrix explains who heard whom."""
     path = tmp_path / "links.csv"
     path.write_text("\n".join(",".join(map(str, row)) for row in FORK))
-    evidence = four(tmp_path, radio={"links": path if written else FORK, "max_peers": 2})
-    assert damaged(evidence, evidence.trace) == {}
-    assert verdict(evidence, "peer_cap") is Verdict.VALID, "the cap of 2 acts on vehicle 3"
+    recorded = four(tmp_path, radio={"links": path if written else FORK, "max_peers": 2})
+    assert damaged(recorded, recorded.trace) == {}
+    assert verdict(recorded, "peer_cap") is Verdict.VALID, "the cap of 2 acts on vehicle 3"
     assert check_run(tmp_path / "run").verdict is Verdict.VALID
-    pairs = set(zip(evidence.nodes("sender").tolist(), evidence.nodes("receiver").tolist(), strict=True))
+    pairs = set(zip(recorded.nodes("sender").tolist(), recorded.nodes("receiver").tolist(), strict=True))
     assert pairs == {(0, 1), (1, 2), (0, 3), (1, 3), (2, 3)}
-    disc = evidence.scenario.radio.model_copy(update={"links": None})
-    by_range = replace(evidence, scenario=evidence.scenario.model_copy(update={"radio": disc}))
+    disc = recorded.scenario.radio.model_copy(update={"links": None})
+    by_range = replace(recorded, scenario=recorded.scenario.model_copy(update={"radio": disc}))
     assert verdict(by_range, "conservation") is Verdict.INVALID
 
 
 def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: Path) -> None:
-    evidence = four(tmp_path, radio={"links": FORK, "loss": 0.0})
-    row = int(np.flatnonzero((evidence.nodes("sender") == 1) & (evidence.nodes("receiver") == 2))[0])
-    found = damaged(evidence, with_names(evidence.trace, "receiver", row, "v0"))  # within range, but deaf to v1
+    recorded = four(tmp_path, radio={"links": FORK, "loss": 0.0})
+    row = int(np.flatnonzero((recorded.nodes("sender") == 1) & (recorded.nodes("receiver") == 2))[0])
+    found = damaged(recorded, with_names(recorded.trace, "receiver", row, "v0"))  # within range, but deaf to v1
     assert {name: check.verdict for name, check in found.items()} == {
         "conservation": Verdict.INVALID,
         "range": Verdict.INVALID,
@@ -376,9 +376,9 @@ def test_a_delivery_against_the_matrix_breaks_range_and_conservation(tmp_path: P
 
 
 def test_a_capped_pair_that_was_delivered_is_found_in_a_matrix_run(tmp_path: Path) -> None:
-    evidence = four(tmp_path, radio={"links": FORK, "loss": 0.0, "max_peers": 2})
-    forged = with_names(evidence.trace, "outcome", first(evidence, "peer_cap"), "delivered")
-    assert set(damaged(evidence, forged)) == {"peer_cap"}
+    recorded = four(tmp_path, radio={"links": FORK, "loss": 0.0, "max_peers": 2})
+    forged = with_names(recorded.trace, "outcome", first(recorded, "peer_cap"), "delivered")
+    assert set(damaged(recorded, forged)) == {"peer_cap"}
 
 
 def test_a_matrix_in_which_nobody_hears_leaves_no_radio_to_judge(tmp_path: Path) -> None:

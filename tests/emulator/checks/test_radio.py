@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -27,7 +27,7 @@ Change = Callable[[dict[str, Any], np.ndarray], None]
 """Changes the trace's columns, given which rows arrived."""
 
 
-def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) -> Evidence:
+def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) -> RecordedRun:
     """Twelve beacons within four kilometres for three seconds."""
     scenario = Scenario.model_validate(
         {
@@ -43,42 +43,44 @@ def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) 
     conclude(emulation, wall_s, "simulate")
     states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
     busy = pq.read_table(folder / "busy.parquet") if "mac" in radio else None
-    return Evidence(scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder), busy=busy)
+    return RecordedRun(
+        scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder), busy=busy
+    )
 
 
 @pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return run(tmp_path_factory.mktemp("shared") / "run", mac={})
 
 
 @pytest.fixture(scope="module")
-def faded(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def faded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return run(tmp_path_factory.mktemp("faded") / "run", fading={}, shadowing={}, mac={}, loss=0.1)
 
 
-def found(evidence: Evidence, name: str) -> CheckResult | NotExercised:
-    judgement = judge(evidence)
+def found(recorded: RecordedRun, name: str) -> CheckResult | NotExercised:
+    judgement = judge(recorded)
     return next(check for check in [*judgement.checks, *judgement.not_exercised] if check.name == name)
 
 
-def verdict(evidence: Evidence, name: str) -> Verdict:
-    check = found(evidence, name)
+def verdict(recorded: RecordedRun, name: str) -> Verdict:
+    check = found(recorded, name)
     assert isinstance(check, CheckResult), check
     return check.verdict
 
 
-def changed(evidence: Evidence, change: Change) -> Evidence:
+def changed(recorded: RecordedRun, change: Change) -> RecordedRun:
     """The evidence with some columns of the trace changed."""
-    trace = evidence.trace
+    trace = recorded.trace
     names = ("sent_ns", "on_air_ns", "left_ns", "arrival_ns", "outcome")
     columns = {
         name: trace[name].cast(pa.string() if name == "outcome" else pa.int64()).to_pylist() for name in names
     }
-    change(columns, np.flatnonzero(evidence.arrived))
+    change(columns, np.flatnonzero(recorded.arrived))
     for name, values in columns.items():
         column = pa.array(values, pa.string()).dictionary_encode() if name == "outcome" else pa.array(values)
         trace = trace.set_column(trace.column_names.index(name), name, column)
-    return replace(evidence, trace=trace)
+    return replace(recorded, trace=trace)
 
 
 def became(columns: dict[str, Any], row: int, outcome: str) -> None:
@@ -86,12 +88,12 @@ def became(columns: dict[str, Any], row: int, outcome: str) -> None:
     columns["outcome"][row], columns["arrival_ns"][row] = outcome, None
 
 
-def test_what_really_happened_is_valid(shared: Evidence, faded: Evidence) -> None:
-    for evidence in (shared, faded):
-        judgement = judge(evidence)
+def test_what_really_happened_is_valid(shared: RecordedRun, faded: RecordedRun) -> None:
+    for recorded in (shared, faded):
+        judgement = judge(recorded)
         assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
         assert {"fading", "medium", "latency", "range"} <= {check.name for check in judgement.checks}
-        assert evidence.outcome_is("collided").sum() > 10
+        assert recorded.outcome_is("collided").sum() > 10
 
 
 def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
@@ -106,20 +108,20 @@ def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
 
 
 def test_without_a_medium_only_the_fading_is_judged(tmp_path: Path) -> None:
-    evidence = run(tmp_path / "run", fading={})
-    assert verdict(evidence, "fading") is Verdict.VALID
-    assert isinstance(found(evidence, "medium"), NotExercised)
-    judgement = judge(evidence)
+    recorded = run(tmp_path / "run", fading={})
+    assert verdict(recorded, "fading") is Verdict.VALID
+    assert isinstance(found(recorded, "medium"), NotExercised)
+    judgement = judge(recorded)
     assert judgement.verdict is Verdict.VALID, judgement.checks
 
 
-def test_a_run_in_which_nobody_speaks_is_unknown_and_not_valid(shared: Evidence) -> None:
+def test_a_run_in_which_nobody_speaks_is_unknown_and_not_valid(shared: RecordedRun) -> None:
     silent = replace(shared, trace=shared.trace.slice(0, 0))
     assert verdict(silent, "fading") is Verdict.UNKNOWN
     assert verdict(silent, "medium") is Verdict.UNKNOWN
 
 
-def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: Evidence) -> None:
+def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: RecordedRun) -> None:
     hopeless = np.flatnonzero(shared.outcome_is("faded"))[0]
 
     def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
@@ -134,7 +136,7 @@ def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: E
     assert found(certain, "fading").figures["impossible"] == 1
 
 
-def test_with_fading_any_pair_may_do_anything_once(faded: Evidence) -> None:
+def test_with_fading_any_pair_may_do_anything_once(faded: RecordedRun) -> None:
     weakest = np.flatnonzero(faded.outcome_is("faded"))[0]
 
     def arrives(columns: dict[str, Any], _: np.ndarray) -> None:
@@ -144,7 +146,7 @@ def test_with_fading_any_pair_may_do_anything_once(faded: Evidence) -> None:
     assert verdict(changed(faded, arrives), "fading") is Verdict.VALID
 
 
-def test_too_much_fading_is_seen(faded: Evidence) -> None:
+def test_too_much_fading_is_seen(faded: RecordedRun) -> None:
     def fade(columns: dict[str, Any], arrived: np.ndarray) -> None:
         for row in arrived[::4].tolist():
             became(columns, row, "faded")
@@ -152,7 +154,7 @@ def test_too_much_fading_is_seen(faded: Evidence) -> None:
     assert verdict(changed(faded, fade), "fading") is Verdict.INVALID
 
 
-def test_another_law_than_the_scenarios_is_seen(faded: Evidence) -> None:
+def test_another_law_than_the_scenarios_is_seen(faded: RecordedRun) -> None:
     """The same trace, but a scenario in which senders are 2 dB stronger, or in which nothing is in the way."""
     for update in ({"path_loss": {**LOG_DISTANCE, "tx_power_dbm": 35.0}}, {"shadowing": None}):
         data = faded.scenario.model_dump()
@@ -161,7 +163,7 @@ def test_another_law_than_the_scenarios_is_seen(faded: Evidence) -> None:
         assert verdict(other, "fading") is Verdict.INVALID
 
 
-def test_a_collision_needs_somebody_to_collide_with(shared: Evidence) -> None:
+def test_a_collision_needs_somebody_to_collide_with(shared: RecordedRun) -> None:
     """A pair whose frame was alone on air."""
     began, left = shared.on_air_ns, shared.column("left_ns")
     alone = next(
@@ -174,7 +176,7 @@ def test_a_collision_needs_somebody_to_collide_with(shared: Evidence) -> None:
     assert broken.figures["collided_alone"] == 1
 
 
-def test_nobody_hears_while_it_sends(shared: Evidence) -> None:
+def test_nobody_hears_while_it_sends(shared: RecordedRun) -> None:
     began, left = shared.on_air_ns, shared.column("left_ns")
     deaf = next(
         row
@@ -189,9 +191,9 @@ def test_nobody_hears_while_it_sends(shared: Evidence) -> None:
     assert found(changed(shared, hears), "medium").figures["heard_while_sending"] == 1
 
 
-def moved(evidence: Evidence, row: int, by_ns: int) -> Evidence:
+def moved(recorded: RecordedRun, row: int, by_ns: int) -> RecordedRun:
     """The frame of a row was on air at another time."""
-    rows = np.flatnonzero(evidence.emission == evidence.emission[row])
+    rows = np.flatnonzero(recorded.emission == recorded.emission[row])
 
     def move(columns: dict[str, Any], _: np.ndarray) -> None:
         for each in rows.tolist():
@@ -199,10 +201,10 @@ def moved(evidence: Evidence, row: int, by_ns: int) -> Evidence:
                 if columns[name][each] is not None:
                     columns[name][each] += by_ns
 
-    return changed(evidence, move)
+    return changed(recorded, move)
 
 
-def test_who_talks_while_another_is_heard_breaks_the_rules(shared: Evidence) -> None:
+def test_who_talks_while_another_is_heard_breaks_the_rules(shared: RecordedRun) -> None:
     """The second of two frames that follow each other begins 20 µs after the first."""
     order = np.argsort(shared.on_air_ns, kind="stable")
     first = next(
@@ -217,7 +219,7 @@ def test_who_talks_while_another_is_heard_breaks_the_rules(shared: Evidence) -> 
     assert found(early, "medium").figures["into_others"] > 0
 
 
-def test_a_sender_pauses_between_its_frames(shared: Evidence) -> None:
+def test_a_sender_pauses_between_its_frames(shared: RecordedRun) -> None:
     again = np.flatnonzero(shared.seq == 1)[0]
     last = np.flatnonzero((shared.sender == shared.sender[again]) & (shared.seq == 0))[0]
     by_ns = int(shared.column("left_ns")[last] + 50_000 - shared.on_air_ns[again])
@@ -234,7 +236,9 @@ def test_a_sender_pauses_between_its_frames(shared: Evidence) -> None:
 @pytest.mark.parametrize(
     ("name", "by_ns"), [("on_air_ns", -6_000_000), ("left_ns", -1), ("left_ns", 1), ("on_air_ns", None)]
 )
-def test_frames_are_on_air_for_their_airtime_after_they_are_sent(shared: Evidence, name: str, by_ns: int) -> None:
+def test_frames_are_on_air_for_their_airtime_after_they_are_sent(
+    shared: RecordedRun, name: str, by_ns: int
+) -> None:
     def change(columns: dict[str, Any], arrived: np.ndarray) -> None:
         row = int(arrived[5])
         columns[name][row] = None if by_ns is None else columns[name][row] + by_ns
@@ -242,7 +246,7 @@ def test_frames_are_on_air_for_their_airtime_after_they_are_sent(shared: Evidenc
     assert found(changed(shared, change), "medium").figures["mistimed"] >= 1
 
 
-def test_arrivals_are_held_to_the_end_of_the_transmission(shared: Evidence) -> None:
+def test_arrivals_are_held_to_the_end_of_the_transmission(shared: RecordedRun) -> None:
     def late(columns: dict[str, Any], arrived: np.ndarray) -> None:
         columns["arrival_ns"][int(arrived[3])] += 1_100_000
 
@@ -254,7 +258,7 @@ def test_arrivals_are_held_to_the_end_of_the_transmission(shared: Evidence) -> N
     assert verdict(changed(shared, shifted), "latency") is Verdict.INVALID
 
 
-def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: Evidence) -> None:
+def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: RecordedRun) -> None:
     assert shared.busy is not None
     ratio = pc.multiply(shared.busy["busy_ratio"], 0.001)
     idle = shared.busy.set_column(2, "busy_ratio", ratio)
@@ -263,12 +267,12 @@ def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: Evidence) -
 
 def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:
     """Carrier sense above all that anybody sends with: Aloha."""
-    evidence = run(tmp_path / "run", mac={"carrier_sense_dbm": 40.0})
-    judgement = judge(evidence)
+    recorded = run(tmp_path / "run", mac={"carrier_sense_dbm": 40.0})
+    judgement = judge(recorded)
     assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
-    airtime_ns = np.bincount(evidence.sender, evidence.airtime_ns * (evidence.on_air_ns >= 0), minlength=12)
+    airtime_ns = np.bincount(recorded.sender, recorded.airtime_ns * (recorded.on_air_ns >= 0), minlength=12)
     assert airtime_ns.min() > 0
-    assert evidence.busy_ratio.sum(axis=0).min() > 0
+    assert recorded.busy_ratio.sum(axis=0).min() > 0
 
 
 def test_frames_held_back_too_briefly_are_seen(tmp_path: Path) -> None:
@@ -328,10 +332,10 @@ FAULTS: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("fault", FAULTS, ids=[fault["kind"] for fault in FAULTS])
 def test_a_fault_acts_on_a_shared_medium_as_it_says(tmp_path: Path, fault: dict[str, Any]) -> None:
-    evidence = run(
+    recorded = run(
         tmp_path / "run", [{"at_s": 0.9, "duration_s": 1.2, **fault}], fading={}, mac={}, access_jitter_ms=60.0
     )
-    judgement = judge(evidence)
+    judgement = judge(recorded)
     assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
     bit = next(check for check in judgement.checks if check.name == f"bit:{fault['kind']}-0")
     assert bit.figures["count"] > 0
@@ -341,8 +345,8 @@ def test_a_throttle_that_does_nothing_did_not_bite(tmp_path: Path, monkeypatch: 
     """Frames that wait as long for their jitter are none that it slowed."""
     monkeypatch.setattr(Csma, "throttle", lambda *_: None)
     throttle = {"kind": "throttle", "at_s": 0.9, "duration_s": 1.2, "nodes": {"ids": ["v01", "v02"]}}
-    evidence = run(tmp_path / "run", [{**throttle, "bitrate_mbps": 3.0}], fading={}, mac={}, access_jitter_ms=60.0)
-    assert verdict(evidence, "bit:throttle-0") is Verdict.UNKNOWN
+    recorded = run(tmp_path / "run", [{**throttle, "bitrate_mbps": 3.0}], fading={}, mac={}, access_jitter_ms=60.0)
+    assert verdict(recorded, "bit:throttle-0") is Verdict.UNKNOWN
 
 
 def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 from rich.console import Console
 
-from emulator.checks.judge import CheckResult, Evidence, NotExercised, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.checks.replay import compare
 from emulator.records.metrics import STATES
 from emulator.terminal.summary import print_checks
@@ -30,57 +30,59 @@ async def throws_dice(node: Node) -> None:
 
 
 @pytest.fixture(scope="module")
-def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return four(tmp_path_factory.mktemp("replay"))
 
 
-def compared(evidence: Evidence, **again: pa.Table) -> CheckResult:
-    tables = {name: getattr(evidence, name) for name in ("trace", "states", "metrics")}
+def compared(recorded: RecordedRun, **again: pa.Table) -> CheckResult:
+    tables = {name: getattr(recorded, name) for name in ("trace", "states", "metrics")}
     found = compare([(name, table, again.get(name, table)) for name, table in tables.items()])
     assert isinstance(found, CheckResult)
     return found
 
 
-def test_runs_that_agree_are_valid_though_a_number_is_none(evidence: Evidence) -> None:
-    rows = evidence.states.to_pylist()
+def test_runs_that_agree_are_valid_though_a_number_is_none(recorded: RecordedRun) -> None:
+    rows = recorded.states.to_pylist()
     rows[3]["fix_m"] = [float("nan"), 1.0]
-    with_nan = replace(evidence, states=pa.Table.from_pylist(rows, schema=STATES))
+    with_nan = replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
     assert compared(with_nan, states=pa.Table.from_pylist(rows, schema=STATES)).verdict is Verdict.VALID
 
 
 @pytest.mark.parametrize(("column", "value"), [("arrival_ns", 1), ("payload_digest", 1), ("outcome", "lost")])
-def test_the_first_row_that_differs_is_shown_from_both_runs(evidence: Evidence, column: str, value: object) -> None:
-    row = first(evidence, "delivered")
-    found = compared(evidence, trace=with_cells(evidence.trace, column, [row, len(evidence.trace) - 1], value))
+def test_the_first_row_that_differs_is_shown_from_both_runs(
+    recorded: RecordedRun, column: str, value: object
+) -> None:
+    row = first(recorded, "delivered")
+    found = compared(recorded, trace=with_cells(recorded.trace, column, [row, len(recorded.trace) - 1], value))
     assert found.verdict is Verdict.INVALID
     assert (found.figures["table"], found.figures["row"]) == ("trace", row)
     assert column in found.figures["differing"]
     assert [shown["run"] for shown in found.figures["rows"]] == ["first", "again"]
 
 
-def test_a_row_that_only_one_run_has_is_a_difference(evidence: Evidence) -> None:
-    found = compared(evidence, trace=evidence.trace.slice(0, len(evidence.trace) - 1))
-    assert found.figures["row"] == len(evidence.trace) - 1
+def test_a_row_that_only_one_run_has_is_a_difference(recorded: RecordedRun) -> None:
+    found = compared(recorded, trace=recorded.trace.slice(0, len(recorded.trace) - 1))
+    assert found.figures["row"] == len(recorded.trace) - 1
     assert "no such row" in found.text
 
 
-def test_a_state_that_differs_is_found_where_the_traces_agree(evidence: Evidence) -> None:
-    rows = evidence.states.to_pylist()
+def test_a_state_that_differs_is_found_where_the_traces_agree(recorded: RecordedRun) -> None:
+    rows = recorded.states.to_pylist()
     rows[7]["estimate_m"] = [0.0, 0.0]
-    found = compared(evidence, states=pa.Table.from_pylist(rows, schema=STATES))
+    found = compared(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
     assert (found.figures["table"], found.figures["row"]) == ("states", 7)
     assert found.figures["differing"] == ["estimate_m"]
 
 
-def test_a_run_that_was_had_once_does_not_say_whether_it_replays(evidence: Evidence) -> None:
-    assert isinstance(result(evidence, "replay"), NotExercised)
+def test_a_run_that_was_had_once_does_not_say_whether_it_replays(recorded: RecordedRun) -> None:
+    assert isinstance(result(recorded, "replay"), NotExercised)
 
 
-def test_a_failed_check_prints_its_rows_and_the_command(evidence: Evidence) -> None:
-    forged = with_names(evidence.trace, "receiver", first(evidence, "lost"), "v0")
+def test_a_failed_check_prints_its_rows_and_the_command(recorded: RecordedRun) -> None:
+    forged = with_names(recorded.trace, "receiver", first(recorded, "lost"), "v0")
     printed = StringIO()
     console = Console(file=printed, width=200)
-    print_checks(judge(replace(evidence, trace=forged)), console, "vnet simulate here/scenario.toml")
+    print_checks(judge(replace(recorded, trace=forged)), console, "vnet simulate here/scenario.toml")
     lines = printed.getvalue().splitlines()
     start = lines.index(next(line for line in lines if line.startswith("conservation: the first offending rows")))
     assert lines[start + 1].split()[:4] == ["sent_ns", "sender", "seq", "receiver"]

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
 
-from emulator.checks.judge import Evidence, NotExercised, Verdict, judge
+from emulator.checks.judge import NotExercised, RecordedRun, Verdict, judge
 from emulator.drivers.simulate import simulate
 from emulator.drivers.status import Course
 from emulator.records.run_folder import Event
@@ -43,17 +43,17 @@ def traffic(folder: Path, duration_s: float = 8.0, **options: Any) -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     folder = tmp_path_factory.mktemp("motion")
     return run_scenario(folder / "run", traffic(folder, program="tests.emulator.checks.test_faults:hears"))
 
 
-def events_of(evidence: Evidence, *kinds: str) -> list[tuple[str, str | None, float]]:
-    return [(event.kind, event.node, event.time_ns / 1e9) for event in evidence.event(*kinds)]
+def events_of(recorded: RecordedRun, *kinds: str) -> list[tuple[str, str | None, float]]:
+    return [(event.kind, event.node, event.time_ns / 1e9) for event in recorded.event(*kinds)]
 
 
-def rows_of(evidence: Evidence) -> list[dict[str, Any]]:
-    return evidence.trace.to_pylist()
+def rows_of(recorded: RecordedRun) -> list[dict[str, Any]]:
+    return recorded.trace.to_pylist()
 
 
 # The world.
@@ -113,11 +113,11 @@ def test_frames_reach_whom_their_sender_is_near_when_it_sends(
     scenario = scenario_of_trips(
         write_trips(folder / "t.csv", vehicles), 3.0, radio={"range_m": range_m, "max_peers": 2}
     )
-    evidence = run_scenario(folder / "run", scenario)
-    listed = {(row["sent_ns"], row["sender"], row["receiver"]) for row in rows_of(evidence)}
+    recorded = run_scenario(folder / "run", scenario)
+    listed = {(row["sent_ns"], row["sender"], row["receiver"]) for row in rows_of(recorded)}
     admitted = {
         (row["sent_ns"], row["sender"], row["receiver"])
-        for row in rows_of(evidence)
+        for row in rows_of(recorded)
         if row["outcome"] != "peer_cap"
     }
     rounded = [(float(f"{x_m:.6f}"), speed) for x_m, speed in drives]
@@ -134,44 +134,44 @@ def test_frames_reach_whom_their_sender_is_near_when_it_sends(
                 ties = len({round(away, 3) for away, _ in apart}) < len(apart)
                 if not ties:
                     assert (key in admitted) == (sender in near[:2])
-    assert judge(evidence).verdict is not Verdict.INVALID
+    assert judge(recorded).verdict is not Verdict.INVALID
 
 
 def test_links_given_as_a_matrix_hold_for_those_that_are_there(tmp_path: Path) -> None:
     everybody = [[1] * 5 for _ in range(5)]
-    evidence = run_scenario(tmp_path / "run", traffic(tmp_path, radio={"links": everybody}))
-    assert judge(evidence).verdict is Verdict.VALID
-    before = [row for row in rows_of(evidence) if row["sent_ns"] < 3_000_000_000]
+    recorded = run_scenario(tmp_path / "run", traffic(tmp_path, radio={"links": everybody}))
+    assert judge(recorded).verdict is Verdict.VALID
+    before = [row for row in rows_of(recorded) if row["sent_ns"] < 3_000_000_000]
     assert before and all("v3" not in (row["sender"], row["receiver"]) for row in before)
 
 
 # Entering and leaving.
 
 
-def test_vehicles_enter_and_leave_with_their_programs(evidence: Evidence) -> None:
-    assert judge(evidence).verdict is Verdict.VALID
-    assert events_of(evidence, "entered", "left") == [
+def test_vehicles_enter_and_leave_with_their_programs(recorded: RecordedRun) -> None:
+    assert judge(recorded).verdict is Verdict.VALID
+    assert events_of(recorded, "entered", "left") == [
         ("left", "v5", 2.2),
         ("entered", "v3", 3.0),
         ("left", "v4", 4.2),
         ("entered", "v5", 6.0),
     ]
-    incarnations = {event.node: event.details["incarnation"] for event in evidence.event("entered")}
+    incarnations = {event.node: event.details["incarnation"] for event in recorded.event("entered")}
     assert incarnations == {"v3": 0, "v5": 1}
-    for row in rows_of(evidence):
+    for row in rows_of(recorded):
         for node in (row["sender"], row["receiver"]):
             stays = TRAFFIC[node]
             assert any(start <= row["sent_ns"] / 1e9 < end + 0.2 for start, end, _ in stays), row
-    assert result(evidence, "presence").figures["changes"] == 4  # type: ignore[union-attr]
+    assert result(recorded, "presence").figures["changes"] == 4  # type: ignore[union-attr]
 
 
 def test_what_is_on_its_way_to_one_who_leaves_does_not_reach_it(tmp_path: Path) -> None:
     slow = {"latency_ms": 250.0, "loss": 0.0}
-    evidence = run_scenario(tmp_path / "run", traffic(tmp_path, radio=slow))
-    lost = [row for row in rows_of(evidence) if row["outcome"] == "receiver_down"]
+    recorded = run_scenario(tmp_path / "run", traffic(tmp_path, radio=slow))
+    lost = [row for row in rows_of(recorded) if row["outcome"] == "receiver_down"]
     assert {row["receiver"] for row in lost} == {"v4", "v5"}
     assert all(row["arrival_ns"] >= 2_200_000_000 for row in lost)
-    assert judge(evidence).verdict is Verdict.VALID
+    assert judge(recorded).verdict is Verdict.VALID
 
 
 FAULTS: list[dict[str, Any]] = [
@@ -196,20 +196,20 @@ def test_apart_and_together_are_one_run(tmp_path: Path, faults: list[dict[str, A
 
 
 def test_faults_of_vehicles_that_come_and_go_are_judged(tmp_path: Path) -> None:
-    evidence = run_scenario(tmp_path / "run", traffic(tmp_path, program=ORDERED, faults=FAULTS))
-    found = {check.name: check for check in judge(evidence).checks if check.verdict is not Verdict.VALID}
+    recorded = run_scenario(tmp_path / "run", traffic(tmp_path, program=ORDERED, faults=FAULTS))
+    found = {check.name: check for check in judge(recorded).checks if check.verdict is not Verdict.VALID}
     assert not found
-    assert ("entered", "v3", 3.7) in events_of(evidence, "entered", "restarted"), "it enters when it may"
-    assert ("restarted", "v2", 3.7) in events_of(evidence, "restarted")
-    assert not [event for event in events_of(evidence, "restarted") if event[1] == "v4"], "it is not there any more"
+    assert ("entered", "v3", 3.7) in events_of(recorded, "entered", "restarted"), "it enters when it may"
+    assert ("restarted", "v2", 3.7) in events_of(recorded, "restarted")
+    assert not [event for event in events_of(recorded, "restarted") if event[1] == "v4"], "it is not there any more"
 
 
 def test_who_has_crashed_does_not_come_back(tmp_path: Path) -> None:
-    evidence = run_scenario(tmp_path / "run", traffic(tmp_path, program=f"{__name__}:crashes"))
-    assert ("entered", "v5", 6.0) not in events_of(evidence, "entered")
-    assert verdict(evidence, "agents_alive") is Verdict.INVALID
+    recorded = run_scenario(tmp_path / "run", traffic(tmp_path, program=f"{__name__}:crashes"))
+    assert ("entered", "v5", 6.0) not in events_of(recorded, "entered")
+    assert verdict(recorded, "agents_alive") is Verdict.INVALID
     for name in ("presence", "down_respected", "conservation"):
-        assert verdict(evidence, name) is Verdict.VALID
+        assert verdict(recorded, name) is Verdict.VALID
 
 
 async def crashes(node: Any) -> None:
@@ -223,9 +223,9 @@ async def crashes(node: Any) -> None:
 def test_nobody_there_at_first_and_nobody_at_last(tmp_path: Path) -> None:
     trips = write_trips(tmp_path / "t.csv", {"a": [(2, 4, still(0))], "b": [(3, 5, still(10))]})
     scenario = scenario_of_trips(trips, 8.0)
-    evidence = run_scenario(tmp_path / "run", scenario)
-    assert judge(evidence).verdict is Verdict.VALID
-    assert run_apart(scenario).engine.trace.sha256() == judge(evidence).trace_sha256
+    recorded = run_scenario(tmp_path / "run", scenario)
+    assert judge(recorded).verdict is Verdict.VALID
+    assert run_apart(scenario).engine.trace.sha256() == judge(recorded).trace_sha256
 
 
 # Regions.
@@ -238,9 +238,9 @@ def test_a_region_acts_on_whom_it_holds_when_they_send(tmp_path: Path) -> None:
     scenario = scenario_of_trips(
         write_trips(tmp_path / "t.csv", vehicles), 9.0, faults=[block], radio={"loss": 0.0}
     )
-    evidence = run_scenario(tmp_path / "run", scenario)
-    assert judge(evidence).verdict is Verdict.VALID
-    cut = {row["sent_ns"] for row in rows_of(evidence) if row["outcome"] == "fault"}
+    recorded = run_scenario(tmp_path / "run", scenario)
+    assert judge(recorded).verdict is Verdict.VALID
+    cut = {row["sent_ns"] for row in rows_of(recorded) if row["outcome"] == "fault"}
     assert cut == {k * 200_000_000 for k in range(45) if abs(-45 + 2 * k) <= 20}
 
 
@@ -250,13 +250,13 @@ def test_receivers_fail_where_the_region_is_and_processes_are_killed_where_it_wa
     outage = {"kind": "gnss_outage", "at_s": 1.0, "duration_s": 7.0, "nodes": region}
     kill = {"kind": "kill", "at_s": 4.0, "duration_s": 3.5, "nodes": region}
     trips = write_trips(tmp_path / "t.csv", vehicles)
-    evidence = run_scenario(tmp_path / "run", scenario_of_trips(trips, 9.0, faults=[outage]))
-    without = np.isnan(evidence.vectors("fix_m")[:, evidence.number["drives"], 0])
+    recorded = run_scenario(tmp_path / "run", scenario_of_trips(trips, 9.0, faults=[outage]))
+    without = np.isnan(recorded.vectors("fix_m")[:, recorded.number["drives"], 0])
     assert np.flatnonzero(without).tolist() == [k for k in range(45) if abs(-45 + 2 * k) <= 20]
-    assert judge(evidence).verdict is Verdict.VALID
+    assert judge(recorded).verdict is Verdict.VALID
     later = {**kill, "at_s": 7.6, "duration_s": 0.5}
-    evidence = run_scenario(tmp_path / "kill", scenario_of_trips(trips, 9.0, faults=[kill, later]))
-    chosen = [event.details["nodes"] for event in evidence.event("fault_started")]
+    recorded = run_scenario(tmp_path / "kill", scenario_of_trips(trips, 9.0, faults=[kill, later]))
+    chosen = [event.details["nodes"] for event in recorded.event("fault_started")]
     assert chosen == [["stands", "drives"], ["stands"]]
 
 
@@ -264,50 +264,50 @@ def test_degrees_are_those_of_the_period(tmp_path: Path) -> None:
     vehicles = {f"v{n}": [(0, 9, still(10.0 * n))] for n in range(3)} | {"comer": [(4, 9, still(5.0))]}
     lonely = {"kind": "gnss_outage", "at_s": 1.0, "duration_s": 7.0, "nodes": {"degree": [0, 2]}}
     scenario = scenario_of_trips(write_trips(tmp_path / "t.csv", vehicles), 9.0, faults=[lonely])
-    evidence = run_scenario(tmp_path / "run", scenario)
-    without = np.isnan(evidence.vectors("fix_m")[..., 0])
+    recorded = run_scenario(tmp_path / "run", scenario)
+    without = np.isnan(recorded.vectors("fix_m")[..., 0])
     assert without[5:20, :3].all() and not without[20:, :].any()
-    assert judge(evidence).verdict is Verdict.VALID
+    assert judge(recorded).verdict is Verdict.VALID
 
 
 # Checks.
 
 
-def with_events(evidence: Evidence, *events: Event, without: tuple[str, str] | None = None) -> Evidence:
-    kept = [event for event in evidence.events if (event.kind, event.node) != without]
-    return replace(evidence, events=[*kept, *events])
+def with_events(recorded: RecordedRun, *events: Event, without: tuple[str, str] | None = None) -> RecordedRun:
+    kept = [event for event in recorded.events if (event.kind, event.node) != without]
+    return replace(recorded, events=[*kept, *events])
 
 
-def test_a_missing_or_an_odd_event_is_found(evidence: Evidence) -> None:
-    assert verdict(evidence, "presence") is Verdict.VALID
+def test_a_missing_or_an_odd_event_is_found(recorded: RecordedRun) -> None:
+    assert verdict(recorded, "presence") is Verdict.VALID
     for missing in (("entered", "v3"), ("left", "v4")):
-        assert verdict(with_events(evidence, without=missing), "presence") is Verdict.INVALID
+        assert verdict(with_events(recorded, without=missing), "presence") is Verdict.INVALID
     for odd in (("left", "v1"), ("entered", "v2"), ("entered", "v4")):
-        assert verdict(with_events(evidence, Event(5_000_000_000, *odd, {})), "presence") is Verdict.INVALID
+        assert verdict(with_events(recorded, Event(5_000_000_000, *odd, {})), "presence") is Verdict.INVALID
 
 
-def test_who_is_not_there_is_neither_dead_nor_heard(evidence: Evidence) -> None:
-    assert verdict(evidence, "liveness") is Verdict.VALID
-    silent = evidence.states.to_pydict()
+def test_who_is_not_there_is_neither_dead_nor_heard(recorded: RecordedRun) -> None:
+    assert verdict(recorded, "liveness") is Verdict.VALID
+    silent = recorded.states.to_pydict()
     for row, (period, node) in enumerate(zip(silent["period"], silent["node"], strict=True)):
         if node == "v3" and period >= 25:
             silent["values"][row], silent["estimate_m"][row] = [], None
-    states = pa.Table.from_pydict(silent, schema=evidence.states.schema)
-    assert verdict(replace(evidence, states=states), "liveness") is Verdict.INVALID
-    assert verdict(with_events(evidence, without=("entered", "v3")), "down_respected") is Verdict.INVALID
+    states = pa.Table.from_pydict(silent, schema=recorded.states.schema)
+    assert verdict(replace(recorded, states=states), "liveness") is Verdict.INVALID
+    assert verdict(with_events(recorded, without=("entered", "v3")), "down_respected") is Verdict.INVALID
 
 
 def test_a_delivery_out_of_range_is_found_by_where_the_vehicles_were_then(tmp_path: Path) -> None:
     """Two vehicles meet and part: what is plausible in the middle is impossible at the ends."""
     vehicles = {"east": [(0, 20, along(-500, 50))], "west": [(0, 20, along(500, -50))]}
     trips = write_trips(tmp_path / "t.csv", vehicles)
-    evidence = run_scenario(tmp_path / "run", scenario_of_trips(trips, 18.0, radio={"range_m": 200.0}))
-    assert judge(evidence).verdict is Verdict.VALID
-    sent_s = evidence.sent_ns / 1e9
+    recorded = run_scenario(tmp_path / "run", scenario_of_trips(trips, 18.0, radio={"range_m": 200.0}))
+    assert judge(recorded).verdict is Verdict.VALID
+    sent_s = recorded.sent_ns / 1e9
     assert sent_s.min() == pytest.approx(8.0) and sent_s.max() == pytest.approx(12.0)
-    shifted = evidence.trace.set_column(0, "sent_ns", pc.add(evidence.trace["sent_ns"], 1_000_000_000))
-    later = shifted.set_column(8, "arrival_ns", pc.add(evidence.trace["arrival_ns"], 1_000_000_000))
-    wrong = replace(evidence, trace=later)
+    shifted = recorded.trace.set_column(0, "sent_ns", pc.add(recorded.trace["sent_ns"], 1_000_000_000))
+    later = shifted.set_column(8, "arrival_ns", pc.add(recorded.trace["arrival_ns"], 1_000_000_000))
+    wrong = replace(recorded, trace=later)
     assert verdict(wrong, "range") is Verdict.INVALID
     assert verdict(wrong, "conservation") is Verdict.INVALID
 
@@ -321,9 +321,9 @@ def test_where_vehicles_stand_there_is_nothing_to_enter(tmp_path: Path) -> None:
 
 
 def test_a_run_that_ends_within_a_period_is_judged_as_far_as_its_places_are_known(tmp_path: Path) -> None:
-    evidence = run_scenario(tmp_path / "run", traffic(tmp_path, duration_s=7.5))
-    assert evidence.sent_ns.max() == 7_400_000_000 and len(evidence.metrics) == 37
-    assert judge(evidence).verdict is Verdict.VALID
+    recorded = run_scenario(tmp_path / "run", traffic(tmp_path, duration_s=7.5))
+    assert recorded.sent_ns.max() == 7_400_000_000 and len(recorded.metrics) == 37
+    assert judge(recorded).verdict is Verdict.VALID
 
 
 def test_figures_by_component_are_those_of_the_period(tmp_path: Path) -> None:
@@ -332,8 +332,8 @@ def test_figures_by_component_are_those_of_the_period(tmp_path: Path) -> None:
     scenario = scenario_of_trips(
         write_trips(tmp_path / "t.csv", vehicles), 8.0, program=program, radio={"range_m": 100.0}
     )
-    evidence = run_scenario(tmp_path / "run", scenario)
-    counts = [len(row) for row in evidence.metrics["component_rmse_m"].to_pylist()]
+    recorded = run_scenario(tmp_path / "run", scenario)
+    counts = [len(row) for row in recorded.metrics["component_rmse_m"].to_pylist()]
     assert counts[0] == 1 and counts[20] == 2 and counts[30] == 2, "a and c at the end, and b far away"
 
 

@@ -332,20 +332,20 @@ PARAMETERS: dict[str, dict[str, Any]] = {
 
 def drawn(seed: int, kinds: list[str], together: int) -> list[dict[str, Any]]:
     """A schedule of faults drawn at random, many of them at the same instants."""
-    luck = random.Random(seed)
+    rng = random.Random(seed)
     groups = [IDS[start : start + together] for start in range(0, 4, together)]
     faults = []
-    for _ in range(luck.randint(2, 6)):
-        kind = luck.choice(kinds)
-        chosen = [node for group in luck.sample(groups, luck.randint(1, len(groups))) for node in group]
+    for _ in range(rng.randint(2, 6)):
+        kind = rng.choice(kinds)
+        chosen = [node for group in rng.sample(groups, rng.randint(1, len(groups))) for node in group]
         more = dict(PARAMETERS.get(kind, {}))
         if kind == "skew":
-            more["offset_ms"] = luck.choice([-1000, -130, 50, 500])
+            more["offset_ms"] = rng.choice([-1000, -130, 50, 500])
         if kind == "drift":
-            more["rate_ppm"] = luck.choice([-500_000, 500_000, 1000, 333_333])
+            more["rate_ppm"] = rng.choice([-500_000, 500_000, 1000, 333_333])
         who = chosen if has_nodes(kind) else []
-        at_s = luck.choice([0, 0.2, 0.4, 1, luck.uniform(0, 2.4)])
-        faults.append(fault(kind, round(at_s, 3), luck.choice([0.2, 0.4, 1, 1.7]), *who, **more))
+        at_s = rng.choice([0, 0.2, 0.4, 1, rng.uniform(0, 2.4)])
+        faults.append(fault(kind, round(at_s, 3), rng.choice([0.2, 0.4, 1, 1.7]), *who, **more))
     return faults
 
 

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from emulator.checks.judge import Evidence, read_evidence
+from emulator.checks.judge import RecordedRun, read_recorded_run
 from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
@@ -54,8 +54,8 @@ async def reports(node: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def evidence(folder: Path) -> Evidence:
-    return read_evidence(folder)
+def recorded(folder: Path) -> RecordedRun:
+    return read_recorded_run(folder)
 
 
 # pcapng, as its draft describes it.
@@ -104,30 +104,30 @@ def packets(data: bytes) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def capture(evidence: Evidence) -> bytes:
+def capture(recorded: RecordedRun) -> bytes:
     file = io.BytesIO()
-    count = write_pcapng(evidence, file)
+    count = write_pcapng(recorded, file)
     assert count == len(packets(file.getvalue()))
     return file.getvalue()
 
 
-def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, evidence: Evidence) -> None:
+def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: RecordedRun) -> None:
     (first, section), *rest = blocks(capture)
     assert first == 0x0A0D0D0A and struct.unpack_from("<IHH", section) == (0x1A2B3C4D, 1, 0)
     interfaces = [body for kind, body in rest if kind == 1]
-    assert [options(body[8:])[2].decode() for body in interfaces] == evidence.node_ids
+    assert [options(body[8:])[2].decode() for body in interfaces] == recorded.node_ids
     assert {struct.unpack_from("<H", body)[0] for body in interfaces} == {127}
     assert {options(body[8:])[9] for body in interfaces} == {b"\x09"}, "nanoseconds"
 
 
 def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
-    capture: bytes, evidence: Evidence
+    capture: bytes, recorded: RecordedRun
 ) -> None:
     found = packets(capture)
     assert [packet["time_ns"] for packet in found] == sorted(packet["time_ns"] for packet in found)
     inbound = sorted((p["interface"], p["time_ns"]) for p in found if p["direction"] == 1)
-    rows = evidence.trace.to_pylist()
-    number = evidence.number
+    rows = recorded.trace.to_pylist()
+    number = recorded.number
     heard = [(number[r["receiver"]], r["arrival_ns"]) for r in rows if r["outcome"] == "delivered"]
     assert inbound == sorted(heard)
     outbound = sorted((p["interface"], p["time_ns"]) for p in found if p["direction"] == 2)
@@ -139,13 +139,13 @@ def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     assert outbound == sorted(emission[:2] for emission in sent)
 
 
-def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, evidence: Evidence) -> None:
+def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, recorded: RecordedRun) -> None:
     for packet in packets(capture):
         data = packet["bytes"]
         version, length, present = struct.unpack_from("<BxHI", data)
         assert (version, length, present) == (0, 14, 0b1110)
         flags, rate, channel_mhz, channel = struct.unpack_from("<BBHH", data, 8)
-        assert (flags, rate / 2, channel_mhz) == (0, evidence.scenario.radio.bitrate_mbps, 5900)
+        assert (flags, rate / 2, channel_mhz) == (0, recorded.scenario.radio.bitrate_mbps, 5900)
         assert channel & 0x4000, "10 MHz"
         mac, llc = data[14:40], data[40:]
         assert mac[:2] == b"\x88\x00", "QoS data, to and from no distribution system"
@@ -153,11 +153,11 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         assert llc == b"\xaa\xaa\x03\x00\x00\x00\x88\xb5"
         assert packet["length"] == len(data) + 20, "20 bytes of payload, which no run keeps"
         sender, seq = packet["comment"].split(";")[0].replace(",", "").split(" frame ")
-        assert mac[10:16] == b"\x02\x00\0\0\0" + bytes([evidence.number[sender] + 1])
+        assert mac[10:16] == b"\x02\x00\0\0\0" + bytes([recorded.number[sender] + 1])
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
 
 
-def test_comments_tell_what_became_of_a_frame(capture: bytes, evidence: Evidence) -> None:
+def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: RecordedRun) -> None:
     for packet in packets(capture):
         fields = packet["comment"].split("; ")
         if packet["direction"] == 1:
@@ -167,7 +167,7 @@ def test_comments_tell_what_became_of_a_frame(capture: bytes, evidence: Evidence
         copy = int(fields[0].split("copy ")[1]) if "copy" in fields[0] else 0
         rows = [
             row["outcome"]
-            for row in evidence.trace.to_pylist()
+            for row in recorded.trace.to_pylist()
             if (row["sender"], row["seq"], row["copy"]) == (name, int(seq), copy)
         ]
         assert {outcome: int(count) for outcome, count in told.items()} == {o: rows.count(o) for o in set(rows)}
@@ -176,9 +176,9 @@ def test_comments_tell_what_became_of_a_frame(capture: bytes, evidence: Evidence
 # MCAP.
 
 
-def test_mcap_has_every_period_frame_and_event_in_order(evidence: Evidence) -> None:
+def test_mcap_has_every_period_frame_and_event_in_order(recorded: RecordedRun) -> None:
     file = io.BytesIO()
-    count = write_mcap(evidence, file)
+    count = write_mcap(recorded, file)
     file.seek(0)
     reader = make_reader(file)
     messages: dict[str, list[tuple[int, dict[str, Any]]]] = {topic: [] for topic in SCHEMAS}
@@ -190,7 +190,7 @@ def test_mcap_has_every_period_frame_and_event_in_order(evidence: Evidence) -> N
     for told in messages.values():
         assert [time_ns for time_ns, _ in told] == sorted(time_ns for time_ns, _ in told)
     assert len(messages["/states"]) == len(messages["/metrics"]) == 20
-    rows = evidence.trace.to_pylist()
+    rows = recorded.trace.to_pylist()
     frames = {(row["sender"], row["seq"], row["copy"]) for row in rows}
     told_frames = {(m["sender"], m["seq"], m["copy"]): m for _, m in messages["/frames"]}
     assert told_frames.keys() == frames
@@ -206,9 +206,9 @@ def test_mcap_has_every_period_frame_and_event_in_order(evidence: Evidence) -> N
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
 
 
-def test_mcap_shows_who_is_there_where_it_is(evidence: Evidence) -> None:
+def test_mcap_shows_who_is_there_where_it_is(recorded: RecordedRun) -> None:
     file = io.BytesIO()
-    write_mcap(evidence, file)
+    write_mcap(recorded, file)
     file.seek(0)
     reader = make_reader(file)
     truth, fixes = ([json.loads(m.data) for _, _, m in reader.iter_messages(topics=[topic])] for topic in TOPICS)
@@ -224,18 +224,18 @@ TOPICS = ("/tf", "/vehicles/fix")
 # CSV.
 
 
-def test_csv_has_every_row_of_every_table_in_plain_columns(evidence: Evidence, tmp_path: Path) -> None:
+def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: RecordedRun, tmp_path: Path) -> None:
     tables = {}
-    for name in write_csv(evidence, tmp_path):
+    for name in write_csv(recorded, tmp_path):
         with (tmp_path / name).open(newline="") as file:
             tables[name.removesuffix(".csv")] = list(csv.DictReader(file))
-    assert len(tables["trace"]) == len(evidence.trace) and len(tables["metrics"]) == 20
-    for told, row in zip(tables["trace"], evidence.trace.to_pylist(), strict=True):
+    assert len(tables["trace"]) == len(recorded.trace) and len(tables["metrics"]) == 20
+    for told, row in zip(tables["trace"], recorded.trace.to_pylist(), strict=True):
         assert {key: value or None for key, value in told.items() if key != "cause"} == {
             key: None if value is None else str(value) for key, value in row.items() if key != "cause"
         }
     state = tables["states"][0]
-    assert float(state["fix_m_x"]) == evidence.vectors("fix_m")[0, 0, 0]
+    assert float(state["fix_m_x"]) == recorded.vectors("fix_m")[0, 0, 0]
     assert float(state["covariance_m2_yy"]) == 1.0
     assert json.loads(state["values"])["several"] == [1.0, 2.0]
     assert {"links", "vehicles", "distances", "events"} <= tables.keys()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.faults.plan import FaultPlan, PlannedFault, stream, swizzle_times_ns
-from emulator.faults.selectors import Nodes, select, severed_by
+from emulator.faults.selectors import Nodes, partitioned_links, select
 from emulator.scenario.faults import Partition, Selector
 from emulator.scenario.scenario import Scenario
 
@@ -150,7 +150,7 @@ def test_links_have_an_end_among_the_nodes_and_go_from_senders_to_receivers(seed
 
 def cut(count: int, seed: int, groups: Any) -> np.ndarray:
     fault = Partition(kind="partition", duration_s=1, groups=groups)
-    return severed_by(fault, some_nodes(count), stream(seed, 0, "select"))
+    return partitioned_links(fault, some_nodes(count), stream(seed, 0, "select"))
 
 
 def islands(severed: np.ndarray) -> list[int]:

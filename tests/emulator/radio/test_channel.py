@@ -11,8 +11,8 @@ from scipy.stats import binom
 
 from emulator.radio.connectivity import Disc
 from emulator.radio.engine import Engine
-from emulator.radio.frames import Frame, Pairs, Stage
-from emulator.radio.link_faults import LinkEffects
+from emulator.radio.frames import Frame, Receptions, Stage
+from emulator.radio.link_faults import ActiveLinkFaults
 from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
 from emulator.radio.stages import Latency, Loss, in_range, peer_cap, sender_side
@@ -41,8 +41,8 @@ def frame_of(
     sender: int = 0, seq: int = 0, sent_ns: int = 0, size: int = 100, among: Topology | None = None
 ) -> Frame:
     """A frame that has been sent without taking any time."""
-    surroundings = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
-    return Frame(sender, seq, sent_ns, size, surroundings, LinkEffects(), end_ns=sent_ns)
+    topology = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
+    return Frame(sender, seq, sent_ns, size, topology, ActiveLinkFaults(), end_ns=sent_ns)
 
 
 def sent(
@@ -50,17 +50,17 @@ def sent(
 ) -> Row:
     """One frame through one stage: its outcomes and arrivals."""
     frame = frame_of(sender, seq, sent_ns, among=among)
-    pairs = Pairs.of([frame], count)
-    stage([frame], pairs)
-    return Row(pairs.outcome[0], pairs.arrival_ns[0])
+    receptions = Receptions.of([frame], count)
+    stage([frame], receptions)
+    return Row(receptions.outcome[0], receptions.arrival_ns[0])
 
 
 def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
     """When a frame that is handed over has left its sender; None if there was no room."""
     frame = frame_of(sender, seq, time_ns, size)
-    queue.hand_over(frame)
+    queue.enqueue(frame)
     assert queue.sent.pop() is frame
-    return frame.end_ns if frame.fate == Outcome.pending else None
+    return frame.end_ns if frame.sender_outcome == Outcome.pending else None
 
 
 @settings(max_examples=30, deadline=None)
@@ -96,8 +96,8 @@ def test_a_pair_that_is_decided_stays_decided() -> None:
     for decided in set(Outcome) - {Outcome.pending}:
         for stage in chain:
             frame = frame_of(size=11, among=among)
-            frame.fate = Outcome.oversize
-            subject = Pairs.of([frame], 3)
+            frame.sender_outcome = Outcome.oversize
+            subject = Receptions.of([frame], 3)
             subject.outcome[:] = decided
             stage([frame], subject)
             assert subject.outcome.tolist() == [[decided] * 3]
@@ -150,8 +150,8 @@ def test_the_payload_limit_is_the_last_size_that_passes(size: int, outcome: str)
 
 def test_what_a_sender_did_not_send_reaches_nobody() -> None:
     frame = frame_of()
-    frame.fate = Outcome.queue_full
-    subject = Pairs.of([frame_of(), frame], 2)
+    frame.sender_outcome = Outcome.queue_full
+    subject = Receptions.of([frame_of(), frame], 2)
     subject.outcome[1, 0] = Outcome.out_of_range
     sender_side([frame_of(), frame], subject)
     assert subject.outcome.tolist() == [[Outcome.pending] * 2, [Outcome.out_of_range, Outcome.queue_full]]
@@ -161,7 +161,7 @@ def test_a_frame_keeps_the_surroundings_of_its_handing_over_among_others() -> No
     topology = Topology(np.array([[0.0, 0.0], [50.0, 0.0]]), Disc(100.0), 30)
     near = frame_of(among=topology)
     topology.move(np.array([[0.0, 0.0], [500.0, 0.0]]))
-    subject = Pairs.of([near, frame_of(among=topology)], 2)
+    subject = Receptions.of([near, frame_of(among=topology)], 2)
     in_range([near, frame_of(among=topology)], subject)
     assert subject.outcome[:, 1].tolist() == [Outcome.pending, Outcome.out_of_range]
 

@@ -13,8 +13,8 @@ from scipy.integrate import quad
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.congestion import SLICE_NS, WINDOW_NS, Ear, LimericGate, ReactiveGate
-from emulator.radio.connectivity import distances_m, reach_of
+from emulator.radio.congestion import SLICE_NS, WINDOW_NS, BusyRatioMeter, LimericControl, ReactiveControl
+from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
@@ -265,7 +265,7 @@ def test_who_is_in_range_is_told_by_the_powers_where_there_are_any(
     radio: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = Radio.model_validate(radio)
-    reach, nakagami = reach_of(model, 1, None), Nakagami(None) if model.is_physical else None
+    reach, nakagami = connectivity_of(model, 1, None), Nakagami(None) if model.is_physical else None
     counted = Counted(monkeypatch)
     first_m, then_m = np.random.default_rng(2).uniform(0, 4000, (2, 30, 2))
     then_m[7] = np.nan
@@ -398,49 +398,51 @@ def test_what_lasts_over_the_edge_of_a_window_counts_in_both() -> None:
     assert first + second == pytest.approx(0.00448)
 
 
-def windows(gate: ReactiveGate | LimericGate, *ratios: float, first: int = 0) -> None:
+def windows(before_horizon: ReactiveControl | LimericControl, *ratios: float, first: int = 0) -> None:
     """Let a gate hear windows that are all equally busy throughout."""
     for number, ratio in enumerate(np.repeat(ratios, 10), start=10 * first):
-        gate.hear(number, np.full(len(gate._ear), int(ratio * SLICE_NS)))
+        before_horizon.observe(number, np.full(len(before_horizon._meter), int(ratio * SLICE_NS)))
 
 
-def pause_ms(gate: ReactiveGate | LimericGate) -> int:
+def pause_ms(before_horizon: ReactiveControl | LimericControl) -> int:
     """For how long the first sender must pause, if the channel stays as it is."""
-    gate.sends(0, 0, 448_000)
-    return next(ms for ms in range(2000) if gate.ask_ns(0, ms * MS) == ms * MS)
+    before_horizon.sends(0, 0, 448_000)
+    return next(ms for ms in range(2000) if before_horizon.next_poll_ns(0, ms * MS) == ms * MS)
 
 
 def test_the_reactive_states_are_reached_one_after_the_other() -> None:
-    gate = ReactiveGate(EtsiReactive(kind="etsi"), Ear(1, 1))
-    assert gate.ask_ns(0, 0) == 0, "the first frame may go"
-    pauses_ms = [pause_ms(gate)]
+    before_horizon = ReactiveControl(EtsiReactive(kind="etsi"), BusyRatioMeter(1, 1))
+    assert before_horizon.next_poll_ns(0, 0) == 0, "the first frame may go"
+    pauses_ms = [pause_ms(before_horizon)]
     for first, ratio in enumerate((0.7,) * 6 + (0.45,) * 4 + (0.1,) * 4):
-        windows(gate, ratio, first=first)
-        pauses_ms.append(pause_ms(gate))
+        windows(before_horizon, ratio, first=first)
+        pauses_ms.append(pause_ms(before_horizon))
     states = [(50, 100, 200, 250, 1000).index(pause) for pause in pauses_ms]
     assert set(np.abs(np.diff(states))) == {0, 1}
     assert (states[0], states[6], states[10], states[14]) == (0, 4, 2, 0)
 
 
 def test_who_is_held_back_asks_again_after_its_next_window() -> None:
-    gate = ReactiveGate(EtsiReactive(kind="etsi", pause_ms=(1000,) * 5), Ear(1, 1))
-    gate.sends(0, 0, 448_000)
+    before_horizon = ReactiveControl(EtsiReactive(kind="etsi", pause_ms=(1000,) * 5), BusyRatioMeter(1, 1))
+    before_horizon.sends(0, 0, 448_000)
     asks_ns = [0]
-    while (next_ns := gate.ask_ns(0, asks_ns[-1])) > asks_ns[-1]:
+    while (next_ns := before_horizon.next_poll_ns(0, asks_ns[-1])) > asks_ns[-1]:
         asks_ns.append(next_ns)
     assert asks_ns[-1] == 1000 * MS
     assert set(np.diff(asks_ns[1:-1])) == {WINDOW_NS}
 
 
 def test_senders_measure_each_on_its_own_clock() -> None:
-    ear = Ear(50, 3)
-    asks_ns = [ear.ask_ns(node, 10**10, 0) for node in range(50)]
+    ear = BusyRatioMeter(50, 3)
+    asks_ns = [ear.next_poll_ns(node, 10**10, 0) for node in range(50)]
     assert len(set(asks_ns)) == 50
-    assert asks_ns[:20] == [Ear(20, 3).ask_ns(node, 10**10, 0) for node in range(20)], "whoever else there is"
+    assert asks_ns[:20] == [BusyRatioMeter(20, 3).next_poll_ns(node, 10**10, 0) for node in range(20)], (
+        "whoever else there is"
+    )
     # Slices that are busy or not, in turns of ten: who measures half in either sees half.
     ratios = []
     for number in range(40):
-        over = ear.hear(number, np.full(50, SLICE_NS if number // 10 % 2 else 0))
+        over = ear.observe(number, np.full(50, SLICE_NS if number // 10 % 2 else 0))
         ratios.append((number, over, ear.busy_ratio.copy()))
     seen = np.concatenate([ratio[over] for number, over, ratio in ratios if number >= 9])
     assert set(np.round(seen, 3)) == {round(part / 10, 3) for part in range(11)}
@@ -448,18 +450,18 @@ def test_senders_measure_each_on_its_own_clock() -> None:
 
 def test_limeric_settles_where_its_equation_does() -> None:
     """K senders of airtime a: share* = β (target - K share) / α, as the busy ratio is the sum of all shares."""
-    gate = LimericGate(Limeric(kind="limeric"), Ear(1, 1))
+    before_horizon = LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1))
     for first in range(6000):
-        windows(gate, min(100 * float(gate.share[0]), 1.0), first=first)
+        windows(before_horizon, min(100 * float(before_horizon.share[0]), 1.0), first=first)
     expected = 0.0012 * 0.68 / (0.016 + 0.0012 * 100)
-    assert gate.share[0] == pytest.approx(expected, rel=1e-4)
+    assert before_horizon.share[0] == pytest.approx(expected, rel=1e-4)
 
 
 def test_limerics_pause_is_the_airtime_over_the_share_within_bounds() -> None:
-    gate = LimericGate(Limeric(kind="limeric"), Ear(1, 1))
+    before_horizon = LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1))
     for share, expected_ms in ((0.03, 25), (0.00448, 100), (0.0001, 1000)):
-        gate.share[0] = share
-        assert pause_ms(gate) == expected_ms
+        before_horizon.share[0] = share
+        assert pause_ms(before_horizon) == expected_ms
 
 
 def test_a_congested_channel_thins_out_what_is_sent() -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.checks.judge import Evidence
+from emulator.checks.judge import RecordedRun
 from emulator.records.metrics import STATES
 from emulator.records.radio_metrics import radio_metrics
 from emulator.scenario.scenario import Scenario
@@ -23,7 +23,7 @@ PERIOD_NS = 100_000_000
 Row = dict[str, Any]
 
 
-def evidence_of(rows: list[Row], position_m: np.ndarray, moves: bool) -> Evidence:
+def evidence_of(rows: list[Row], position_m: np.ndarray, moves: bool) -> RecordedRun:
     """Evidence of a trace of these rows, with positions (K, N, 2)."""
     names = [f"v{number}" for number in range(position_m.shape[1])]
     rows = sorted(rows, key=lambda row: (row["sent_ns"], row["sender"], row["seq"], row["receiver"], row["copy"]))
@@ -43,7 +43,7 @@ def evidence_of(rows: list[Row], position_m: np.ndarray, moves: bool) -> Evidenc
     network = {"kind": "trips", "path": "none"} if moves else {}
     scenario = Scenario.model_validate({"network": network})
     table = pa.Table.from_pylist(states, schema=STATES)
-    return Evidence(scenario, pa.table(columns), table, pa.table({}), [], position_m)
+    return RecordedRun(scenario, pa.table(columns), table, pa.table({}), [], position_m)
 
 
 @st.composite

@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import CheckResult, Evidence, Judgement, NotExercised, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, Judgement, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -22,7 +22,7 @@ from vnet.errors import VnetError
 from vnet.node import Report
 
 
-def beacons(folder: Path, **radio: float) -> Evidence:
+def beacons(folder: Path, **radio: float) -> RecordedRun:
     """A small simulated run."""
     scenario = Scenario.model_validate(
         {"run": {"duration_s": 2.0}, "network": {"vehicles": 6, "layout": "dense"}, "radio": radio}
@@ -30,7 +30,7 @@ def beacons(folder: Path, **radio: float) -> Evidence:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
-    return Evidence(
+    return RecordedRun(
         scenario,
         read_trace(folder / "trace.parquet"),
         pq.read_table(folder / "states.parquet"),
@@ -40,17 +40,17 @@ def beacons(folder: Path, **radio: float) -> Evidence:
 
 
 @pytest.fixture(scope="module")
-def evidence(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return beacons(tmp_path_factory.mktemp("observe") / "run", loss=0.2, max_peers=2)
 
 
-def verdicts(evidence: Evidence, **changes: object) -> dict[str, Verdict]:
-    fields = {name: getattr(evidence, name) for name in ("scenario", "trace", "states", "metrics", "events")}
-    return {check.name: check.verdict for check in judge(Evidence(**{**fields, **changes})).checks}
+def verdicts(recorded: RecordedRun, **changes: object) -> dict[str, Verdict]:
+    fields = {name: getattr(recorded, name) for name in ("scenario", "trace", "states", "metrics", "events")}
+    return {check.name: check.verdict for check in judge(RecordedRun(**{**fields, **changes})).checks}
 
 
-def only_invalid(evidence: Evidence, trace: pa.Table) -> set[str]:
-    return {name for name, verdict in verdicts(evidence, trace=trace).items() if verdict is Verdict.INVALID}
+def only_invalid(recorded: RecordedRun, trace: pa.Table) -> set[str]:
+    return {name for name, verdict in verdicts(recorded, trace=trace).items() if verdict is Verdict.INVALID}
 
 
 def outcome_set(table: pa.Table, mask: np.ndarray, outcome: str) -> pa.Table:
@@ -68,51 +68,51 @@ def is_outcome(table: pa.Table, outcome: str) -> np.ndarray:
     return np.array(pc.equal(table["outcome"].cast(pa.string()), outcome).to_pylist())
 
 
-def test_an_honest_run_is_valid(evidence: Evidence) -> None:
-    assert set(verdicts(evidence).values()) == {Verdict.VALID}
+def test_an_honest_run_is_valid(recorded: RecordedRun) -> None:
+    assert set(verdicts(recorded).values()) == {Verdict.VALID}
     assert {"conservation", "range", "peer_cap", "loss_rate", "transport", "agents_alive", "finite"} <= set(
-        verdicts(evidence)
+        verdicts(recorded)
     )
 
 
-def test_a_missing_row_breaks_conservation(evidence: Evidence) -> None:
-    assert only_invalid(evidence, evidence.trace.slice(1)) == {"conservation"}
+def test_a_missing_row_breaks_conservation(recorded: RecordedRun) -> None:
+    assert only_invalid(recorded, recorded.trace.slice(1)) == {"conservation"}
 
 
-def test_a_repeated_row_breaks_conservation(evidence: Evidence) -> None:
-    assert "conservation" in only_invalid(evidence, pa.concat_tables([evidence.trace, evidence.trace.slice(0, 1)]))
+def test_a_repeated_row_breaks_conservation(recorded: RecordedRun) -> None:
+    assert "conservation" in only_invalid(recorded, pa.concat_tables([recorded.trace, recorded.trace.slice(0, 1)]))
 
 
-def test_a_missing_frame_breaks_conservation(evidence: Evidence) -> None:
-    first = evidence.trace.slice(0, 1).to_pylist()[0]
+def test_a_missing_frame_breaks_conservation(recorded: RecordedRun) -> None:
+    first = recorded.trace.slice(0, 1).to_pylist()[0]
     same = pc.and_(
-        pc.equal(evidence.trace["sender"].cast(pa.string()), first["sender"]),
-        pc.equal(evidence.trace["seq"], first["seq"]),
+        pc.equal(recorded.trace["sender"].cast(pa.string()), first["sender"]),
+        pc.equal(recorded.trace["seq"], first["seq"]),
     )
-    assert only_invalid(evidence, evidence.trace.filter(pc.invert(same))) == {"conservation"}
+    assert only_invalid(recorded, recorded.trace.filter(pc.invert(same))) == {"conservation"}
 
 
-def test_an_undecided_pair_breaks_conservation(evidence: Evidence) -> None:
-    mask = np.arange(len(evidence.trace)) == 3
-    assert "conservation" in only_invalid(evidence, outcome_set(evidence.trace, mask, "pending"))
+def test_an_undecided_pair_breaks_conservation(recorded: RecordedRun) -> None:
+    mask = np.arange(len(recorded.trace)) == 3
+    assert "conservation" in only_invalid(recorded, outcome_set(recorded.trace, mask, "pending"))
 
 
-def test_a_delivery_beyond_the_cap_is_found(evidence: Evidence) -> None:
-    capped = np.flatnonzero(is_outcome(evidence.trace, "peer_cap"))[:1]
-    mask = np.isin(np.arange(len(evidence.trace)), capped)
-    assert only_invalid(evidence, outcome_set(evidence.trace, mask, "delivered")) == {"peer_cap"}
+def test_a_delivery_beyond_the_cap_is_found(recorded: RecordedRun) -> None:
+    capped = np.flatnonzero(is_outcome(recorded.trace, "peer_cap"))[:1]
+    mask = np.isin(np.arange(len(recorded.trace)), capped)
+    assert only_invalid(recorded, outcome_set(recorded.trace, mask, "delivered")) == {"peer_cap"}
 
 
-def test_a_delivery_beyond_the_range_is_found(evidence: Evidence) -> None:
-    narrow = evidence.scenario.model_copy(
-        update={"radio": evidence.scenario.radio.model_copy(update={"range_m": 500.0})}
+def test_a_delivery_beyond_the_range_is_found(recorded: RecordedRun) -> None:
+    narrow = recorded.scenario.model_copy(
+        update={"radio": recorded.scenario.radio.model_copy(update={"range_m": 500.0})}
     )
-    assert verdicts(evidence, scenario=narrow)["range"] is Verdict.INVALID
+    assert verdicts(recorded, scenario=narrow)["range"] is Verdict.INVALID
 
 
-def test_too_much_loss_is_found(evidence: Evidence) -> None:
-    mask = is_outcome(evidence.trace, "delivered") & (np.arange(len(evidence.trace)) % 3 == 0)
-    assert only_invalid(evidence, outcome_set(evidence.trace, mask, "lost")) == {"loss_rate"}
+def test_too_much_loss_is_found(recorded: RecordedRun) -> None:
+    mask = is_outcome(recorded.trace, "delivered") & (np.arange(len(recorded.trace)) % 3 == 0)
+    assert only_invalid(recorded, outcome_set(recorded.trace, mask, "lost")) == {"loss_rate"}
 
 
 @pytest.mark.parametrize(
@@ -127,14 +127,14 @@ def test_too_much_loss_is_found(evidence: Evidence) -> None:
     ],
 )
 def test_events_decide_their_checks(
-    evidence: Evidence, kind: str, details: dict, check: str, verdict: Verdict
+    recorded: RecordedRun, kind: str, details: dict, check: str, verdict: Verdict
 ) -> None:
     event = Event(1_999_000_000, kind, "v01", details)
-    assert verdicts(evidence, events=[*evidence.events, event])[check] is verdict
+    assert verdicts(recorded, events=[*recorded.events, event])[check] is verdict
 
 
-def test_a_program_that_sends_nothing_leaves_checks_unknown(evidence: Evidence) -> None:
-    empty = verdicts(evidence, trace=evidence.trace.slice(0, 0))
+def test_a_program_that_sends_nothing_leaves_checks_unknown(recorded: RecordedRun) -> None:
+    empty = verdicts(recorded, trace=recorded.trace.slice(0, 0))
     assert {name for name, verdict in empty.items() if verdict is Verdict.UNKNOWN} == {
         "conservation",
         "range",
@@ -167,9 +167,9 @@ def test_invalid_wins_over_unknown_over_valid(verdicts: list[str], together: str
 
 
 def test_a_folder_judges_itself_again_and_notices_tampering(tmp_path: Path) -> None:
-    evidence = beacons(tmp_path / "run", loss=0.1)
+    recorded = beacons(tmp_path / "run", loss=0.1)
     assert check_run(tmp_path / "run").verdict is Verdict.VALID
-    table = evidence.trace
+    table = recorded.trace
     digest = pa.array([0] * len(table), pa.uint64())
     pq.write_table(
         table.set_column(table.column_names.index("payload_digest"), "payload_digest", digest),
@@ -180,16 +180,16 @@ def test_a_folder_judges_itself_again_and_notices_tampering(tmp_path: Path) -> N
     assert judgement.checks[-1].name == "trace_sha256"
 
 
-def test_the_hash_survives_the_file_and_sees_every_cell(evidence: Evidence, tmp_path: Path) -> None:
-    pq.write_table(evidence.trace, tmp_path / "again.parquet", compression="none")
-    assert sha256_of_table(read_trace(tmp_path / "again.parquet")) == sha256_of_table(evidence.trace)
-    mask = np.arange(len(evidence.trace)) == 0
+def test_the_hash_survives_the_file_and_sees_every_cell(recorded: RecordedRun, tmp_path: Path) -> None:
+    pq.write_table(recorded.trace, tmp_path / "again.parquet", compression="none")
+    assert sha256_of_table(read_trace(tmp_path / "again.parquet")) == sha256_of_table(recorded.trace)
+    mask = np.arange(len(recorded.trace)) == 0
     for column in ("sent_ns", "seq", "size_bytes", "copy"):
-        values = np.array(evidence.trace[column].to_pylist())
+        values = np.array(recorded.trace[column].to_pylist())
         values[mask] += 1
-        index = evidence.trace.column_names.index(column)
-        changed = evidence.trace.set_column(index, column, pa.array(values, evidence.trace[column].type))
-        assert sha256_of_table(changed) != sha256_of_table(evidence.trace)
+        index = recorded.trace.column_names.index(column)
+        changed = recorded.trace.set_column(index, column, pa.array(values, recorded.trace[column].type))
+        assert sha256_of_table(changed) != sha256_of_table(recorded.trace)
 
 
 def instant(position: np.ndarray, common: list[float]) -> Instant:

@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from emulator.checks.judge import read_evidence
+from emulator.checks.judge import read_recorded_run
 from emulator.cli import report as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
@@ -115,7 +115,7 @@ def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
     run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
     page = page_of(run)
     assert "busy ratio (%)" in page.text and "expected: " not in page.text
-    figures = radio_metrics(read_evidence(run))
+    figures = radio_metrics(read_recorded_run(run))
     assert f"delivered {100 * figures.totals['delivery_ratio']:.1f} %" in page.text
     assert f"busy ratio {100 * figures.totals['busy_ratio_mean']:.1f} %" in page.text
     assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text

@@ -164,17 +164,17 @@ def test_a_terminal_that_goes_away_harms_nobody(monkeypatch: pytest.MonkeyPatch)
 def test_a_terminal_that_stands_still_holds_up_nobody_who_prints() -> None:
     """As with Ctrl-S: a redraw hangs, and the run goes on."""
     terminal = Terminal()
-    let_go, hanging = threading.Event(), threading.Event()
+    detach, hanging = threading.Event(), threading.Event()
     write = terminal.write
 
     def hang(text: str) -> int:
         hanging.set()
-        assert let_go.wait(60)
+        assert detach.wait(60)
         return write(text)
 
     terminal.write = hang  # type: ignore[method-assign]
     with Painter(terminal.console, Pictures("a picture")) as painter:
         assert hanging.wait(60)
         painter.print_above("a line\n")
-        let_go.set()
+        detach.set()
     assert terminal.screen.text == "a line"

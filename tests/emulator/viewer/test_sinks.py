@@ -135,13 +135,13 @@ def test_a_vehicle_that_is_not_there_is_said_before_anything_has_started(tmp_pat
 
 def test_addresses_as_they_are_told() -> None:
     here = ServeAt("127.0.0.1", 9000)
-    assert here.told() == (
+    assert here.announcement() == (
         "viewer: rerun --connect rerun+http://127.0.0.1:9000/proxy\n"
         "browser: http://127.0.0.1:9001/?url=rerun%2Bhttp%3A%2F%2F127.0.0.1%3A9000%2Fproxy"
     )
     everywhere = ServeAt("0.0.0.0", 9000)
     assert everywhere.url == f"rerun+http://{socket.gethostname()}:9000/proxy"
-    assert everywhere.told().endswith("whoever can reach port 9000 of this machine can watch")
+    assert everywhere.announcement().endswith("whoever can reach port 9000 of this machine can watch")
     assert everywhere.origin == "http://*:9001"
     assert ServeAt("::1", 9000).web_url.startswith("http://[::1]:9001/")
 

@@ -8,28 +8,28 @@ import pytest
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
 from emulator.scenario.scenario import Scenario
-from emulator.world.gnss_faults import BentGnss
+from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import World, build_world
 
 VEHICLES = 4
 RATE_HZ = 10
 
 
-def receivers(*faults: dict[str, Any], seed: int = 1) -> tuple[BentGnss, World, FaultPlan]:
+def receivers(*faults: dict[str, Any], seed: int = 1) -> tuple[FaultyGnss, World, FaultPlan]:
     """The receivers of four vehicles under faults, and what they would be without."""
     run = {"duration_s": 20.0, "seed": seed}
     scenario = Scenario.model_validate({"run": run, "network": {"vehicles": VEHICLES}, "fault": list(faults)})
     world = build_world(scenario)
     start_m = world.at(0).position_m
     plan = FaultPlan(scenario, Nodes(world.node_ids, start_m, np.zeros(VEHICLES, int)))
-    return BentGnss(world, plan.faults, seed), world, plan
+    return FaultyGnss(world, plan.faults, seed), world, plan
 
 
 def fault(kind: str, at_s: float = 2.0, duration_s: float = 3.0, **more: Any) -> dict[str, Any]:
     return {"kind": kind, "at_s": at_s, "duration_s": duration_s, "nodes": {"ids": ["v01"]}, **more}
 
 
-def strayed(gnss: BentGnss, world: World, number: int = 0, periods: int = 100) -> np.ndarray:
+def strayed(gnss: FaultyGnss, world: World, number: int = 0, periods: int = 100) -> np.ndarray:
     """(periods, 2): how far the fixes are from those of a sound receiver; NaN where there is none."""
     found = [gnss.fix(period, number) for period in range(periods)]
     nothing = np.full(2, np.nan)

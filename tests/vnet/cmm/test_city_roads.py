@@ -218,5 +218,5 @@ def test_hypotheses_of_others_pay_for_a_road_that_was_left_as_ones_own_do() -> N
     assert not len(rbpf._lane), "no lane points north-east"
     own = rbpf.own_log_road[0]
     assert own @ rbpf.weight < -0.05
-    _, _, log_road = rbpf.supply(rbpf.sample(200))
+    _, _, log_road = rbpf.condition_on(rbpf.sample(200))
     assert log_road[0].mean() == pytest.approx(own @ rbpf.weight, abs=0.3)

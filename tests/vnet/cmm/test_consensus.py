@@ -54,7 +54,7 @@ class Net:
         total = sum((node.mass for node in self.nodes.values()), np.zeros(3))
         for i, node in self.nodes.items():
             share = self.said[i]
-            for taker in share.takers:
+            for taker in share.out_neighbours:
                 seen = self.nodes[int(taker[1:])]._seen.get(f"n{i:02d}", 0.0)
                 total = total + np.array(share.running_sum) - seen
             assert node.epoch == share.epoch
@@ -145,7 +145,7 @@ def test_a_link_that_turns_one_way_carries_no_share_any_more() -> None:
     inputs = np.random.default_rng(2).normal(size=(15, 2))
     net = Net(inputs, lambda r, j, i: bool(linked[j, i] if r < 100 else one_way[j, i]))
     net.run(350)
-    assert f"n{second:02d}" not in net.said[int(first)].takers
+    assert f"n{second:02d}" not in net.said[int(first)].out_neighbours
     assert net.total() == pytest.approx([*inputs.sum(axis=0), 15], abs=1e-9)
     assert net.errors().max() < 1e-3
 

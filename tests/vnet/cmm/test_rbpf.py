@@ -136,16 +136,16 @@ def test_systematic_resampling_is_within_one_of_what_is_expected() -> None:
 def test_a_collapsed_cloud_supplies_means_with_slope_minus_one() -> None:
     rbpf = known_error((1.0, 1.0), particles=20)
     rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    assert np.array_equal(rbpf.slopes()[0][0, :2], -np.eye(2))
-    supplied, _, _ = rbpf.supply(np.array([[2.0, 1.0]]))
+    assert np.array_equal(rbpf.regression_on_common_error()[0][0, :2], -np.eye(2))
+    supplied, _, _ = rbpf.condition_on(np.array([[2.0, 1.0]]))
     assert supplied[0, :2, 0] == pytest.approx([1.0, 3.0])
 
 
 def test_regression_finds_that_a_new_vehicle_is_where_its_fix_says_less_c() -> None:
     rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
     rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    assert rbpf.slopes()[0][0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
-    supplied, past, _ = rbpf.supply(np.array([[1.0, 1.0]] * 5))
+    assert rbpf.regression_on_common_error()[0][0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
+    supplied, past, _ = rbpf.condition_on(np.array([[1.0, 1.0]] * 5))
     assert pytest.approx(np.array([[2.0, 3.0]] * 5)) == supplied[0, :2].T
     assert pytest.approx(np.array([[1.0, 1.0]] * 5)) == past[0].T
 

@@ -51,7 +51,7 @@ class Clocks:
         for time_ns in sorted(t for t in changes if self._acted_ns < t <= now_ns):
             for node, faults in self._faults.items():
                 clock = clock_of(faults, node, 0, time_ns)
-                if clock.bends or node in self._bent:
+                if clock.is_wrong or node in self._bent:
                     clocks.append(clock)
                     self._bent.add(node)
         self._acted_ns = now_ns
@@ -62,7 +62,7 @@ class Clocks:
                 self._packet_ns[node] += self._every_ns
         grant = wire.decode_rx(wire.encode(wire.Grant(0, now_ns, packets, (), clocks)))
         assert isinstance(grant, wire.Grant)
-        self.host.bend(grant.clocks, self.loop)
+        self.host.apply_clock_error(grant.clocks, self.loop)
         self.host.deliver(grant.packets, grant.fixes)
         return now_ns
 
@@ -221,7 +221,7 @@ def test_a_skew_and_a_drift_together_and_apart_again() -> None:
     for time_s, offset_s, rate in ((1, 0, 0), (3, 1, 0), (6, 0, -0.5), (8, -2, -0.5), (9, -2.5, -0.5), (10, 0, 0)):
         clock = clock_of(faults, "v1", 0, time_s * S)
         assert (clock.offset_ns, clock.rate) == (round(offset_s * S), rate)
-        assert clock.bends == (offset_s != 0 or rate != 0)
+        assert clock.is_wrong == (offset_s != 0 or rate != 0)
 
 
 drifts = st.lists(
@@ -245,7 +245,7 @@ def test_any_drifts_together_go_on_without_a_jump_while_they_act_and_never_stand
         assert clock.shown_ns(next_ns) > clock.shown_ns(one_ns)
         if next_ns not in ends:
             assert abs(clock_of(faults, "v1", 0, next_ns).shown_ns(next_ns) - clock.shown_ns(next_ns)) <= 2
-    assert not clock_of(faults, "v1", 0, changes[-1]).bends
+    assert not clock_of(faults, "v1", 0, changes[-1]).is_wrong
 
 
 def test_timers_for_never_do_not_wake_anybody() -> None:

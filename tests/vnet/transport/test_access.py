@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from vnet.errors import LinkError
-from vnet.transport.access import EMULATOR, OBSERVER, Access, Credentials, common_name, node_user
-from vnet.transport.certificates import router_names
+from vnet.errors import TransportError
+from vnet.transport.access import EMULATOR, OBSERVER, Access, node_user
+from vnet.transport.certificates import certifier, router_names
+from vnet.transport.credentials import Credentials, common_name
 from vnet.transport.session import open_client, open_router
 
 TLS = "tls/127.0.0.1:7447"
@@ -20,7 +21,7 @@ endpoints = pytest.mark.parametrize("listen", [TCP, TLS])
 
 
 def create(listen: str) -> Access:
-    return Access.create("r", PROCESSES, listen if listen == TLS else None)
+    return Access.create("r", PROCESSES, certifier(listen) if listen == TLS else None)
 
 
 @pytest.fixture
@@ -69,10 +70,10 @@ def test_every_user_has_a_key_pair_and_a_rule_of_its_own() -> None:
 
 
 def test_a_certificate_has_room_for_every_name() -> None:
-    lead = "v" * 64
-    assert len(common_name(node_user(lead))) <= 64
-    assert common_name(node_user(lead)) != common_name(node_user("v" * 63 + "w"))
-    assert Access.create("r", [[lead]], TLS).tls is not None
+    process_id = "v" * 64
+    assert len(common_name(node_user(process_id))) <= 64
+    assert common_name(node_user(process_id)) != common_name(node_user("v" * 63 + "w"))
+    assert Access.create("r", [[process_id]], certifier(TLS)).tls is not None
 
 
 def test_a_router_goes_by_where_it_listens() -> None:
@@ -82,29 +83,29 @@ def test_a_router_goes_by_where_it_listens() -> None:
 
 
 def test_what_cannot_stand_in_a_certificate_is_one_line() -> None:
-    with pytest.raises(LinkError, match="not a name or an address"):
-        Access.create("r", PROCESSES, TLS, ["a" * 300])
+    with pytest.raises(TransportError, match="not a name or an address"):
+        Access.create("r", PROCESSES, certifier(TLS, ["a" * 300]))
 
 
 def test_without_cryptography_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "vnet.transport.certificates", None)
-    with pytest.raises(LinkError, match=r"pip install 'vnet-emulator\[tls\]'"):
+    monkeypatch.setitem(sys.modules, "vnet.transport.authority", None)
+    with pytest.raises(TransportError, match=r"pip install 'vnet-emulator\[tls\]'"):
         create(TLS)
 
 
 def test_certificates_and_endpoint_go_together(tmp_path: Path) -> None:
-    with pytest.raises(LinkError, match="only at tls/HOST:PORT"), open_router(TCP, create(TLS), 1000):
+    with pytest.raises(TransportError, match="only at tls/HOST:PORT"), open_router(TCP, create(TLS), 1000):
         pass
-    with pytest.raises(LinkError, match="vnet access --listen tls/"):
+    with pytest.raises(TransportError, match="vnet access --listen tls/"):
         create(TCP).save(tmp_path, TLS, tmp_path)
     own = create(TLS).credentials(EMULATOR)
-    with pytest.raises(LinkError, match="connect to tls/HOST:PORT"), open_client(TCP, own, 1000):
+    with pytest.raises(TransportError, match="connect to tls/HOST:PORT"), open_client(TCP, own, 1000):
         pass
     for credentials in (None, create(TCP).credentials(EMULATOR)):
-        with pytest.raises(LinkError, match="have no certificate"), open_client(TLS, credentials, 1000):
+        with pytest.raises(TransportError, match="have no certificate"), open_client(TLS, credentials, 1000):
             pass
 
 
 def test_an_endless_file_is_refused() -> None:
-    with pytest.raises(LinkError, match="not a credentials file"):
+    with pytest.raises(TransportError, match="not a credentials file"):
         Credentials.load(Path("/dev/zero"))

@@ -32,14 +32,14 @@ def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.Monke
 def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
     """In a process of its own, because a log is opened once for all."""
     code = (
-        "from vnet.errors import LinkError\n"
+        "from vnet.errors import TransportError\n"
         "from vnet.transport import session\n"
-        "from vnet.transport.access import Credentials\n"
+        "from vnet.transport.credentials import Credentials\n"
         "session.CONNECT_TIMEOUT_MS = 1\n"
         "session.quiet_zenoh()\n"
         "try:\n"
         "    with session.open_client('tcp/127.0.0.1:1', Credentials('user', 'tell-nobody'), 1000): pass\n"
-        "except LinkError: print('over')\n"
+        "except TransportError: print('over')\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "RUST_LOG"}
     if wanted is not None:

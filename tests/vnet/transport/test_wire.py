@@ -14,7 +14,7 @@ names = st.text(min_size=1, max_size=8)
 reals = st.floats(allow_nan=False)
 packets = st.builds(wire.WirePacket, names, names, times, times, st.binary(max_size=64))
 clocks = st.lists(
-    st.builds(wire.ClockBend, names, times, st.integers(-(2**50), 2**50), st.floats(-0.5, 0.5)), max_size=2
+    st.builds(wire.ClockError, names, times, st.integers(-(2**50), 2**50), st.floats(-0.5, 0.5)), max_size=2
 )
 fixes = st.builds(
     wire.WireFix,
@@ -53,7 +53,7 @@ agent_messages = st.one_of(
         st.none() | st.builds(wire.Lateness, st.lists(times, max_size=5)),
         st.booleans(),
     ),
-    st.builds(wire.Standing, st.binary(), names),
+    st.builds(wire.StackDump, st.binary(), names),
 )
 emulator_messages = st.one_of(
     st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
@@ -68,7 +68,7 @@ emulator_messages = st.one_of(
         clocks,
     ),
     st.builds(wire.Await, st.floats(0, 60)),
-    st.just(wire.Where()),
+    st.just(wire.StackRequest()),
     st.builds(wire.End, st.none() | st.binary(), names, st.booleans()),
 )
 
