@@ -1,4 +1,4 @@
-"""What finding the lanes near vehicles costs, on a city's streets."""
+"""Cost of finding the lanes near vehicles on a city's streets."""
 
 import statistics
 import time

@@ -3,7 +3,7 @@
 min ‖Σ a_j x_j − x̄‖² + Σ λ_j a_j² with Σ a = 1, 0 ≤ a ≤ 1, as in `vnet.cmm.weights`, for 10, 20 and 30 neighbours.
 Timed is the whole way from estimates to weights, which is the same for all but for the solver: checking the
 covariances, the Hessian, the solver, clipping. `_update` sets the solver up once and gives it each new Hessian,
-`_fresh` sets it up anew for every problem. All take turns problem by problem. Needs the extra `bench`.
+`_fresh` sets it up again for every problem. All take turns problem by problem. Needs the extra `bench`.
 """
 
 import statistics

@@ -21,23 +21,23 @@ class Pacing(StrEnum):
 
 ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
 ProgramOption = Annotated[
-    str | None, typer.Option(metavar="MODULE:FUNCTION", help="What every vehicle runs, as hello:main.")
+    str | None, typer.Option(metavar="MODULE:FUNCTION", help="Program of every vehicle, as hello:main.")
 ]
 PacingOption = Annotated[
     Pacing | None,
-    typer.Option(help="Virtual time, the same on every machine; or the wall clock. Default: the scenario's."),
+    typer.Option(
+        help="lockstep: virtual time, the same on every machine. realtime: the wall clock. Default: the scenario's."
+    ),
 ]
-SeedOption = Annotated[
-    int | None, typer.Option(metavar="N", help="Of all that is drawn at random: same seed, same run.")
-]
+SeedOption = Annotated[int | None, typer.Option(metavar="N", help="Random seed: same seed, same run.")]
 DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
 OutOption = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="For the run's files. Default: runs/NAME-SEED.")
+    Path | None, typer.Option(metavar="FOLDER", help="Folder of the run's files. Default: runs/NAME-SEED.")
 ]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. As often as need be."
+        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. May be repeated."
     ),
 ]
 RerunOption = Annotated[

@@ -53,7 +53,7 @@ from vnet.transport.session import quiet_zenoh
 
 
 class RouterKind(StrEnum):
-    """Who routes a run that `vnet run` starts."""
+    """Router of a run that `vnet run` starts."""
 
     EMBEDDED = "embedded"
     SEPARATE = "separate"
@@ -61,7 +61,7 @@ class RouterKind(StrEnum):
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What was asked for beside the run itself."""
+    """Output that was asked for beside the run itself."""
 
     log_format: LogFormat
     quiet: bool
@@ -123,7 +123,7 @@ def simulate(
     quiet: QuietOption = False,
     report: ReportOption = True,
 ) -> None:
-    """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, sooner."""
+    """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
     fix_hash_seed("emulator.cli")
     with one_line_errors(log_format):
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
@@ -228,7 +228,7 @@ def _run_live(
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:
     """The vehicle to be looked at closely must be there."""
     if sinks is not None and sinks.vehicle is not None and sinks.vehicle not in world.node_ids:
-        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no vehicle is called so")
+        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no such vehicle")
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:

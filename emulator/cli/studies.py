@@ -29,7 +29,7 @@ def analyze(
     ] = None,
     overrides: SetOption = None,
 ) -> None:
-    """What the graph says without a run: components, degrees, how well each rule of weights mixes."""
+    """Analyze the network without a run: components, degrees, convergence of each rule of weights."""
     from emulator.experiments.analyze import analysis_table
     from emulator.experiments.analyze import analyze as analyze_scenario
 
@@ -58,7 +58,7 @@ def campaign(
         float, typer.Option(min=1.0, metavar="SECONDS", help="Wall clock that a run may take.")
     ] = 300.0,
 ) -> None:
-    """Run a scenario many times under random faults, and shrink what fails to the least that still does."""
+    """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
     fix_hash_seed("emulator.cli")
     from emulator.testing.campaign import Plan, run_campaign
 

@@ -21,8 +21,8 @@ from emulator.viewer.sinks import (
     choose_sinks,
     has_display,
     is_closed,
-    mend,
     place_to_serve,
+    repair,
     serve_file,
     viewer_command,
 )
@@ -58,7 +58,7 @@ def view(
         if not recording.exists() or not recording.stat().st_size:
             raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
         if not is_closed(recording):
-            recording = mend(recording)
+            recording = repair(recording)
             print(f"the recording was not closed: what it has is in {recording}", flush=True)
         if has_display() and not serve and rerun_bind is None and rerun_port is None:
             with contextlib.suppress(KeyboardInterrupt):
@@ -70,7 +70,7 @@ def view(
 
 
 def _is_on(run: Path) -> bool:
-    """Whether a run is going on in this folder."""
+    """Return True if the run of this folder is on."""
     way = read_control_file(run)
     if way is None:
         return False

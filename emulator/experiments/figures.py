@@ -96,7 +96,7 @@ _COMPONENT_LOOKS = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANG
 
 
 def degree_histogram(networks: Networks, out: Path, range_m: float = REFERENCE_RANGE_M) -> Path:
-    """How many vehicles have how many others in range; a panel a network."""
+    """Histogram of the degrees; a panel a network."""
     return save(draw_degree_histogram(networks, range_m), out)
 
 
@@ -121,7 +121,7 @@ def draw_degree_histogram(networks: Networks, range_m: float) -> Figure:
 
 
 def road_angle_histogram(networks: Networks, out: Path) -> Path:
-    """Which way the roads lead: vehicles a sector of 15°, east at the right, north at the top."""
+    """Directions of the roads: vehicles a sector of 15°, east at the right, north at the top."""
     return save(draw_road_angle_histogram(networks), out)
 
 
@@ -330,7 +330,7 @@ def draw_alpha_curve(
 
 
 OPTIMIZED_AT = 1.12
-"""Where on the axis of α the optimized weights stand."""
+"""Position of the optimized weights on the axis of α."""
 
 
 def _dress_alpha_axis(axes: Axes) -> None:

@@ -61,7 +61,7 @@ GROUPS = (("title", "time"), ("vehicles",), ("common_error", "deviation", "posit
           ("faults",), ("events",))  # fmt: skip
 FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m"}
 PATIENCE_S = 1.0
-"""Of emulated time: what programs have not reported by then has no row."""
+"""Emulated time after which a value that is not reported has no row."""
 EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
 
 
@@ -104,7 +104,7 @@ class Dashboard:
         return found + [[]] * min(spare, count["events"] - max(1, len(shot.events)))
 
     def _allot(self, height: int) -> Counter[str]:
-        """How many rows each part gets."""
+        """Rows given to each part."""
         shot = self._snapshot
         most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults)}
         if shot.emulated_s >= PATIENCE_S:
@@ -135,7 +135,7 @@ class _Rows:
         return [start, *axis, Segment(" " * (self._axis - filled + 2)), *words]
 
     def title(self, rows: int) -> list[Line]:
-        """What runs, and how fast."""
+        """Line with the run's name, pacing and speed."""
         shot = self._shot
         about = [shot.pacing, f"seed {shot.seed}", f"{len(shot.node_ids)} vehicles"]
         if shot.emulator_memory_mb is not None:
@@ -163,7 +163,7 @@ class _Rows:
         return [Segment(f"{shot.real_time_factor:.1f}× real time", BOLD), Segment(f" · {left}")]
 
     def time(self, rows: int) -> list[Line]:
-        """How far it has come."""
+        """Progress bar of the emulated time."""
         shot = self._shot
         done = shot.emulated_s / shot.duration_s
         words = [Segment(f"{shot.emulated_s:.1f}", BOLD), Segment(f" of {shot.duration_s:g} s")]
@@ -174,7 +174,7 @@ class _Rows:
         return [Segment("━" * done, SKY), Segment("─" * (self._axis - done), DIM)]
 
     def joined(self, rows: int) -> list[Line]:
-        """How many have joined, and how long they still may take."""
+        """Line with the number of vehicles that have joined and the time left to join."""
         shot = self._shot
         count = len(shot.node_ids)
         joined = count - len(shot.missing)
@@ -184,7 +184,7 @@ class _Rows:
         return [self._row("joined", self._bar(joined / count), words)]
 
     def missing(self, rows: int) -> list[Line]:
-        """Who has not joined."""
+        """Line with the vehicles that have not joined."""
         named = _names(self._shot.missing, self._width - self._label)
         return [[Segment("missing".ljust(self._label), DIM), Segment(named)]]
 
@@ -205,7 +205,7 @@ class _Rows:
         return [self._row("vehicles", strip, words)]
 
     def _strip(self, node_ids: Sequence[str], away: set[str]) -> Line:
-        """Where there are more vehicles than room, one dot stands for several, and is hollow if any is away."""
+        """Dots for the vehicles; with more vehicles than room a dot stands for several, hollow if any is away."""
         dots = min(len(node_ids), self._axis)
         hollow = DIM if self._shot.phase == "joining" else RED
         absent = set(self._shot.absent)
@@ -224,7 +224,7 @@ class _Rows:
         return [self._figure("common error", "common_error_rmse_m", "RMSE")]
 
     def deviation(self, rows: int) -> list[Line]:
-        """How much vehicles differ."""
+        """Line with the deviation between vehicles."""
         return [self._figure("deviation", "deviation_m", "between vehicles")]
 
     def position(self, rows: int) -> list[Line]:
@@ -243,7 +243,7 @@ class _Rows:
         return self._row(label, [Segment(line, SKY)], words)
 
     def frames(self, rows: int) -> list[Line]:
-        """What became of frames in the last second, as shares."""
+        """Shares of the outcomes of the last second."""
         rates = _shown(self._shot.frames_per_s)
         total = sum(rates.values())
         bar: Line = []
@@ -320,7 +320,7 @@ class _Rows:
 
 
 def is_bad(event: Event) -> bool:
-    """Whether something has gone wrong that no fault of the plan was to do."""
+    """True if something failed that no planned fault was to do."""
     return event.kind in BAD_EVENTS
 
 
@@ -409,7 +409,7 @@ def _cut(text: str, width: int) -> str:
 
 
 def _cut_middle(text: str, width: int) -> str:
-    """What is cut of a long name is not its number."""
+    """Cut a long name, but not the number at its end."""
     return text if len(text) <= width else f"{text[: width - 4]}…{text[-3:]}"
 
 

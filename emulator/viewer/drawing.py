@@ -1,4 +1,4 @@
-"""What all parts of a recording are drawn with: colours, lengths, a canvas, and a period as arrays.
+"""Drawing for all parts of a recording: colours, lengths, a canvas, and a period as arrays.
 
 Rerun's 2-D views have y downwards, hence the minus signs: east is right, north is up.
 """
@@ -86,12 +86,12 @@ class Period:
 
     @property
     def number(self) -> int:
-        """Of the period."""
+        """Number of the period, from 0."""
         return int(self.message["period"])
 
     @property
     def time_ns(self) -> int:
-        """When it began."""
+        """Start of the period, in nanoseconds."""
         return int(self.message["time_ns"])
 
     @property
@@ -118,7 +118,7 @@ class Period:
 
     @cached_property
     def up(self) -> NDArray[np.bool_]:
-        """Which vehicles are up, (n,)."""
+        """Mask of the vehicles that are up, (n,)."""
         return np.frombuffer(self.message["up"], dtype=np.uint8).astype(bool)
 
     @cached_property
@@ -134,11 +134,11 @@ class Period:
 
     @cached_property
     def pairs(self) -> NDArray[np.int32]:
-        """What became of frames, (k, 4): sender, receiver, outcome, how many."""
+        """Counts of outcomes by link, (k, 4): sender, receiver, outcome, count."""
         return unpack_pairs(self.message)
 
     def counts(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many frames there were, and how many were delivered, each (n, n): row receives, column sends."""
+        """Frames attempted and frames delivered, each (n, n): row receives, column sends."""
         sender, receiver, outcome, number = self.pairs.T
         n = len(self.node_ids)
         place = receiver * n + sender + n * n * (outcome == Outcome.delivered)
@@ -202,7 +202,7 @@ for _outcome, _colour in OUTCOME_COLOURS.items():
 
 
 class _Rows:
-    """What is to be drawn of one entity, instant by instant."""
+    """Drawing of one entity, instant by instant."""
 
     def __init__(self) -> None:
         self.times_ns: list[int] = []
@@ -217,7 +217,7 @@ class _Rows:
 
     @property
     def lengths(self) -> NDArray[np.int32]:
-        """How many there are at each instant."""
+        """Number of elements at each instant."""
         return np.array([len(array) for array in self.arrays], dtype=np.int32)
 
 
@@ -236,7 +236,7 @@ class Canvas:
         self._bars: dict[str, Floats] = {}
 
     def at(self, time_ns: int) -> None:
-        """What is drawn from now on belongs to this emulated time."""
+        """Set the emulated time of whatever is drawn from now on."""
         self._time_ns = time_ns
 
     def log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
@@ -254,7 +254,7 @@ class Canvas:
         show_labels: bool = False,
         order: float | None = None,
     ) -> None:
-        """How the points of an entity look at all times: `radius` on the screen, one colour or one each.
+        """Set the style of an entity's points for all times: `radius` on the screen, one colour or one each.
 
         None for colours that change: what is always there would hide what comes with a time.
         """
@@ -283,7 +283,7 @@ class Canvas:
         self.points(entity, position_m, static=True)
 
     def strip_style(self, entity: str, colour: Colour | None, width: float, order: float | None = None) -> None:
-        """How the lines of an entity look at all times: `width` on the screen; None for a colour that changes."""
+        """Set the style of an entity's lines for all times: `width` on screen; None for a changing colour."""
         style = rr.LineStrips2D.from_fields(
             colors=None if colour is None else [colour],
             radii=rr.Radius.ui_points(width / 2),

@@ -223,7 +223,7 @@ def draw_scale(canvas: Canvas, point_m: Floats) -> None:
 
 
 def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
-    """What the colours of the map mean, in a view of its own: two rows of points with their names."""
+    """Legend of the map's colours, in a view of its own: two rows of points with their names."""
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     never = impossible(scene)
     links = [(outcome_title(one), colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
@@ -251,7 +251,7 @@ def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
 
 
 def in_reach(radio: Mapping[str, Any]) -> str:
-    """Who hears whom, in words, by the scenario's section."""
+    """Rule of connectivity in words, by the scenario's section."""
     if "path_loss" not in radio:
         return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
     stages = {"shadowing": "shadowing", "fading": "fading", "mac": "CSMA", "congestion": "congestion"}
