@@ -32,7 +32,7 @@ FOLDER = {
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
     "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
-    "control.json, operator.json": "the control endpoint of `vnet fault` and `vnet status`; there during a live run",
+    "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
     "again/": "the second run, with `--check-determinism`",
 }
@@ -95,7 +95,7 @@ EVENTS = {
     "spun": (
         "vehicle",
         "`error`, `where`",
-        "its program does not let time advance (busy loop); where its tasks stood",
+        "its program did not let time advance (busy loop); where its tasks stood",
     ),
     "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
     "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),

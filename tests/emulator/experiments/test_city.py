@@ -74,12 +74,12 @@ def test_errors_are_those_of_the_place() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--trips", "trips.csv"], "--map is needed"),
-        (["--map", "cross.npz"], "--trips is needed"),
+        (["--trips", "trips.csv"], "--map is missing"),
+        (["--map", "cross.npz"], "--trips is missing"),
         (["--trips", "nowhere.csv", "--map", "cross.npz"], "--trips nowhere.csv: no such file"),
     ],
 )
-def test_trips_and_maps_come_together(
+def test_trips_and_maps_are_needed_together(
     files: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
 ) -> None:
     monkeypatch.chdir(files)

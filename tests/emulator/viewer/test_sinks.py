@@ -262,7 +262,7 @@ def test_a_recording_of_nothing_but_its_name_is_not_shown(tmp_path: Path, left: 
     assert path.stat().st_size > 3000
     with path.open("r+b") as file:
         file.truncate(left)
-    with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} makes it anew"):
+    with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} rebuilds it"):
         repair(path)
     assert list(tmp_path.iterdir()) == [path]
 
