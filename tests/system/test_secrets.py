@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.live import LiveOptions, run_live
+from emulator.drivers.live import run_live
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import load_scenario
 from emulator.viewer.sinks import Sinks
