@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.lockstep import RealTime
+from emulator.drivers.realtime import RealTime
 from emulator.scenario.faults import parse_fault
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
