@@ -148,7 +148,7 @@ def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
     corner_m, error_m = errors_by_place(states)
     figure = Figure(figsize=(9, 8), layout="constrained")
     axes = figure.add_subplot()
-    axes.add_collection(LineCollection(list(lanes / 1000), colors="#bbbbbb", linewidths=0.4))
+    axes.add_collection(LineCollection(list(lanes / 1000), colors="0.733", linewidths=0.4))
     middle_km = (corner_m + PLACE_M / 2) / 1000
     order = np.argsort(error_m)  # the worst on top
     top_m = max(2.0, np.percentile(error_m, 98))

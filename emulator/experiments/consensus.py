@@ -29,6 +29,7 @@ from emulator.experiments.analyze import (
     ratio_matrix,
 )
 from emulator.experiments.paper import RANGE_M, network_sections
+from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.cmm.linear_model import convergence_factor
@@ -47,7 +48,12 @@ ONE_WAY_SHARE, CHURN_SHARE = 0.1, 0.1
 AWAY_S = (6.0, 20.0)
 FLOOR = 1e-10
 """Smaller relative errors are rounding: the convergence factor is measured above."""
-COLOURS = {"ratio": "#0072B2", "metropolis": "#D55E00", "max-degree": "#009E73", FASTEST: "#000000"}
+COLOURS = {
+    "ratio": PALETTE["blue"].light,
+    "metropolis": PALETTE["red"].light,
+    "max-degree": PALETTE["green"].light,
+    FASTEST: "0",
+}
 MARKERS = {"ratio": "o", "metropolis": "s", "max-degree": "^"}
 
 

@@ -154,7 +154,7 @@ def draw_tempering_curve(results: Sequence[Result]) -> Figure:
         if any(row[POSITION] is not None for row in rows):
             _draw_curve(consistency, rows, POSITION, len(groups), f"{label}, position")
     low, high = anees_band(len(unique(results, "seed")))
-    consistency.axhspan(low, high, color="#e6e6e6", zorder=0, label="95 % band, one sample a run")
+    consistency.axhspan(low, high, color="0.902", zorder=0, label="95 % band, one sample a run")
     consistency.axhline(1.0, color=BLACK, linewidth=1, zorder=1)
     consistency.set_yscale("log")
     _dress(

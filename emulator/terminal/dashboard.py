@@ -18,34 +18,20 @@ from rich.segment import Segment
 from rich.style import Style
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
+from emulator.pages.palette import PALETTE
+from emulator.radio.outcomes import DRAWN
 from emulator.records.run_folder import Event
 from vnet.errors import printable
 
 Line = list[Segment]
 
-# Okabe & Ito 2008: colours that the colour-blind can tell apart.
-GREEN, RED, ORANGE, SKY, PURPLE, YELLOW, BLUE, GREY = (
-    Style(color=colour)
-    for colour in ("#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#0072B2", "#969696")
-)
-# Shades, for more outcomes than there are such colours.
-DARK_YELLOW, DARK_RED, DARK_BLUE = (Style(color=colour) for colour in ("#8C8232", "#964208", "#285A8C"))
+GREEN, RED, ORANGE, SKY = (Style(color=PALETTE[name].either) for name in ("green", "red", "orange", "sky"))
 PLAIN, BOLD, DIM = Style(), Style(bold=True), Style(dim=True)
 BAD = RED + BOLD
-# The signs tell outcomes apart where there are no colours.
 OUTCOMES = {
-    "delivered": (GREEN, "█"),
-    "faded": (DARK_YELLOW, "▧"),
-    "collided": (DARK_RED, "▨"),
-    "lost": (RED, "▒"),
-    "peer_cap": (ORANGE, "░"),
-    "queue_full": (BLUE, "▚"),
-    "held_back": (DARK_BLUE, "▦"),
-    "oversize": (YELLOW, "▞"),
-    "fault": (PURPLE, "▓"),
-    "receiver_down": (GREY, "▤"),
-    "transport": (SKY, "▥"),
+    outcome.name: (Style(color=PALETTE[outcome.facts.colour].either), outcome.facts.sign) for outcome in DRAWN
 }
+"""Style and sign of each outcome; signs tell them apart where there are no colours."""
 BAD_EVENTS = ("died", "crashed", "spun", "stalled", "refused", "transport_gap", "observer_ended", "interrupted")
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0

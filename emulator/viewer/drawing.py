@@ -16,7 +16,8 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.outcomes import Outcome
+from emulator.pages.palette import PALETTE
+from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.stream.messages import unpack, unpack_pairs
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
@@ -24,32 +25,10 @@ Floats = NDArray[np.float32]
 
 TIMELINE = "emulated time"
 
-# Okabe & Ito 2008: colours that the colour-blind can tell apart, and that show on dark and light.
 BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
-    (0, 114, 178),
-    (86, 180, 233),
-    (0, 158, 115),
-    (230, 159, 0),
-    (213, 94, 0),
-    (204, 121, 167),
-    (150, 150, 150),
-    (100, 100, 100),
+    PALETTE[name].rgb for name in ("blue", "sky", "green", "orange", "red", "purple", "grey", "ink")
 )
-DARK_YELLOW, DARK_RED, DARK_BLUE = (140, 130, 50), (150, 66, 8), (40, 90, 140)
-"""Shades of yellow, red and blue, where there are more things than colours."""
-OUTCOME_COLOURS: dict[Outcome, Colour] = {
-    Outcome.delivered: GREEN,
-    Outcome.faded: DARK_YELLOW,
-    Outcome.collided: DARK_RED,
-    Outcome.lost: RED,
-    Outcome.peer_cap: ORANGE,
-    Outcome.fault: PURPLE,
-    Outcome.receiver_down: GREY,
-    Outcome.queue_full: BLUE,
-    Outcome.held_back: DARK_BLUE,
-    Outcome.oversize: DARK,
-    Outcome.transport: SKY,
-}
+OUTCOME_COLOURS: dict[Outcome, Colour] = {outcome: PALETTE[outcome.facts.colour].rgb for outcome in DRAWN}
 """In the order in which they are stacked."""
 
 COMMON_RINGS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
@@ -70,11 +49,6 @@ def drawable(text: str) -> str:
 
 def _has_glyph(character: str) -> bool:
     return character.isprintable() and (ord(character) < 0x180 or character in _ALSO_DRAWN)
-
-
-def outcome_title(outcome: Outcome) -> str:
-    """An outcome in words."""
-    return outcome.name.replace("_", " ")
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from emulator.viewer.drawing import (
     Canvas,
     Floats,
     Period,
-    outcome_title,
 )
 
 WINDOW_S = 5.0
@@ -139,7 +138,7 @@ class RadioScene:
             if count and entity not in self._announced:
                 self._announced.add(entity)
                 style = rr.SeriesLines(
-                    names=outcome_title(outcome), colors=[colour], widths=[2.5], aggregation_policy="MinMax"
+                    names=outcome.title, colors=[colour], widths=[2.5], aggregation_policy="MinMax"
                 )
                 self._canvas.log(entity, style, static=True)
             if entity in self._announced:
