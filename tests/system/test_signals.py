@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -42,7 +43,7 @@ def emulation_of(folder: Path, *overrides: str) -> Emulation:
     return Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
 
 
-def live(emulation: Emulation, **options: str) -> bool:
+def live(emulation: Emulation, **options: Any) -> bool:
     """Run; returns whether the run was interrupted."""
     access = Access.create(emulation.scenario.run.name, [["v01"], ["v02"]])
     return asyncio.run(run_live(emulation, LiveOptions(access, **options)))[1]

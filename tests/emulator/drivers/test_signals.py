@@ -58,7 +58,7 @@ def test_the_first_signal_cancels_the_task_and_a_second_one_does_not_disturb_its
 
 
 def test_a_handler_of_the_caller_s_loop_goes_on_afterwards() -> None:
-    heard = []
+    heard: list[str] = []
 
     async def work() -> None:
         loop = asyncio.get_running_loop()
