@@ -9,14 +9,13 @@ from typing import Any
 
 from agents.cooperative.frame import COMMON_LIMIT_M
 from vnet.cmm.consensus import AVERAGING_RULES
+from vnet.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
 from vnet.cmm.rbpf import RbpfConfig
 from vnet.errors import ProgramError
 
 FUSIONS = ("optimized", "random", "metropolis", "max-degree", "constant", "none")
 EXCHANGES = ("estimates", "particles")
 CONSENSUSES = ("ratio", *AVERAGING_RULES, "exact")
-LEAST_LOG_ROAD = -6.0
-"""What a road says at worst against a hypothesis, so that one vehicle cannot outvote all others."""
 PROFILES: dict[str, dict[str, Any]] = {
     "default": {},
     # The paper's, from its published runs (MODEL 7): a loose random walk, its 0.5 m a step of 0.1 s read as uniform
@@ -29,7 +28,7 @@ PROFILES: dict[str, dict[str, Any]] = {
         "consensus": "exact",
         "common_walk_m": 0.5 / math.sqrt(3) / math.sqrt(0.1),
         "one_sided": True,
-        "roads_apart": True,
+        "separate_map_update": True,
         "two_frames": True,
         "fusion_interval_s": 0.1,
         "ridge_m2": 1e-4,
@@ -162,7 +161,7 @@ class Options:
             start_sigma_m=self.start_sigma_m or None,
             one_sided=self.one_sided,
             separate_map_update=self.separate_map_update,
-            least_log_road=LEAST_LOG_ROAD if self.defence else -math.inf,
+            min_map_log_likelihood=MIN_MAP_LOG_LIKELIHOOD if self.defence else -math.inf,
         )
 
 

@@ -38,7 +38,7 @@ from vnet.cmm.consensus import (
     RatioConsensus,
     Share,
 )
-from vnet.cmm.fusion import Cloud, fuse
+from vnet.cmm.fusion import Cloud, fuse, shift
 from vnet.cmm.rbpf import Observation, Rbpf
 from vnet.cmm.robust import near_the_median
 from vnet.cmm.weights import (
@@ -187,7 +187,7 @@ class Estimator:
             stacked, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
             return stacked
         offset = np.array([frame.estimate_m for frame in frames.values()]) - self._said[0]
-        self.rbpf.shift(weights[1:] @ offset)
+        shift(self.rbpf, weights[1:] @ offset)
         return self.rbpf.estimate_m
 
     def _weigh(self, frames: Mapping[str, CooperativeFrame]) -> Array:
