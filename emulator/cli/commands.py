@@ -22,6 +22,7 @@ import typer
 from rich.console import Console
 
 from emulator.checks.judge import check_run, recorded_verdict
+from emulator.cli.conformance import conformance
 from emulator.cli.experiment import app as experiment_app
 from emulator.cli.export import export, radio
 from emulator.cli.fault import app as fault_app
@@ -79,6 +80,7 @@ app.command(rich_help_panel=Panel.AFTER)(radio)
 app.command(rich_help_panel=Panel.AFTER)(export)
 app.command(rich_help_panel=Panel.AFTER)(report)
 app.command(rich_help_panel=Panel.AFTER)(compare)
+app.command(rich_help_panel=Panel.APART)(conformance)
 
 
 class Pacing(StrEnum):
