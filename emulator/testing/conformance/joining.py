@@ -33,6 +33,7 @@ def joining(scene: Scene) -> None:
     while (heard := scene.hear(deadline_s - time.monotonic())) is not None:
         if isinstance(heard.message, wire.Hello) and heard.message.ready:
             scene.findings.fail("others_nonce", "ready after another's welcome", heard.data)
+            raise SceneOverError
     if (status := scene.bench.agent.exit_status) is not None:
         scene.findings.fail("others_nonce", f"exit status {status} after another's End")
         raise SceneOverError

@@ -9,7 +9,7 @@ from typing import Literal, TypeVar
 
 from emulator.scenario.scenario import Scenario
 from emulator.testing.conformance.bench import Bench, Said
-from emulator.testing.conformance.findings import Findings
+from emulator.testing.conformance.findings import Findings, counted
 from emulator.testing.conformance.inspection import Inspection
 from emulator.world.world import World
 from vnet.transport import wire
@@ -111,7 +111,7 @@ class Scene:
         if hello.ready or hello.failure is not None:
             self.findings.fail("hello", f"ready = {hello.ready}, failure = {hello.failure!r}", said.data)
         if len(hello.nonce) < SHORTEST_NONCE:
-            self.findings.fail("hello", f"a nonce of {len(hello.nonce)} bytes", said.data)
+            self.findings.fail("hello", f"a nonce of {counted(len(hello.nonce), 'byte')}", said.data)
         self.nonce = hello.nonce
         return hello
 
