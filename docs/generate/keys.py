@@ -84,7 +84,7 @@ def unit(name: str) -> str:
 
 
 def _type(key: dict[str, Any], many: bool = False) -> str:
-    """What kind of value a key takes, in words; of `many` such values, if they stand in a list."""
+    """Kind of value that a key takes, in words; `many` for a list of them."""
     if "$ref" in key:
         return "[selector](faults.md#selectors)"
     if "anyOf" in key:

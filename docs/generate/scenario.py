@@ -1,4 +1,4 @@
-"""docs/reference/scenario.md: every section and key of a scenario, and the options of the flagship."""
+"""docs/reference/scenario.md: every section and key of a scenario, and the options of programs."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def default(
 def tempering(
     networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
 ) -> None:
-    """How often roads count anew: ANEES and error of the limit, on N3 of the default too, against lateral_tau_s."""
+    """Consistency (ANEES) and error of the hears-all bound against lateral_tau_s, on N3 of the default too."""
     from emulator.experiments import tempering as study
 
     with one_line_errors():
@@ -200,7 +200,7 @@ def capacity(
     seeds: SeedsOption = 2,
     out: OutOption = None,
 ) -> None:
-    """How many peers an 802.11p channel has room for: delivery against the number of senders in reach."""
+    """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
     from emulator.experiments.capacity import run_capacity
 
     with one_line_errors():

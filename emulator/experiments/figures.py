@@ -23,6 +23,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLoca
 from numpy.typing import NDArray
 
 from emulator.experiments.tables import mean_and_standard_error, paired_ratio
+from emulator.pages.palette import PALETTE
 from emulator.world.networks import REFERENCE_RANGE_M
 from emulator.world.world import components
 from vnet.types import Array
@@ -31,17 +32,10 @@ Networks = Mapping[str, tuple[Array, Array]]
 """Name → positions (N, 2) in metres, east and north, and headings (N,) in radians from east to north."""
 
 DPI = 150
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE = (
-    "#000000",
-    "#E69F00",
-    "#56B4E9",
-    "#009E73",
-    "#F0E442",
-    "#0072B2",
-    "#D55E00",
-    "#CC79A7",
+BLACK, GREY = "0", "0.4"
+ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE = (
+    PALETTE[name].light for name in ("orange", "sky", "green", "yellow", "blue", "red", "purple")
 )
-GREY = "#666666"
 SECTORS = 24
 SHOWN_COMPONENTS = 5
 RATIO_LINES = {1.0: "the limit", 1.05: "1.05", 1.35: "1.35"}
@@ -62,7 +56,7 @@ styled = matplotlib.rc_context(
         "axes.spines.right": False,
         "axes.axisbelow": True,
         "axes.grid": True,
-        "grid.color": "#dddddd",
+        "grid.color": "0.867",
         "grid.linewidth": 0.6,
         "hatch.linewidth": 0.6,
         "svg.hashsalt": "vnet",
@@ -96,7 +90,7 @@ _COMPONENT_LOOKS = ((BLUE, "o"), (RED, "s"), (GREEN, "^"), (PURPLE, "D"), (ORANG
 
 
 def degree_histogram(networks: Networks, out: Path, range_m: float = REFERENCE_RANGE_M) -> Path:
-    """How many vehicles have how many others in range; a panel a network."""
+    """Histogram of the degrees; a panel a network."""
     return save(draw_degree_histogram(networks, range_m), out)
 
 
@@ -121,7 +115,7 @@ def draw_degree_histogram(networks: Networks, range_m: float) -> Figure:
 
 
 def road_angle_histogram(networks: Networks, out: Path) -> Path:
-    """Which way the roads lead: vehicles a sector of 15°, east at the right, north at the top."""
+    """Directions of the roads: vehicles a sector of 15°, east at the right, north at the top."""
     return save(draw_road_angle_histogram(networks), out)
 
 
@@ -174,7 +168,7 @@ def _draw_graph(axes: Axes, name: str, position_m: Array, heading_rad: Array, ra
     position_km = position_m / 1000
     linked = _links(position_m, range_m)
     ends = np.argwhere(np.triu(linked))
-    axes.add_collection(LineCollection(list(position_km[ends]), colors="#b0b0b0", linewidths=0.6, zorder=1))
+    axes.add_collection(LineCollection(list(position_km[ends]), colors="0.69", linewidths=0.6, zorder=1))
     groups = _by_component(position_m, range_m)
     for (colour, marker), (label, members) in zip((*_COMPONENT_LOOKS, (GREY, "x")), groups, strict=False):
         at, heading = position_km[members], heading_rad[members]
@@ -330,14 +324,14 @@ def draw_alpha_curve(
 
 
 OPTIMIZED_AT = 1.12
-"""Where on the axis of α the optimized weights stand."""
+"""Position of the optimized weights on the axis of α."""
 
 
 def _dress_alpha_axis(axes: Axes) -> None:
     ticks = {0.05: "0.05", 0.2: "0.2", 0.4: "0.4", 0.5: "0.5", 0.6: "0.6", 0.8: "0.8", 0.95: "0.95"}
     axes.set_xticks([*ticks, OPTIMIZED_AT], [*ticks.values(), "optimized"])
     axes.set_xlim(0, 1.2)
-    axes.axvline(1.035, color="#999999", linewidth=0.8)
+    axes.axvline(1.035, color="0.6", linewidth=0.8)
     axes.set_xlabel("α, the weight of a vehicle's own estimate")
 
 

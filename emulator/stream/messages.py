@@ -31,8 +31,6 @@ WEIGHT = "weight."
 """How the values begin by which programs report the weights of their fusion; a node's id follows."""
 LONGEST_DETAIL = 200
 """Characters that are told of one detail of an event."""
-_OUTCOMES = 16
-"""More than there are outcomes, for one number of sender, receiver and outcome."""
 
 
 def pack(array: ArrayLike) -> bytes:
@@ -183,12 +181,12 @@ def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> d
     decided = rows[(rows["outcome"] != Outcome.pending) & (start_ns <= time_ns) & (time_ns < end_ns)]
     sender, receiver = decided["sender"].astype(np.int64), decided["receiver"]
     key, which, number = np.unique(
-        (sender * count + receiver) * _OUTCOMES + decided["outcome"], return_inverse=True, return_counts=True
+        (sender * count + receiver) * len(Outcome) + decided["outcome"], return_inverse=True, return_counts=True
     )
-    place = key // _OUTCOMES
+    place = key // len(Outcome)
     newest_ns = np.zeros(len(key), np.int64)
     np.maximum.at(newest_ns, which, decided["sent_ns"])
-    pairs = np.column_stack([place // count, place % count, key % _OUTCOMES, number])
+    pairs = np.column_stack([place // count, place % count, key % len(Outcome), number])
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
     bins = np.minimum((delivered["arrival_ns"] - delivered["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1)

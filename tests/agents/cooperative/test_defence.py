@@ -144,7 +144,9 @@ def test_a_lie_is_chosen_from_a_list() -> None:
 
 
 @pytest.mark.parametrize("bend", [(50.0, 0.0), (3.0, -3.0), "random"])
-def test_a_receiver_that_fails_bends_nobody_elses_estimate_and_breaks_nothing(bend: object) -> None:
+def test_a_receiver_that_fails_bends_nobody_elses_estimate_and_breaks_nothing(
+    bend: tuple[float, float] | str,
+) -> None:
     town = Town()
     rng = np.random.default_rng(1)
     for _ in range(100):

@@ -47,7 +47,7 @@ def test_time_courses_are_drawn_for_one_seed_or_many(tmp_path: Path, seeds: int)
 
 
 def table1_results() -> list[dict[str, object]]:
-    rows = []
+    rows: list[dict[str, object]] = []
     for name in ("optimized", *(f"{alpha:g}" for alpha in ALPHAS)):
         value = 0.1 if name == "optimized" else 0.2 + (float(name) - 0.48) ** 2
         for seed in (1, 2):

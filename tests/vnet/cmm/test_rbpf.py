@@ -1,6 +1,7 @@
 """The filter against textbook filters and closed forms."""
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from vnet.cmm.map_matching import log_on_lane
@@ -12,7 +13,7 @@ DT_S = 0.1
 NOWHERE = LaneMap(np.empty((0, 2)), np.empty(0), 0.85)
 
 
-def observation(position: np.ndarray, heading: float = 0.3) -> Observation:
+def observation(position: npt.ArrayLike, heading: float = 0.3) -> Observation:
     return Observation(np.asarray(position, dtype=float), np.eye(2), heading)
 
 
@@ -102,7 +103,11 @@ def test_a_fix_that_is_far_off_may_be_explained_by_an_uncertain_common_error(spr
 def test_vehicles_on_no_lane_on_one_and_between_two_are_weighed_each_by_its_own() -> None:
     lanes = LaneMap(np.array([[0.0, 0.0], [0.0, 3.5], [900.0, 0.0]]), np.array([0.0, 0.0, np.pi / 2]), 0.85)
     rbpf = Rbpf(RbpfConfig(particles=50), lanes, np.random.default_rng(1))
-    places = {"a": ([0.0, 1.75], 0.0), "b": ([500.0, 500.0], 0.0), "c": ([900.0, 9.0], np.pi / 2)}
+    places: dict[str, tuple[list[float], float]] = {
+        "a": ([0.0, 1.75], 0.0),
+        "b": ([500.0, 500.0], 0.0),
+        "c": ([900.0, 9.0], np.pi / 2),
+    }
     rbpf.step(DT_S, {name: observation(place, heading) for name, (place, heading) in places.items()})
     across = np.sqrt(rbpf.covariance[:, 0, 0])[:, None]
     two = [log_on_lane(rbpf.mean[:1, 1] - north, across[:1], 0.85) for north in (0.0, 3.5)]

@@ -148,6 +148,6 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
 @settings(max_examples=100, deadline=None)
 @given(emulator_messages)
 def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
-    batch = isinstance(message, wire.Batch)
-    assert wire.is_batch(wire.encode(message)) == batch
-    assert wire.is_packets_only(wire.encode(message)) == (batch and not message.fixes)
+    assert wire.is_batch(wire.encode(message)) == isinstance(message, wire.Batch)
+    packets_only = isinstance(message, wire.Batch) and not message.fixes
+    assert wire.is_packets_only(wire.encode(message)) == packets_only
