@@ -215,7 +215,7 @@ class HidesGaps(Alters):
 
 class TooFewBins(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:6], [[2**63] * 80], fields[7]] if fields[0] == "Frames" else fields
+        return [*fields[:6], [[0] * 5], fields[7]] if fields[0] == "Frames" else fields
 
 
 class NoLastWords(Alters):
