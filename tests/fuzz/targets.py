@@ -213,7 +213,7 @@ _TX: tuple[wire.AgentMessage, ...] = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None),
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import"),
     wire.Yield(b"n" * 16, 3, 100, ["v01"], [], _TRAFFIC),
-    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], _TRAFFIC, wire.Lateness([1, 2]), True),
+    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], _TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
     wire.StackDump(b"n" * 16, "File …"),
 )
 _RX: tuple[wire.EmulatorMessage, ...] = (

@@ -21,6 +21,12 @@ from vnet.node import Fix, Packet, Report
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
+HEAD_START_NS = 200_000_000
+"""Real time: time 0 is this much later than the message that announces it, so that all hear of it in time."""
+LATENESS_LIMIT_NS = 20_000_000
+"""Deliveries later than this count against a real-time run."""
+LATENESS_BINS = 80
+"""Four for each factor of two, from 10 µs to 10 s around the limit."""
 LARGEST_SAID_BYTES = 64 * 2**20
 """What an agent may say at once: a frame of the largest payload from each of a thousand nodes still fits."""
 
@@ -119,7 +125,7 @@ class Yield(Message, frozen=True):
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
     """Real time: how late packets reached their process, as counts in the bins of `lateness_bin`."""
 
-    counts: Sequence[Count] = ()
+    counts: Annotated[Sequence[Count], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
 
 
 class Frames(Message, frozen=True):
@@ -294,11 +300,6 @@ def _check_size(data: bytes) -> None:
         raise WireError(f"{len(data)} bytes at once: at most {LARGEST_SAID_BYTES} are read")
 
 
-HEAD_START_NS = 200_000_000
-"""Real time: time 0 is this much later than the message that announces it, so that all hear of it in time."""
-LATENESS_LIMIT_NS = 20_000_000
-"""Deliveries later than this count against a real-time run."""
-LATENESS_BINS = 80
 _LATENESS_LIMIT_BIN = 44
 
 
