@@ -20,7 +20,7 @@ class Vehicle:
     def __init__(self, mark: float, lanes: list[int], particles: int) -> None:
         self.mark = mark
         self.lanes = lanes
-        self.mean = np.full((4, particles), mark) + np.arange(particles)
+        self.mean = np.full((4, particles), mark, float) + np.arange(particles)
         self.map_log_likelihood = np.zeros(particles)
         self.age_s = self.unseen_s = mark / 1000
         self.anchor_rad = np.nan
