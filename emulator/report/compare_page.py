@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend, styled, to_svg
-from emulator.pages.page import SIGNS, badge, escape, page, put_page, table
+from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.figures import DASHES, Chart, Drawing, Line, decided, latencies_ms, time_figure
 from emulator.report.source import Source
-from emulator.report.write import STYLE, figures_section
 from vnet.errors import VnetError
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
@@ -34,47 +33,39 @@ def write_comparison(comparison: Comparison, path: Path) -> Path:
 
 
 def comparison_page(comparison: Comparison) -> str:
-    """The whole page."""
+    """Return the whole page."""
     charts, missing = _draw(comparison)
-    names = [source.folder.resolve().name for source in (comparison.first, comparison.second)]
-    body = [*_header(comparison), *_difference(comparison), *_tables(comparison), *figures_section(charts, missing)]
-    return page(f"vnet: {names[0]} and {names[1]}", body, STYLE)
-
-
-def _header(comparison: Comparison) -> Iterator[str]:
-    yield "<header><h1>Two runs side by side</h1>"
-    rows = zip((A, B), (comparison.first, comparison.second), comparison.records, strict=True)
-    for name, source, record in rows:
-        yield f"<p><b>{name}</b> {badge(record.verdict)} {escape(source.folder)}</p>"
-    yield "</header>"
-
-
-def _difference(comparison: Comparison) -> Iterator[str]:
     finding = comparison.finding
-    yield '<section id="difference"><h2>First difference</h2>'
-    sign = "" if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} "
-    yield f"<p>{sign}{escape(finding.text)}.</p>"
-    if rows := finding.figures.get("rows"):
-        yield table(turned(rows))
-    yield "</section>"
+    rows = finding.figures.get("rows")
+    outcomes = "outcomes, as shares of the attempted receptions; B − A in percentage points"
+    return render(
+        "comparison.html.j2",
+        runs=list(_runs(comparison)),
+        difference=finding.text if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} {finding.text}",
+        difference_rows=table(turned(rows)) if rows else None,
+        scenario=table(comparison.scenario, "keys that differ") if comparison.scenario else None,
+        key_figures=table(comparison.figures, "errors are means after the first fifth of the run"),
+        outcomes=table(comparison.outcomes, outcomes) if comparison.outcomes else None,
+        checks=table(comparison.checks),
+        charts=charts,
+        missing=missing,
+    )
 
 
-def _tables(comparison: Comparison) -> Iterator[str]:
-    yield '<section id="scenario"><h2>Scenario</h2>'
-    yield table(comparison.scenario, "keys that differ") if comparison.scenario else "<p>The same.</p>"
-    yield '</section><section id="key"><h2>Key figures</h2>'
-    yield table(comparison.figures, "errors are means after the first fifth of the run")
-    if comparison.outcomes:
-        yield f"<br>{table(comparison.outcomes, 'shares of the pairs in range; B − A in percentage points')}"
-    yield f'</section><section id="checks"><h2>Checks</h2>{table(comparison.checks)}</section>'
+def _runs(comparison: Comparison) -> Iterator[dict[str, Any]]:
+    sources = comparison.first, comparison.second
+    for letter, source, record in zip((A, B), sources, comparison.records, strict=True):
+        name = source.folder.resolve().name
+        yield {"letter": letter, "name": name, "folder": source.folder, "verdict": record.verdict}
 
 
 # Curves.
 
 
 @styled
-def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, str]]:
-    charts, missing = [], {}
+def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, list[str]]]:
+    charts: list[Chart] = []
+    missing: dict[str, list[str]] = {}
     drawers: dict[str, tuple[str, Callable[[], Drawing]]] = {
         key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
     }
@@ -84,7 +75,7 @@ def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, str]]:
         try:
             drawing = draw()
         except VnetError as error:
-            missing[title] = str(error)
+            missing.setdefault(str(error), []).append(title)
             continue
         charts.append(Chart(key, title, to_svg(drawing.canvas.figure, key, title), drawing.caption))
     return charts, missing

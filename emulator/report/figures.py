@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from markupsafe import Markup
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
@@ -88,7 +89,7 @@ class Chart:
 
     key: str
     title: str
-    svg: str
+    svg: Markup
     caption: str
 
 
@@ -224,7 +225,7 @@ def busy(source: Source) -> Drawing:
         Line("mean", end_s, percent.mean(axis=1), BLUE),
         Line("busiest", end_s, percent.max(axis=1), RED, DASHES[1]),
     ]
-    made = time_figure(lines, "busy ratio (%)", source.end_s, source.spans, linear=True)
+    made = time_figure(lines, "channel busy ratio (%)", source.end_s, source.spans, linear=True)
     text = "The share of the time in which vehicles sensed the medium taken, in windows of 100 ms."
     return Drawing(made, text + _faults_note(made, source))
 
@@ -494,7 +495,7 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "position": ("Position", position),
     "outcomes": ("Outcomes over time", outcomes),
     "totals": ("Outcomes in total", totals),
-    "busy": ("Busy ratio of the medium", busy),
+    "busy": ("Channel busy ratio", busy),
     "links": ("Delivery against distance", links),
     "latency": ("Latency", latency),
     "ages": ("Age of information, and gaps", ages),
@@ -506,14 +507,15 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
 
 
 @styled
-def draw(source: Source) -> tuple[list[Chart], dict[str, str]]:
-    """All figures of a run; and of those with nothing to show, why, by title."""
-    charts, missing = [], {}
+def draw(source: Source) -> tuple[list[Chart], dict[str, list[str]]]:
+    """Draw all figures of a run; returns also the titles of those with nothing to show, by reason."""
+    charts: list[Chart] = []
+    missing: dict[str, list[str]] = {}
     for key, (title, figure) in FIGURES.items():
         try:
             drawing = figure(source)
         except VnetError as error:
-            missing[title] = str(error)
+            missing.setdefault(str(error), []).append(title)
             continue
         charts.append(Chart(key, title, to_svg(drawing.canvas.figure, key, title), drawing.caption))
     return charts, missing
