@@ -62,7 +62,7 @@ def report_page(source: Source) -> str:
         note=_note(source, record),
         summary=_summary(source, record),
         checks=_checks(record) if record else [],
-        not_applicable=_not_applicable(record) if record else {},
+        not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
         charts=charts,
         missing=missing,
@@ -164,12 +164,6 @@ def _one_line(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, str, type(None))):
         return json.dumps(value)
     return f"{value:,}" if isinstance(value, int) and abs(value) < 10**9 else value
-
-
-def _not_applicable(record: Record) -> dict[str, list[str]]:
-    """Names of the checks that were not exercised by reason; each reason begins with a capital."""
-    by_reason = record.judgement.not_applicable
-    return {reason[0].upper() + reason[1:]: names for reason, names in by_reason.items() if reason}
 
 
 def key_figures(record: Record) -> dict[str, str]:
