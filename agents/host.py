@@ -80,7 +80,7 @@ def run_agent(
 
 
 class _Attachment:
-    """The process's keys: its messages go out on the `tx` of its first node, all that it is told comes in one queue."""
+    """The process's keys: its messages go out on the `tx` of its first node, and come in through one queue."""
 
     def __init__(self, session: zenoh.Session, run: str, nodes: Sequence[str], stack: ExitStack) -> None:
         self.nodes = list(nodes)
