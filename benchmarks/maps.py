@@ -25,7 +25,7 @@ def city(seed: int = 0) -> Roads:
                 (cell := along(k), tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for k in range(steps)
             ]
             builder.add(f"street {street}", points, NUMBER["residential"], (1, 1), 3.0)
-    return builder.build(builder.places(), None)
+    return builder.build(builder.coordinates(), None)
 
 
 def measure(roads: Roads | None = None) -> dict[str, float]:
