@@ -92,7 +92,11 @@ EVENTS = {
     "interrupted": ("", "", "Ctrl-C or SIGTERM"),
     "finished": ("vehicle", "", "its program returned"),
     "crashed": ("vehicle", "`error`, `where`", "its program raised; the traceback"),
-    "spun": ("vehicle", "`error`, `where`", "its program went on for ever at one instant; where its tasks stood"),
+    "spun": (
+        "vehicle",
+        "`error`, `where`",
+        "its program did not let time advance (busy loop); where its tasks were waiting",
+    ),
     "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
     "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),

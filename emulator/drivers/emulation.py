@@ -20,7 +20,7 @@ from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.run_folder import RunFolder, write_text
-from emulator.scenario.faults import Fault, Infrastructure
+from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
@@ -216,9 +216,9 @@ class Emulation:
         self.engine.set_faults(active, time_ns)
         self._log_changes(time_ns, active)
         absent = self._absent(time_ns // self.world.period_ns)
-        down = self._nodes_under(active, "kill", "restart") | absent
-        paused = self._nodes_under(active, "pause")
-        killed = self._nodes_under(active, "kill")
+        down = self._nodes_under(active, lambda fault: fault.ends) | absent
+        paused = self._nodes_under(active, lambda fault: not fault.ends)
+        killed = self._nodes_under(active, lambda fault: fault.forced)
         living = [node for node in self.world.node_ids if self.up[node] or node in self._starting]
         stop = {node: node in killed for node in living if node in down}
         start = [n for n in self.world.node_ids if n in self._down and n not in down]
@@ -258,8 +258,9 @@ class Emulation:
                 self.folder.event(time_ns, "left", node)
         self._outside |= absent
 
-    def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
-        chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]
+    def _nodes_under(self, active: Sequence[PlannedFault], is_meant: Callable[[ProcessFault], bool]) -> set[str]:
+        """The nodes on whose processes faults act that `is_meant` accepts."""
+        chosen = [p.nodes for p in active if isinstance(p.fault, ProcessFault) and is_meant(p.fault)]
         return {node for node, number in self.number.items() if any(mask[number] for mask in chosen)}
 
     def _log_changes(self, time_ns: int, active: Sequence[PlannedFault]) -> None:

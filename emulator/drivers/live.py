@@ -30,7 +30,8 @@ from emulator.drivers.memory import MemoryWatch
 from emulator.drivers.observers import Messages
 from emulator.drivers.router import ROUTER
 from emulator.drivers.status import Course
-from emulator.scenario.faults import EmulatorRestart, Infrastructure
+from emulator.scenario.fault_families import Infrastructure
+from emulator.scenario.faults import EmulatorRestart
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.sinks import Sinks
 from vnet.errors import ProgramError, TransportError, VnetError, WireError

@@ -13,20 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from emulator.faults.selectors import Nodes, links_of, partitioned_links, select
-from emulator.scenario.faults import (
-    ConstPosOffset,
-    Fault,
-    GnssJump,
-    GnssOutage,
-    GnssRamp,
-    Infrastructure,
-    LinkFault,
-    NodeFault,
-    Partition,
-    RandomPos,
-    Range,
-    Swizzle,
-)
+from emulator.scenario.fault_families import Fault, LinkFault, NodeFault, ProcessFault
+from emulator.scenario.faults import Partition, Swizzle
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 from vnet.types import Mask
@@ -34,8 +22,6 @@ from vnet.units import NS_PER_S
 
 NEVER_NS = 0.1
 """Less than an instant: a fault that lasts so long does not act."""
-FOLLOWING = LinkFault | Range | GnssOutage | GnssJump | GnssRamp | ConstPosOffset | RandomPos
-"""Where vehicles move, a region or degree is looked at anew each period for these; others choose as they begin."""
 Places = tuple[Mask, Mask | None]
 
 
@@ -110,7 +96,7 @@ class FaultPlan:
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
-        if not isinstance(fault, FOLLOWING):
+        if not fault.follows_vehicles:
             moving = None
         planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
@@ -119,7 +105,7 @@ class FaultPlan:
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
         """Nodes of one process live, pause and die together."""
-        if planned.fault.kind not in ("kill", "restart", "pause"):
+        if not isinstance(planned.fault, ProcessFault):
             return
         for start in range(0, len(planned.nodes), self._groups):
             part = planned.nodes[start : start + self._groups]
@@ -206,10 +192,9 @@ def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Places:
     if isinstance(fault, LinkFault):
         links = links_of(fault, nodes, rng)
         return _ends(links), links
-    if isinstance(fault, Infrastructure):
-        return np.ones(len(nodes.ids), dtype=bool), None
-    assert isinstance(fault, NodeFault)
-    return select(fault.nodes, nodes, rng), None
+    if isinstance(fault, NodeFault):
+        return select(fault.nodes, nodes, rng), None
+    return np.ones(len(nodes.ids), dtype=bool), None
 
 
 def _ends(links: Mask) -> Mask:
@@ -240,7 +225,7 @@ def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, i
 def _changes(planned: PlannedFault, seed: int) -> Iterator[int]:
     yield planned.start_ns
     yield planned.end_ns
-    if planned.fault.kind == "swizzle":
+    if isinstance(planned.fault, Swizzle):
         for _, off_ns, back_ns in swizzle_times_ns(planned, seed):
             yield min(off_ns, planned.end_ns)
             yield min(back_ns, planned.end_ns)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scenario.faults import LinkFault, Partition, Selector
+from emulator.scenario.fault_families import LinkFault, Selector
+from emulator.scenario.faults import Partition
 from vnet.errors import ScenarioError
 from vnet.types import Array, Mask
 

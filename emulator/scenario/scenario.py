@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from emulator.scenario.faults import Fault
+from emulator.scenario.faults import AnyFault
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.sumo import input_files
@@ -304,8 +304,8 @@ class Scenario(Section):
     world: WorldSection = WorldSection()
     radio: Radio = Radio()
     program: Program = Program()
-    fault: tuple[Fault, ...] = ()
-    """What breaks, and when."""
+    fault: tuple[AnyFault, ...] = ()
+    """The faults, and when they act."""
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:

@@ -27,10 +27,11 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.records.run_folder import RUNS
+from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.schedules import WEIGHTS, ScheduleConstraints, draw_fault, known_kinds
+from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
 from vnet.errors import ScenarioError, VnetError
@@ -77,9 +78,9 @@ class Plan:
         if self.scenario.network.kind == "generated":
             changes["network.seed"] = seed
         scenario = make_scenario(self.scenario, changes)
-        choose, ground = _Random(seed), ScheduleConstraints.of(scenario)
-        weighted = [kind for kind in self.kinds for _ in range(WEIGHTS.get(kind, 1))]
-        faults = [draw_fault(choose, ground, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
+        choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
+        weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
+        faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
         return make_scenario(scenario, {"faults": faults})
 
 
