@@ -40,8 +40,9 @@ from emulator.checks.run import (
     check_transport,
 )
 from emulator.checks.senders import check_copies, check_gnss
+from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.verdicts import DIVERGENT_M, DIVERGENT_S, CheckResult, Finding, NotExercised, Verdict
+from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict
 
 Function = Callable[[RecordedRun], Finding] | Callable[[RecordedRun], Iterator[Finding]]
 

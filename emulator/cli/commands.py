@@ -106,9 +106,7 @@ PacingOption = Annotated[
     Pacing | None,
     typer.Option(help="Virtual time, the same on every machine; or the wall clock. Default: the scenario's."),
 ]
-SeedOption = Annotated[
-    int | None, typer.Option(metavar="N", help="Of all that is drawn at random: same seed, same run.")
-]
+SeedOption = Annotated[int | None, typer.Option(metavar="N", help="Random seed: same seed, same run.")]
 DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
 OutOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="For the run's files. Default: runs/NAME-SEED.")
@@ -116,7 +114,7 @@ OutOption = Annotated[
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. As often as need be."
+        "--set", metavar="KEY=VALUE", help="Change a key of the scenario: radio.loss=0.3. May be repeated."
     ),
 ]
 TlsNameOption = Annotated[
@@ -471,7 +469,7 @@ def _run_live(
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:
     """The vehicle to be looked at closely must be there."""
     if sinks is not None and sinks.vehicle is not None and sinks.vehicle not in world.node_ids:
-        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no vehicle is called so")
+        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no such vehicle")
 
 
 def _check_restarts(scenario: Scenario, own_router: bool) -> None:

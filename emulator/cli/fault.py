@@ -21,7 +21,7 @@ from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import Painter
 from emulator.terminal.progress import terminal
-from vnet.errors import ScenarioError, VnetError
+from vnet.errors import ScenarioError, VnetError, first_names
 
 app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
 
@@ -43,7 +43,7 @@ def inject(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. As often as need be.",
+            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. May be repeated.",
         ),
     ] = None,
     run: RunOption = LATEST,
@@ -139,6 +139,6 @@ def _show(faults: list[dict[str, Any]]) -> None:
     table = Table("fault", "state", "from", "to", "nodes")
     for fault in faults:
         nodes = fault["nodes"]
-        shown = ", ".join(nodes[:6]) + (f", … ({len(nodes)})" if len(nodes) > 6 else "")
+        shown = first_names(nodes, 6, with_total=True)
         table.add_row(fault["fault"], fault["state"], f"{fault['start_s']:.3f} s", f"{fault['end_s']:.3f} s", shown)
     Console().print(table)

@@ -6,13 +6,13 @@ any order, without leaving anything behind.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from emulator.faults.selectors import Nodes, links_of, partitioned_links, select
+from emulator.scenario import random_streams
 from emulator.scenario.fault_families import Fault, LinkFault, NodeFault, ProcessFault
 from emulator.scenario.faults import Partition, Swizzle
 from emulator.scenario.scenario import Scenario
@@ -20,8 +20,8 @@ from vnet.errors import ScenarioError
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
-NEVER_NS = 0.1
-"""Less than an instant: a fault that lasts so long does not act."""
+NO_DURATION_NS = 0.1
+"""Less than an instant: a fault of this duration does not act."""
 Places = tuple[Mask, Mask | None]
 
 
@@ -151,7 +151,7 @@ class FaultPlan:
 
 
 def _as_written(planned: PlannedFault) -> Fault:
-    lasting_ns = planned.end_ns - planned.start_ns or NEVER_NS  # healed before it began: it keeps its number
+    lasting_ns = planned.end_ns - planned.start_ns or NO_DURATION_NS  # healed before it began: it keeps its number
     update = {"at_s": planned.start_ns / NS_PER_S, "duration_s": lasting_ns / NS_PER_S}
     if isinstance(planned.fault, Swizzle):
         update["over_s"] = planned.fault.over_s or planned.fault.duration_s
@@ -203,9 +203,8 @@ def _ends(links: Mask) -> Mask:
 
 
 def stream(seed: int, number: int, what: str) -> np.random.Generator:
-    """The random stream of one fault of the plan, by what it decides."""
-    key = int.from_bytes(hashlib.blake2b(f"fault {number} {what}".encode(), digest_size=8).digest(), "little")
-    return np.random.Generator(np.random.Philox(key=np.array([seed, key], dtype=np.uint64)))
+    """Return the random stream of one fault of the plan, named by what it decides."""
+    return random_streams.stream(seed, f"fault {number} {what}")
 
 
 def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, int]]:

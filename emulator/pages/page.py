@@ -6,14 +6,13 @@ Everything that others wrote (names, programs' errors, scenarios) passes through
 from __future__ import annotations
 
 import html
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from emulator.records.atomic import write_atomically
 from emulator.records.verdicts import Verdict
 from emulator.terminal.summary import cell
-from vnet.errors import VnetError
 
 SIGNS = {Verdict.VALID: "✓", Verdict.INVALID: "✗", Verdict.UNKNOWN: "?"}
 LONGEST_TEXT = 20_000
@@ -130,12 +129,6 @@ def _class(is_number: bool) -> str:
 
 
 def put_page(path: Path, text: str) -> Path:
-    """Put a page in place in one step. Raises VnetError where the disk does not play along."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(text.encode("utf-8", "replace"))
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
+    """Put a page in place in one step. Raises VnetError where the disk refuses."""
+    write_atomically(path, text)
     return path

@@ -9,8 +9,6 @@ from typing import Any
 MOST_ROWS = 10
 """Offending rows that a failed check shows."""
 NO_FAULTS = "the scenario has no faults"
-DIVERGENT_M, DIVERGENT_S = 10.0, 5.0
-"""A vehicle is divergent while its common error is larger for so long (MODEL 6)."""
 
 
 class Verdict(StrEnum):

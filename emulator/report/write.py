@@ -21,12 +21,11 @@ from emulator.report.index import write_index
 from emulator.report.radio import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.terminal.summary import FIGURES, left_out
-from vnet.errors import VnetError
+from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
 MOST_SCENARIO = 50_000
 """Characters of a scenario that are shown; one with a matrix of links may have millions."""
-MOST_NAMED = 8
 
 STYLE = """
 .facts { display: flex; flex-wrap: wrap; gap: .1rem 1.1rem; margin: 0; padding: 0; list-style: none;
@@ -272,8 +271,7 @@ def _event(event: Event) -> dict[str, Any]:
 def _listed(value: Any) -> str:
     if not isinstance(value, list):
         return str(value)
-    more = f", … ({len(value)})" if len(value) > MOST_NAMED else ""
-    return ", ".join(map(str, value[:MOST_NAMED])) + more
+    return first_names(value, with_total=True)
 
 
 def _scenario(source: Source) -> Iterator[str]:

@@ -22,7 +22,7 @@ from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLos
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.sumo import input_files
 from emulator.scenario.toml import DEEPEST, check_plain, parse_toml, read_toml
-from vnet.errors import ScenarioError, did_you_mean, printable, shown
+from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
 DAY_S = 86_400
@@ -37,8 +37,6 @@ FAR_S = 1e11
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
-MOST_NAMED = 8
-"""Files that a message names."""
 
 
 class Run(Section):
@@ -375,7 +373,7 @@ def _instead(path: Path) -> str:
     try:
         inside = sorted(each.name for each in path.glob("*.toml"))
         if inside:
-            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+            return f"; in it there are {first_names(inside)}"
         return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
     except (OSError, ValueError):
         return ""
