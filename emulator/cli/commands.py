@@ -21,7 +21,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from emulator.checks.judge import check_run, recorded_verdict
+from emulator.checks.judge import check_run
 from emulator.cli.experiment import app as experiment_app
 from emulator.cli.export import export, radio
 from emulator.cli.fault import app as fault_app
@@ -38,6 +38,7 @@ from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.simulate import simulate as run_simulation
+from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat, one_line_errors, run_app
@@ -325,7 +326,7 @@ def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's fo
     """Judge a run again, from its files alone."""
     with one_line_errors():
         judgement = check_run(folder)
-        print_checks(judgement, Console(), recorded_verdict(folder)["reproduce"])
+        print_checks(judgement, Console(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from emulator.drivers.control import read_control_file
-from emulator.records.run_folder import check_is_run
+from emulator.records.run_files import check_is_run
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
     RECORDING,

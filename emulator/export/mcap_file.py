@@ -17,8 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 
-from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.scenario import dump_scenario
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from vnet.errors import VnetError
 
 Message = tuple[int, str, dict[str, Any]]
@@ -76,7 +75,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
 _KEPT = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
 
 
-def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
+def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
     """Write a run; returns how many messages these are. Raises VnetError where the package mcap is missing."""
     try:
         from mcap.writer import Writer
@@ -94,7 +93,7 @@ def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
         data = json.dumps(message, allow_nan=False).encode()
         writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
         count += 1
-    scenario = dump_scenario(recorded.scenario).encode()
+    scenario = recorded.scenario_text.encode()
     writer.add_attachment(
         create_time=0, log_time=0, name="scenario.toml", media_type="application/toml", data=scenario
     )

@@ -10,13 +10,13 @@ from urllib.parse import quote
 
 from emulator.pages.page import badge, escape, page, put_page
 from emulator.records.page_names import INDEX, REPORT
-from emulator.records.verdict_file import Record, read_record
-from emulator.report.source import when
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_files import is_run_folder
+from emulator.records.run_folder import SCENARIO_FILE, VERDICT_FILE
+from emulator.records.verdict_file import Record
 from emulator.viewer.sinks import RECORDING
 from vnet.errors import VnetError
 
-MARKS = ("scenario.toml", "verdict.json", "events.jsonl")
-"""A folder with any of these is a run's."""
 COLUMNS = {
     "run": "",
     "verdict": "",
@@ -91,21 +91,22 @@ def index_page(folder: Path) -> str:
 
 def _entries(folder: Path) -> Iterator[Entry]:
     try:
-        below = [path for path in folder.iterdir() if any((path / mark).is_file() for mark in MARKS)]
+        below = [path for path in folder.iterdir() if is_run_folder(path)]
     except OSError as error:
         raise VnetError(f"{folder}: cannot be read: {error.strerror or error}") from None
     for path in below:
         if path.is_symlink() and path.resolve().parent == folder.resolve():
             continue  # `latest`, which is listed under its own name
+        run = RecordedRun.open(path)
         record, without = None, "no verdict"
         problem = "no verdict.json: it is still going on, or was ended from outside"
-        if (path / "verdict.json").exists():
+        if run.has_record:
             try:
-                record = read_record(path)
+                record = run.record
             except VnetError as error:
                 without, problem = "broken", str(error).removeprefix(f"{path}/")
         try:
-            yield Entry(path, when(path), record, without, problem)
+            yield Entry(path, run.when, record, without, problem)
         except VnetError:
             continue  # somebody has just removed it
 
@@ -169,5 +170,5 @@ def _numbers(record: Record) -> list[tuple[str, str]]:
 
 
 def _files(folder: Path) -> str:
-    names = [name for name in ("scenario.toml", "verdict.json", RECORDING) if (folder / name).is_file()]
+    names = [name for name in (SCENARIO_FILE, VERDICT_FILE, RECORDING) if (folder / name).is_file()]
     return ", ".join(f'<a href="./{quote(f"{folder.name}/{name}")}">{escape(name)}</a>' for name in names)

@@ -13,7 +13,7 @@ from typing import Any
 
 from emulator.pages.page import badge, escape, page, pairs, put_page, table
 from emulator.records.page_names import REPORT
-from emulator.records.run_folder import RUNS, Event
+from emulator.records.run_folder import RUNS, SCENARIO_FILE, Event
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Verdict
 from emulator.report.figures import Chart, draw
@@ -115,7 +115,7 @@ def _header(source: Source, name: str, record: Record | None) -> Iterator[str]:
 
 
 def _why_no_verdict(source: Source) -> str:
-    if (source.folder / "verdict.json").exists():
+    if source.recorded.has_record:
         return "The verdict of this run cannot be read."  # why is told among the checks
     return "This run has no verdict: it is still going on, or it was ended from outside."
 
@@ -129,7 +129,7 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
         yield {"lockstep": "in lockstep", "realtime": "in real time"}[scenario.run.pacing]
         yield scenario.program.entry
         yield f"seed {scenario.run.seed}"
-    yield f"{source.when:%Y-%m-%d %H:%M}"
+    yield f"{source.recorded.when:%Y-%m-%d %H:%M}"
 
 
 # Checks.
@@ -291,7 +291,7 @@ def _scenario(source: Source) -> Iterator[str]:
 def _again(source: Source, record: Record | None) -> Iterator[str]:
     yield '<section id="again"><h2>Have it again</h2>'
     folder = shlex.quote(str(source.folder))
-    commands = [record.reproduce] if record else [f"vnet run {shlex.quote(str(source.folder / 'scenario.toml'))}"]
+    commands = [record.reproduce] if record else [f"vnet run {shlex.quote(str(source.folder / SCENARIO_FILE))}"]
     commands += [f"vnet check {folder}", f"vnet report {folder}"]
     yield f"<pre>{escape(chr(10).join(commands))}</pre>"
     if record is not None:

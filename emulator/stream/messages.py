@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
+from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
 from emulator.records.metrics import PeriodFigures, collect
+from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run_folder import Event
-from emulator.scenario.scenario import Scenario, dump_scenario
-from emulator.world.world import Instant, World, components
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import Instant, components
 from vnet.node import Report
 from vnet.types import Array
 
 LATENCY_BIN_NS = 2_000_000
 LATENCY_BINS = 50
-WEIGHT = "weight."
-"""How the values begin by which programs report the weights of their fusion; a node's id follows."""
 LONGEST_DETAIL = 200
 """Characters that are told of one detail of an event."""
 _OUTCOMES = 16
@@ -50,49 +49,34 @@ def unpack_pairs(message: Mapping[str, Any]) -> NDArray[np.int32]:
     return np.frombuffer(message["pairs"], dtype="<i4").reshape(-1, 4)
 
 
-def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
+def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) -> dict[str, Any]:
     """What does not change during a run, but for the faults in `scenario` that are planned while it is on.
 
     `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`: infinite for a line that goes both ways
     from its point), `range_m` (None where the scenario gives links or a path loss, and the range says nothing
     about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is
     not there yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether
-    they move, and the resolved scenario as TOML.
+    they move, and the resolved scenario as TOML, `scenario_text`.
     """
-    start = world.at(0)
     radio = scenario.radio
     reach = connectivity_of(radio, scenario.run.seed, world.links)
-    in_range = reach.in_range(start.position_m, distances_m(start.position_m))
-    label = components(start.position_m, radio.range_m, in_range)
+    in_range = reach.in_range(world.position_m, distances_m(world.position_m))
+    label = components(world.position_m, radio.range_m, in_range)
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),
-        "lane_point_m": pack(world.lane_map.point_m),
-        "lane_heading_rad": pack(world.lane_map.heading_rad),
-        "lane_length_m": pack(world.lane_map.length_m),
+        "lane_point_m": pack(world.lane_point_m),
+        "lane_heading_rad": pack(world.lane_heading_rad),
+        "lane_length_m": pack(world.lane_length_m),
         "range_m": radio.range_m if radio.links is None and radio.path_loss is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),
-        "area_m": pack([np.nanmin(world.course_m, axis=(0, 1)), np.nanmax(world.course_m, axis=(0, 1))]),
-        "moves": world.moves,
-        "period_ns": world.period_ns,
+        "area_m": pack(world.area_m),
+        "moves": scenario.network.moves,
+        "period_ns": scenario.period_ns,
         "duration_ns": scenario.duration_ns,
-        "scenario": dump_scenario(scenario),
+        "scenario": scenario_text,
     }
-
-
-@dataclass(frozen=True)
-class Beliefs:
-    """What nodes reported in a period: arrays (n, 2) and (n, 4), NaN where a node said nothing; and by node the
-    numbers of its cloud, point by point, and the weights (n,) of its fusion.
-    """
-
-    estimate_m: Array
-    covariance_m2: Array
-    common_error_m: Array
-    common_error_covariance_m2: Array
-    clouds: Mapping[str, ArrayLike]
-    weights: Mapping[str, Array]
 
 
 def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
@@ -111,11 +95,6 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
         {n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))},
         {n: w for n, r in last.items() if (w := _weights(weighed, r)) is not None},
     )
-
-
-def is_cloud(count: int) -> bool:
-    """Whether so many numbers can be points."""
-    return count % 2 == 0
 
 
 def _weights(place: Mapping[str, int], report: Report) -> Array | None:

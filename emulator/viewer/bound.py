@@ -9,13 +9,13 @@ speeds hardly change it says what all of them say.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.scenario import parse_recorded_scenario
 from emulator.stream.messages import unpack
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
@@ -26,13 +26,11 @@ LEAST_LOG_ROAD = -6.0
 """As the vehicles: one whose fixes are false must not outvote all others."""
 
 
-class Limit:
+class HearsAllBound:
     """Fed with the messages of a run, period by period; see the module's text."""
 
     def __init__(self, scene: Mapping[str, Any], particles: int = PARTICLES) -> None:
-        data = tomllib.loads(scene["scenario"])
-        data.pop("inputs", None)
-        scenario = Scenario.model_validate(data)
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
         world = scenario.world
         self._node_ids = scene["node_ids"]
         self._component = np.frombuffer(scene["component"], dtype="<i2")

@@ -12,7 +12,7 @@ import rerun as rr
 from emulator.radio.outcomes import Outcome
 from emulator.records.paper_values import paper_rmse
 from emulator.stream.messages import unpack
-from emulator.viewer.bound import Limit
+from emulator.viewer.bound import HearsAllBound
 from emulator.viewer.drawing import (
     BLUE,
     COMMON_RINGS_M,
@@ -60,7 +60,7 @@ class OverviewScene:
         self._canvas = canvas
         self._node_ids: list[str] = scene["node_ids"]
         few, lanes = len(self._node_ids) <= LIMIT_VEHICLES, len(scene["lane_heading_rad"]) > 0
-        self._limit = Limit(scene) if few and lanes and not scene["moves"] else None
+        self._limit = HearsAllBound(scene) if few and lanes and not scene["moves"] else None
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()

@@ -13,11 +13,11 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from emulator.checks.judge import RecordedRun, read_recorded_run
 from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
+from emulator.records.recorded_run import RecordedRun
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
@@ -55,7 +55,7 @@ async def reports(node: Any) -> None:
 
 @pytest.fixture(scope="module")
 def recorded(folder: Path) -> RecordedRun:
-    return read_recorded_run(folder)
+    return RecordedRun.open(folder)
 
 
 # pcapng, as its draft describes it.

@@ -9,13 +9,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import CheckResult, Judgement, NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, Judgement, NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.trace import read_trace, sha256_of_table
 from emulator.records.metrics import Metrics, summarize
-from emulator.records.run_folder import Event, RunFolder, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, build_world
 from vnet.errors import VnetError
@@ -35,7 +36,7 @@ def beacons(folder: Path, **radio: float) -> RecordedRun:
         read_trace(folder / "trace.parquet"),
         pq.read_table(folder / "states.parquet"),
         pq.read_table(folder / "metrics.parquet"),
-        read_events(folder),
+        RecordedRun.open(folder).events,
     )
 
 
@@ -256,5 +257,5 @@ def test_events_are_on_disk_at_once_and_a_torn_line_is_no_harm(tmp_path: Path) -
     folder.event(5, "died", "v01", how="SIGKILL")
     with (folder.path / "events.jsonl").open("a") as file:
         file.write('{"time_ns": 6, "ki')
-    assert read_events(folder.path) == [Event(5, "died", "v01", {"how": "SIGKILL"})]
+    assert RecordedRun.open(folder.path).events == [Event(5, "died", "v01", {"how": "SIGKILL"})]
     assert json.loads((folder.path / "events.jsonl").read_text().splitlines()[0])["kind"] == "died"
