@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import importlib.util
 import json
 import os
 import tempfile
@@ -32,6 +31,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
+from emulator.records.code_digest import digests_of, entries_of
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.world import build_world
@@ -43,6 +43,7 @@ from vnet.types import Array
 FORMAT = 1
 DIVERGENT_M, DIVERGENT_S = 10.0, 5.0
 """A vehicle is divergent whose common error is larger for so long (MODEL 6)."""
+_code_digests = cache(digests_of)
 
 
 @dataclass(frozen=True)
@@ -58,22 +59,9 @@ class Cell:
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        code = code_digest(self.scenario.program.entry)
+        code = _code_digests(entries_of(self.scenario))
         text = json.dumps([FORMAT, code, self.from_s, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-@cache
-def code_digest(entry: str) -> str:
-    """SHA-256 of the code that a result depends on: vnet, the emulator, and the package of the program `entry`."""
-    digest = hashlib.sha256()
-    for package in ("vnet", "emulator", entry.partition(":")[0].partition(".")[0]):
-        spec = importlib.util.find_spec(package)
-        for folder in (spec.submodule_search_locations or []) if spec else []:
-            for path in sorted(Path(folder).rglob("*.py")):
-                if "experiments" not in path.parts:
-                    digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def run_cells(

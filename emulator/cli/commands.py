@@ -27,6 +27,7 @@ from emulator.cli.export import export, radio
 from emulator.cli.fault import app as fault_app
 from emulator.cli.fault import status
 from emulator.cli.map import app as map_app
+from emulator.cli.new_run import create_folder
 from emulator.cli.playback import play, render
 from emulator.cli.report import ReportOption, compare, report, report_at_end
 from emulator.cli.viewing import RerunBindOption, RerunPortOption, RerunVehicleOption, view
@@ -192,7 +193,7 @@ def run(
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
             asked = OutputOptions(log_format, quiet, check_determinism, report)
-            _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
+            _run_live(loaded, world, create_folder(out, scenario, loaded, log_format), options, asked)
 
 
 @app.command(rich_help_panel=Panel.RUNS)
@@ -218,7 +219,7 @@ def simulate(
         world = build_world(loaded)
         _check_vehicle(sinks, world)
         sys.path.append(str(Path.cwd()))
-        emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
+        emulation = Emulation(loaded, world, create_folder(out, scenario, loaded, log_format))
         with show_progress(emulation, log_format, quiet) as progress:
             with ExitStack() as stack:
                 if sinks is not None:
@@ -282,7 +283,7 @@ def emulator(
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
-        folder = RunFolder.create(out, loaded)
+        folder = create_folder(out, scenario, loaded, log_format)
         access = access or folder.path / "access"
         users = _load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")

@@ -18,6 +18,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_folder import SCENARIO_FILE
 from vnet.errors import VnetError
 
 Message = tuple[int, str, dict[str, Any]]
@@ -95,7 +96,7 @@ def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
         count += 1
     scenario = recorded.scenario_text.encode()
     writer.add_attachment(
-        create_time=0, log_time=0, name="scenario.toml", media_type="application/toml", data=scenario
+        create_time=0, log_time=0, name=SCENARIO_FILE, media_type="application/toml", data=scenario
     )
     writer.finish()  # type: ignore[no-untyped-call]
     return count

@@ -214,11 +214,6 @@ class Trace:
         pq.write_table(self.to_table(), path, compression="zstd")
 
 
-def read_trace(path: Path) -> pa.Table:
-    """A trace as `Trace.write` wrote it. Raises OSError."""
-    return pq.read_table(path)
-
-
 def sha256_of_table(table: pa.Table) -> str:
     """SHA-256 over a trace's content, in the order of its rows, independent of how it was stored."""
     digest = hashlib.sha256()

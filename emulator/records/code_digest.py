@@ -28,11 +28,15 @@ _SITE = ("purelib", "platlib", "stdlib", "platstdlib")
 
 
 def code_digests(scenario: Scenario) -> dict[str, str]:
-    """Digests of the `program` of a scenario, its exceptions included, and of `vnet`.
+    """Return digests of the `program` of a scenario, its exceptions included, and of `vnet`.
 
     A program that cannot be found has none.
     """
-    entries = entries_of(scenario)
+    return digests_of(entries_of(scenario))
+
+
+def digests_of(entries: tuple[str, ...]) -> dict[str, str]:
+    """Return the same for the entries of a scenario's programs."""
     digest = program_digest(entries)
     return {"entries": " ".join(entries), **({"program": digest} if digest else {}), "vnet": vnet_digest()}
 
@@ -48,10 +52,10 @@ def changed_code(recorded: Mapping[str, Any], now: Mapping[str, str]) -> str:
     return f"{' and '.join(changed)} changed since this run was recorded" if changed else ""
 
 
-def entries_of(scenario: Scenario) -> list[str]:
+def entries_of(scenario: Scenario) -> tuple[str, ...]:
     """The entries of all programs of a scenario, sorted."""
     program = scenario.program
-    return sorted({program.entry, *(exception.entry for exception in program.exceptions)})
+    return tuple(sorted({program.entry, *(exception.entry for exception in program.exceptions)}))
 
 
 def program_digest(entries: Iterable[str]) -> str | None:

@@ -6,8 +6,9 @@ Nothing else opens them. `recorded_run` makes arrays of them, and says what they
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -35,7 +36,8 @@ from emulator.records.run_folder import (
 )
 from emulator.records.run_tables import StatesReader, TableFile, TraceReader
 from emulator.records.verdict_file import Record, read_record
-from emulator.scenario.scenario import Scenario, load_scenario, parse_recorded_scenario
+from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
 from emulator.world.world import build_world
 from vnet.bounded import read_bounded
@@ -88,7 +90,7 @@ class RunFiles:
                 f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
                 f"reads 1 to {FORMAT}"
             )
-        return record
+        return replace(record, reproduce=_from_here(record.reproduce, self.folder))
 
     @cached_property
     def events(self) -> list[Event]:
@@ -100,8 +102,10 @@ class RunFiles:
     def world(self) -> RecordedWorld:
         """What world.npz holds. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
-        if path.exists() or self.record.format > 1:
+        if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
+        if self.record.format > 1:
+            raise VnetError(f"{self.folder}: not a finished run's folder: there is no {WORLD_FILE} in it")
         try:
             return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
         except ScenarioError as error:
@@ -187,6 +191,16 @@ class RunFiles:
             if not found and column not in left_out:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
         return table.unify_dictionaries()
+
+
+def _from_here(command: str, folder: Path) -> str:
+    """The command that runs a run again, with the path of its scenario as the folder is called now."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return command
+    named = [str(folder / SCENARIO_FILE) if Path(word).name == SCENARIO_FILE else word for word in words]
+    return command if named == words else shlex.join(named)
 
 
 def is_run_folder(folder: Path) -> bool:

@@ -79,6 +79,11 @@ class RunFolder:
         return folder
 
     @property
+    def code(self) -> dict[str, str]:
+        """The digests of program and vnet at the run's start."""
+        return self._digests["code"]
+
+    @property
     def scenario_path(self) -> Path:
         """The file that runs it again."""
         return self.path / SCENARIO_FILE

@@ -39,8 +39,6 @@ OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
 MOST_NAMED = 8
 """Files that a message names."""
-DIGESTS = ("inputs", "code")
-"""Sections of a run's scenario.toml that are no part of the scenario: SHA-256 of what the run has read."""
 
 
 class Run(Section):
@@ -353,7 +351,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
-    recorded_digests = _take_digests(data).get("inputs", {})
+    recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
     for override in overrides:
@@ -372,32 +370,6 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     return scenario
 
 
-def parse_recorded_scenario(text: str, path: Path) -> Scenario:
-    """The scenario of a run's folder from its text; the files that it names need not be there any more.
-
-    `path` is what messages call it. Raises `ScenarioError`.
-    """
-    try:
-        data = parse_toml(text)
-        _take_digests(data)
-        return Scenario.model_validate(data)
-    except ValidationError as error:
-        raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
-    except ValueError as error:
-        raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
-
-
-def recorded_code(path: Path) -> dict[str, Any]:
-    """Return the section `[code]` of a file, in which a run has recorded its code; empty if there is none."""
-    code = _take_digests(read_toml(path)).get("code")
-    return code if isinstance(code, dict) else {}
-
-
-def _take_digests(data: dict[str, Any]) -> dict[str, Any]:
-    """Take out of the tables of a file those which are a run's record of what it has read."""
-    return {name: data.pop(name) for name in DIGESTS if name in data}
-
-
 def _instead(path: Path) -> str:
     """What may have been meant by a path that is no file."""
     try:
@@ -410,10 +382,7 @@ def _instead(path: Path) -> str:
 
 
 def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] | None = None) -> str:
-    """The scenario as TOML with every default spelled out, and with `digests` (see `DIGESTS`) by section.
-
-    Without them, it has those of its input files as they are now.
-    """
+    """The scenario as TOML with every default, and `digests`, by section; without any, those of its inputs."""
     data = scenario.model_dump(mode="json", exclude_none=True)
     data |= {"inputs": input_digests(scenario)} if digests is None else digests
     return tomli_w.dumps(data)

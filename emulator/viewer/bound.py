@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.scenario.scenario import parse_recorded_scenario
+from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap

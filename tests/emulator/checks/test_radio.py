@@ -16,7 +16,6 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.csma import Csma
-from emulator.radio.trace import read_trace
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
@@ -42,11 +41,8 @@ def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) 
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
-    states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
-    busy = pq.read_table(folder / "busy.parquet") if "mac" in radio else None
-    return RecordedRun(
-        scenario, read_trace(folder / "trace.parquet"), states, metrics, RecordedRun.open(folder).events, busy=busy
-    )
+    done = RecordedRun.open(folder)
+    return RecordedRun(scenario, done.trace, done.states, done.metrics, done.events, busy=done.busy)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from emulator.checks.judge import CheckResult, Judgement, NotExercised, Verdict,
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.trace import read_trace, sha256_of_table
+from emulator.radio.trace import sha256_of_table
 from emulator.records.metrics import Metrics, summarize
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import Event, RunFolder
@@ -33,7 +33,7 @@ def beacons(folder: Path, **radio: float) -> RecordedRun:
     conclude(emulation, wall_s, "simulate")
     return RecordedRun(
         scenario,
-        read_trace(folder / "trace.parquet"),
+        pq.read_table(folder / "trace.parquet"),
         pq.read_table(folder / "states.parquet"),
         pq.read_table(folder / "metrics.parquet"),
         RecordedRun.open(folder).events,
@@ -183,7 +183,7 @@ def test_a_folder_judges_itself_again_and_notices_tampering(tmp_path: Path) -> N
 
 def test_the_hash_survives_the_file_and_sees_every_cell(recorded: RecordedRun, tmp_path: Path) -> None:
     pq.write_table(recorded.trace, tmp_path / "again.parquet", compression="none")
-    assert sha256_of_table(read_trace(tmp_path / "again.parquet")) == sha256_of_table(recorded.trace)
+    assert sha256_of_table(pq.read_table(tmp_path / "again.parquet")) == sha256_of_table(recorded.trace)
     mask = np.arange(len(recorded.trace)) == 0
     for column in ("sent_ns", "seq", "size_bytes", "copy"):
         values = np.array(recorded.trace[column].to_pylist())

@@ -15,7 +15,6 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
-from emulator.radio.trace import read_trace
 from emulator.records.busy import mean_busy
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import RunFolder
@@ -164,7 +163,7 @@ def test_a_fault_acts_in_the_periods_that_it_touches(watched: Watched) -> None:
 
 def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
     """Against the trace, counted another way."""
-    trace = read_trace(watched.folder / "trace.parquet")
+    trace = pq.read_table(watched.folder / "trace.parquet")
     rows, ids = trace.to_pylist(), watched.told[0][1]["node_ids"]
     for message in watched.periods:
         start_ns, end_ns = message["time_ns"], message["time_ns"] + 100_000_000
