@@ -24,7 +24,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RECORDING, RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.viewer.bound import Limit
+from emulator.viewer.bound import HearsAllBound
 from emulator.world.world import build_world
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access
@@ -122,10 +122,10 @@ def _cpu_s(pid: int) -> float:
 
 def _limit_share(told: list[tuple[str, dict[str, Any]]]) -> float:
     """Share of it that the line of the bound takes, at 10 Hz."""
-    limit = Limit(told[0][1])
-    limit.step(told[1][1])
+    bound = HearsAllBound(told[0][1])
+    bound.step(told[1][1])
     periods = [message for stream, message in told[2:] if stream == "period"]
     started = time.thread_time()
     for message in periods:
-        limit.step(message)
+        bound.step(message)
     return (time.thread_time() - started) / len(periods) * 10

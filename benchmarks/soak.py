@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from emulator.records.run_folder import Event, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario, dump_scenario
 
@@ -68,7 +69,7 @@ def slope_kb_per_min(event: Event) -> float:
 
 def report(folder: Path) -> None:
     """Print the figures of a finished soak."""
-    events = read_events(folder)
+    events = RecordedRun.open(folder).events
     verdict = json.loads((folder / "verdict.json").read_text())
     series = [e for e in events if e.kind == "memory" and len(e.details["time_s"]) >= 9]
     slopes = {str(e.node): slope_kb_per_min(e) for e in series if e.node != "emulator"}

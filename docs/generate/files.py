@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -14,19 +13,25 @@ from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
-from emulator.records.metrics import STATES, Metrics, PeriodFigures
+from emulator.records.metrics import METRICS, STATES, PeriodFigures
+from emulator.records.recorded_world import ARRAYS
 
 INTRODUCTION = """
 A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`
 points to the newest. Times are emulated nanoseconds from the start of the run; positions are metres east and north.
 [How to read the tables](../how-to/read-tables.md) has examples.
+
+The folder of a finished run is complete: `vnet check`, `report`, `render`, `play`, `compare`, `export` and `radio`
+give the same results on another machine, without the run's input files, its program, or SUMO. Running it again
+(`vnet run FOLDER/scenario.toml`) needs them.
 """
 FOLDER = {
-    "scenario.toml": "the scenario with every default and the digests of its input files; it reproduces the run",
+    "scenario.toml": "[the scenario](#scenariotoml) with every default and digests of what it read; it runs again",
     "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
+    "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
@@ -36,6 +41,30 @@ FOLDER = {
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
     "again/": "the second run, with `--check-determinism`",
 }
+SCENARIO = """
+Two sections are not the scenario's own: they hold SHA-256 of what the run has read at its start.
+
+- `[inputs]`: each input file by its path. `vnet run FOLDER/scenario.toml` refuses a file that has changed, by name.
+- `[code]`: `program` is one digest of the programs named in `entries` and of every module that they import,
+  directly or not, from outside the standard library and site-packages; `vnet` is one digest of vnet's own sources.
+  If either has changed, `vnet run FOLDER/scenario.toml` says so in one line, records it (the event `code_changed`,
+  and the new digests), and goes on. The hash of the trace does not depend on them.
+"""
+WORLD_ABOUT = """
+An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles and `l` lanes.
+"""
+WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
+KINDS = {"U": "text", "f": "double", "b": "bool"}
+FORMATS = """
+`format` in `verdict.json` is the version of the whole folder.
+
+- 2: there is a `world.npz`, and `scenario.toml` has a section `[code]`.
+- 1 (vnet 0.1.0): there is neither. Such folders are read. What needs the world, needs the run's input files:
+  `render` and `play`, and, with `radio.links` in a file, checks and radio figures. Names of checks that began with
+  `bit:` are read as `effect:`.
+
+A folder of a later format is refused, with the version of vnet that wrote it.
+"""
 TRACE = {
     "sent_ns": "when the program handed it to the radio",
     "sender": "id of the vehicle",
@@ -49,6 +78,15 @@ TRACE = {
     "copy": "0; 1, 2, … for what a fault sends, or lets arrive, again",
     "on_air_ns": "with `[radio.mac]` only: when its transmission began; null if it never did",
     "left_ns": "with `[radio.mac]` only: when its transmission ended, or it was given up",
+}
+WORLD = {
+    "node_ids": "ids of the vehicles, in the order of the scenario's network and of the tables' rows",
+    "position_m": "positions at time 0; NaN of a vehicle that is not there yet",
+    "area_m": "lower left and upper right corner of the box in which vehicles are during the run",
+    "lane_point_m": "where each lane, or straight piece of a road, begins",
+    "lane_heading_rad": "its direction of travel, counter-clockwise from east",
+    "lane_length_m": "its length; infinite for a lane that is a straight line through its point",
+    "links": "with `radio.links` only: whether the row's vehicle hears the column's",
 }
 BUSY = {
     "time_ns": "when the 100 ms began",
@@ -73,6 +111,7 @@ STATE = {
     "values": "everything else that it reported, by name",
 }
 EVENTS = {
+    "code_changed": ("", "`what`", "program or vnet have changed since the run whose scenario this one repeats"),
     "started": ("", "`start_up_s`", "all have joined; time 0"),
     "ended": ("", "`wall_s`", "the run is over"),
     "interrupted": ("", "", "Ctrl-C or SIGTERM"),
@@ -105,7 +144,7 @@ EVENTS = {
     ),
 }
 VERDICT = {
-    "format": "1; counts up when the meaning of a key changes",
+    "format": "version of the folder, [2](#formats)",
     "verdict": "`valid`, `invalid` or `unknown`",
     "checks": "list of {`name`, `verdict`, `text`, `figures`}; `figures.rows` are the first offending rows",
     "not_exercised": "list of {`name`, `reason`}",
@@ -126,7 +165,7 @@ VERDICT = {
 
 def page() -> str:
     """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
-    trace, metrics = Trace(["v01"], knows_air=True).to_table().schema, _metrics_schema()
+    trace = Trace(["v01"], knows_air=True).to_table().schema
     parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
     parts += [
         "## `trace.parquet`",
@@ -136,12 +175,13 @@ def page() -> str:
     parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
+    parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
     parts += ["## `states.parquet`", columns(STATES, STATE)]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += [
         "## `metrics.parquet`",
         docstring(PeriodFigures),
-        columns(metrics, attribute_docstrings(PeriodFigures)),
+        columns(METRICS, attribute_docstrings(PeriodFigures)),
     ]
     parts += [
         "## `events.jsonl`",
@@ -151,13 +191,17 @@ def page() -> str:
     parts.append(table(["kind", "node", "besides", "what happened"], rows))
     parts += ["## `verdict.json`", "[checks.md](../checks.md) says what each check claims."]
     parts.append(table(["key", "what"], ([f"`{key}`", what] for key, what in VERDICT.items())))
+    parts += ["## Formats", FORMATS]
     return whole_page("What a run leaves", *parts)
 
 
-def _metrics_schema() -> pa.Schema:
-    schema = Metrics(["v01"], np.zeros(1, dtype=np.intp), 1).metrics_table().schema
-    assert schema.names == [field.name for field in dataclasses.fields(PeriodFigures)]
-    return schema
+def world_rows() -> list[list[str]]:
+    """A row for each array of world.npz. Raises LookupError where the texts do not fit them."""
+    if wrong := ARRAYS.keys() ^ WORLD.keys():
+        raise LookupError(f"arrays without a text, or texts without an array: {', '.join(sorted(wrong))}")
+    return [
+        [f"`{name}`", KINDS[kind], f"({shape})", unit(name), WORLD[name]] for name, (kind, shape) in ARRAYS.items()
+    ]
 
 
 def columns(schema: pa.Schema, said: Mapping[str, str]) -> str:

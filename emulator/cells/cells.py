@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import importlib.util
 import json
 import os
 import tempfile
@@ -33,6 +32,7 @@ from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
 from emulator.records.atomic import whole, write_atomically
+from emulator.records.code_digest import digests_of, entries_of
 from emulator.records.divergence import first_divergences
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
@@ -43,6 +43,7 @@ from vnet.transport.session import quiet_zenoh
 from vnet.types import Array
 
 FORMAT = 1
+_code_digests = cache(digests_of)
 
 
 @dataclass(frozen=True)
@@ -58,22 +59,9 @@ class Cell:
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        code = code_digest(self.scenario.program.entry)
+        code = _code_digests(entries_of(self.scenario))
         text = json.dumps([FORMAT, code, self.from_s, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-@cache
-def code_digest(entry: str) -> str:
-    """SHA-256 of the code that a result depends on: vnet, the emulator, and the package of the program `entry`."""
-    digest = hashlib.sha256()
-    for package in ("vnet", "emulator", entry.partition(":")[0].partition(".")[0]):
-        spec = importlib.util.find_spec(package)
-        for folder in (spec.submodule_search_locations or []) if spec else []:
-            for path in sorted(Path(folder).rglob("*.py")):
-                if "experiments" not in path.parts:
-                    digest.update(path.read_bytes())
-    return digest.hexdigest()
 
 
 def run_cells(

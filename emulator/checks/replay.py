@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_folder import AGAIN
 from emulator.records.verdicts import Finding, NotExercised, result
 from vnet.errors import VnetError
 
-AGAIN = "again"
-"""The folder, in a run's own, of the second run."""
 ONCE = NotExercised("replay", "it ran once; --check-determinism runs it twice")
 TABLES = ("trace", "states", "metrics")
 ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outcome", "arrival_ns")
@@ -24,25 +23,23 @@ ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outc
 def check_replay(folder: Path) -> Finding:
     """Compare a run with the second one in its folder. Raises VnetError if a table cannot be read."""
     again = folder / AGAIN
-    return compare_folders(folder, again) if (again / "verdict.json").exists() else ONCE
+    return compare_folders(folder, again) if RecordedRun.open(again).has_record else ONCE
 
 
 def compare_folders(first: Path, second: Path) -> Finding:
     """Compare two finished runs. Raises VnetError if a table cannot be read, or has other columns in one."""
+    ours, theirs = RecordedRun.open(first), RecordedRun.open(second)
     tables = []
-    for name in TABLES:
-        ours, theirs = _read(first, name), _read(second, name)
-        if set(ours.column_names) != set(theirs.column_names):
-            raise VnetError(f"{second / name}.parquet: has other columns than the one of {first}")
-        tables.append((name, ours, theirs))
+    for name, mine, other in zip(TABLES, _tables(ours), _tables(theirs), strict=True):
+        if set(mine.column_names) != set(other.column_names):
+            raise VnetError(f"{second}: the table of the {name} has other columns than the one of {first}")
+        tables.append((name, mine, other))
     return compare(tables)
 
 
-def _read(folder: Path, name: str) -> pa.Table:
-    try:
-        return pq.read_table(folder / f"{name}.parquet")
-    except (OSError, pa.ArrowInvalid) as error:
-        raise VnetError(f"{folder}: not the folder of a finished run: {error}") from None
+def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
+    """The tables of a run, as `TABLES` calls them."""
+    return run.trace, run.states, run.metrics
 
 
 def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from emulator.checks.judge import check_run, recorded_verdict
+from emulator.checks.judge import check_run
+from emulator.records.recorded_run import RecordedRun
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.summary import print_checks
 
@@ -17,5 +18,5 @@ def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's fo
     """Judge a run again, from its files alone."""
     with one_line_errors():
         judgement = check_run(folder)
-        print_checks(judgement, Console(), recorded_verdict(folder)["reproduce"])
+        print_checks(judgement, Console(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)

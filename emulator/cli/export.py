@@ -14,13 +14,13 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from emulator.checks.judge import RecordedRun, read_recorded_run
 from emulator.cli.viewing import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.atomic import disk_errors, whole
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
 
@@ -61,7 +61,7 @@ def radio(
 ) -> None:
     """A run's radio in figures: delivery by distance, latency, time between receptions, age of information."""
     with one_line_errors():
-        metrics = radio_metrics(read_recorded_run(run), bin_m)
+        metrics = radio_metrics(RecordedRun.open(run), bin_m)
         if out is not None:
             tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
             with disk_errors(out):
@@ -115,7 +115,7 @@ def export(
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
-        recorded = read_recorded_run(run)
+        recorded = RecordedRun.open(run)
         match to:
             case Format.PCAPNG:
                 path = out or run / "frames.pcapng"
@@ -128,7 +128,7 @@ def export(
                 print(f"{', '.join(_write_folder(path, recorded))} in {path}")
 
 
-def _write(path: Path, recorded: RecordedRun, writer: Callable[[RecordedRun, BinaryIO], int]) -> int:
+def _write(path: Path, recorded: OpenedRun, writer: Callable[[OpenedRun, BinaryIO], int]) -> int:
     """Write a file in one step; return what `writer` counts."""
     _refuse_existing(path)
     with whole(path) as part, part.open("wb") as file:

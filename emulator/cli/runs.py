@@ -16,6 +16,7 @@ import typer
 from rich.console import Console
 
 from emulator.cli.access import DEFAULT_ADDRESS, DEFAULT_LISTEN, create_access, load_or_create_access
+from emulator.cli.new_run import create_folder
 from emulator.cli.options import (
     DeterminismOption,
     DurationOption,
@@ -107,7 +108,7 @@ def run(
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
             asked = OutputOptions(log_format, quiet, check_determinism, report)
-            _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
+            _run_live(loaded, world, create_folder(out, scenario, loaded, log_format), options, asked)
 
 
 def simulate(
@@ -132,7 +133,7 @@ def simulate(
         world = build_world(loaded)
         _check_vehicle(sinks, world)
         sys.path.append(str(Path.cwd()))
-        emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
+        emulation = Emulation(loaded, world, create_folder(out, scenario, loaded, log_format))
         with show_progress(emulation, log_format, quiet) as progress:
             with ExitStack() as stack:
                 if sinks is not None:
@@ -195,7 +196,7 @@ def emulator(
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
-        folder = RunFolder.create(out, loaded)
+        folder = create_folder(out, scenario, loaded, log_format)
         access = access or folder.path / "access"
         users = load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")

@@ -13,17 +13,25 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
-from emulator.checks.replay import AGAIN, check_replay
+from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.radio.outcomes import Outcome
-from emulator.records.busy import BUSY, busy_table
+from emulator.records.busy import busy_table
 from emulator.records.metrics import summarize
+from emulator.records.recorded_world import RecordedWorld
+from emulator.records.run_folder import (
+    AGAIN,
+    BUSY_FILE,
+    FORMAT,
+    METRICS_FILE,
+    STATES_FILE,
+    TRACE_FILE,
+    VERDICT_FILE,
+    WORLD_FILE,
+)
 from emulator.records.verdicts import Finding, unknown
-
-FORMAT = 1
 
 
 def _start_up_s(emulation: Emulation) -> float | None:
@@ -43,13 +51,15 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     trace = emulation.engine.trace.to_table()
     states = emulation.metrics.states_table()
     metrics = emulation.metrics.metrics_table()
-    folder.put("trace.parquet", lambda path: pq.write_table(trace, path, compression="zstd"))
-    folder.put("states.parquet", lambda path: pq.write_table(states, path, compression="zstd"))
-    folder.put("metrics.parquet", lambda path: pq.write_table(metrics, path, compression="zstd"))
-    busy = _busy(emulation)
-    if busy is not None:
-        folder.put(BUSY, lambda path: pq.write_table(busy, path, compression="zstd"))
-    judgement = judge(RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy))
+    busy, world = _busy(emulation), RecordedWorld.of(emulation.world)
+    tables = {TRACE_FILE: trace, STATES_FILE: states, METRICS_FILE: metrics, BUSY_FILE: busy}
+    for name, table in tables.items():
+        if table is not None:
+            folder.put_table(name, table)
+    folder.put(WORLD_FILE, world.write)
+    judgement = judge(
+        RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
+    )
     verdict = {
         "format": FORMAT,
         **_judged(judgement),
@@ -63,14 +73,14 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
-        "reproduce": f"vnet {command} {shlex.quote(str(folder.path / 'scenario.toml'))}",
+        "reproduce": f"vnet {command} {shlex.quote(str(folder.scenario_path))}",
         "versions": {
             "vnet": version("vnet-emulator"),
             "python": platform.python_version(),
             "numpy": np.__version__,
         },
     }
-    folder.put_json("verdict.json", verdict)
+    folder.put_json(VERDICT_FILE, verdict)
     return judgement, verdict
 
 
@@ -99,7 +109,7 @@ def run_again(
     Returns the new contents of verdict.json.
     """
     path = emulation.folder.path
-    arguments = [command, str(path / "scenario.toml"), "--out", str(path / AGAIN), "--no-report", *options]
+    arguments = [command, str(emulation.folder.scenario_path), "--out", str(path / AGAIN), "--no-report", *options]
     # A process of its own: nothing that a program has left in this one may help it to agree with itself.
     done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
     finding: Finding = check_replay(path)
@@ -107,5 +117,5 @@ def run_again(
         finding = unknown("replay", f"the second run ended with status {done.returncode}")
     judgement.put(finding)
     verdict = {**verdict, **_judged(judgement), "reproduce": f"{verdict['reproduce']} --check-determinism"}
-    emulation.folder.put_json("verdict.json", verdict)
+    emulation.folder.put_json(VERDICT_FILE, verdict)
     return verdict

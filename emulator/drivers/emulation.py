@@ -20,9 +20,9 @@ from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.metrics import Metrics, PeriodFigures
-from emulator.records.run_folder import RunFolder, write_text
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
 from vnet.node import Report
@@ -276,8 +276,7 @@ class Emulation:
 
     def _rewrite(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        text = dump_scenario(scenario)
-        self.folder.put("scenario.toml", lambda path: write_text(path, text))
+        self.folder.put_scenario(scenario)
 
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""

@@ -11,6 +11,7 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
 from emulator.records.busy import mean_busy
+from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run_folder import Event
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import beliefs_of, event_message, period_message, scene_message
@@ -40,7 +41,8 @@ class Messages:
         """What does not change."""
         if self._scenario is not self._emulation.scenario:  # faults are planned while a run is on
             self._scenario = self._emulation.scenario
-            self._scene = scene_message(self._emulation.world, self._scenario)
+            world = RecordedWorld.of(self._emulation.world)
+            self._scene = scene_message(world, self._scenario, self._emulation.folder.scenario_text)
         return self._scene
 
     def period(self, view: PeriodView) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from rich.console import Group
 from rich.table import Table
@@ -23,6 +22,8 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.topology import Topology
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import METRICS_FILE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
@@ -98,13 +99,11 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
     `noise_m` is, by rule, the noise per axis and round with which the linear model deviates as much.
     """
-    path = run / "metrics.parquet"
-    if not path.is_file():
-        raise VnetError(f"{run}: no metrics.parquet in it; the folder of a finished run is needed")
-    values = pq.read_table(path, columns=["deviation_m"])["deviation_m"].to_pylist()
+    recorded = RecordedRun.open(run, {METRICS_FILE: ["deviation_m"]})
+    values = recorded.metrics["deviation_m"].to_pylist()
     settled = [value for value in values[len(values) // 5 :] if value is not None]
     if not settled:
-        raise VnetError(f"{path}: no deviation in it; its program reported no common error")
+        raise VnetError(f"{run}: no deviation in it; its program reported no common error")
     deviation = float(np.sqrt(np.mean(np.square(settled))))
     variance = {name: figures["deviation_variance"] for name, figures in rules.items()}
     noise = {name: deviation / float(np.sqrt(2 * value)) for name, value in variance.items() if value}

@@ -17,8 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import pyarrow as pa
 
-from emulator.records.recorded_run import RecordedRun
-from emulator.scenario.scenario import dump_scenario
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_folder import SCENARIO_FILE
 from vnet.errors import VnetError
 
 Message = tuple[int, str, dict[str, Any]]
@@ -77,7 +77,7 @@ _STATE_COLUMNS = ("position_m", "heading_rad", "fix_m", "estimate_m", "covarianc
 """Columns of `states.parquet` in `/states`."""
 
 
-def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
+def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
     """Write a run; return the number of messages. Raise VnetError if the package mcap is missing."""
     try:
         from mcap.writer import Writer
@@ -95,9 +95,9 @@ def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
         data = json.dumps(message, allow_nan=False).encode()
         writer.add_message(channels[topic], log_time=time_ns, publish_time=time_ns, data=data, sequence=count)
         count += 1
-    scenario = dump_scenario(recorded.scenario).encode()
+    scenario = recorded.scenario_text.encode()
     writer.add_attachment(
-        create_time=0, log_time=0, name="scenario.toml", media_type="application/toml", data=scenario
+        create_time=0, log_time=0, name=SCENARIO_FILE, media_type="application/toml", data=scenario
     )
     writer.finish()  # type: ignore[no-untyped-call]
     return count

@@ -220,11 +220,6 @@ class Trace:
         pq.write_table(self.to_table(), path, compression="zstd")
 
 
-def read_trace(path: Path) -> pa.Table:
-    """Return a trace that `Trace.write` wrote. Raise OSError if the file cannot be read."""
-    return pq.read_table(path)
-
-
 def sha256_of_table(table: pa.Table) -> str:
     """SHA-256 of a trace's content in the order of its rows, independent of how it was stored."""
     digest = hashlib.sha256()

@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from emulator.radio.medium import WINDOW_NS
+from emulator.records.run_folder import BUSY_FILE
 from vnet.errors import VnetError
 from vnet.types import Array
-
-BUSY = "busy.parquet"
-"""The file that a run has where senders share a medium."""
-
-
-def read_busy(folder: Path) -> pa.Table:
-    """busy.parquet of a run's folder. Raises VnetError in one line if it is not there or no table."""
-    path = folder / BUSY
-    try:
-        return pq.read_table(path)
-    except FileNotFoundError:
-        raise VnetError(f"{path.parent}: not a finished run's folder: there is no {path.name} in it") from None
-    except (OSError, pa.ArrowException) as error:
-        raise VnetError(f"{path}: cannot be read: {' '.join(str(error).split())}") from None
 
 
 def busy_table(windows: Array, node_ids: Sequence[str]) -> pa.Table:
@@ -47,12 +32,10 @@ def busy_windows(table: pa.Table | None, node_ids: Sequence[str]) -> Array:
     count = len(node_ids)
     if table is None:
         return np.zeros((0, count))
-    if any(column not in table.column_names for column in ("time_ns", "node", "busy_ratio")):
-        raise VnetError(f"{BUSY} has the columns {', '.join(table.column_names)}, not time_ns, node and busy_ratio")
     windows = len(table) // max(1, count)
     number = pc.index_in(table["node"].cast(pa.string()), value_set=pa.array(list(node_ids), pa.string()))
     if not np.array_equal(pc.fill_null(number, -1).to_numpy(), np.tile(np.arange(count), windows)):
-        raise VnetError(f"{BUSY}: its rows are not those of {count} vehicles, one window after the other")
+        raise VnetError(f"{BUSY_FILE}: its rows are not those of {count} vehicles, one window after the other")
     return np.asarray(table["busy_ratio"].cast(pa.float64()).to_numpy()).reshape(windows, count)
 
 

@@ -201,8 +201,7 @@ class Metrics:
 
     def metrics_table(self) -> pa.Table:
         """A row for each period; columns are the fields of `PeriodFigures`."""
-        schema = pa.schema([(field.name, _ARROW[str(field.type)]) for field in fields(PeriodFigures)])
-        return pa.Table.from_pylist([asdict(row) for row in self.rows], schema=schema)
+        return pa.Table.from_pylist([asdict(row) for row in self.rows], schema=METRICS)
 
     def sha256(self) -> str:
         """A hash of the metrics' content, bit by bit."""
@@ -215,6 +214,7 @@ _ARROW = {
     "float | None": pa.float64(),
     "list[float | None]": pa.list_(pa.float64()),
 }
+METRICS = pa.schema([(field.name, _ARROW[str(field.type)]) for field in fields(PeriodFigures)])
 
 
 def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:

@@ -106,15 +106,19 @@ class _Pairs:
     contact: IntArray
 
 
-def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M) -> RadioMetrics:
-    """The radio's figures of a run; distances in bins of `bin_m`. Raises VnetError if its files do not fit."""
+def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M, has_busy: bool = True) -> RadioMetrics:
+    """The radio's figures of a run; distances in bins of `bin_m`. Raises VnetError if its files do not fit.
+
+    Without `has_busy` the channel busy ratio is left empty, whatever there is.
+    """
     count = len(recorded.node_ids)
     pairs = _pairs(recorded, count)
     codes, place = np.unique(pairs.link, return_inverse=True)
     figures = _by_link(pairs, place, len(codes))
     links = _links_table(recorded.node_ids, codes, count, figures)
-    vehicles = _vehicles_table(recorded, codes, count, figures)
-    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(recorded.busy_ratio)}
+    busy = recorded.busy_ratio if has_busy else np.zeros((0, count))
+    vehicles = _vehicles_table(recorded, codes, count, figures, busy)
+    totals = _totals(pairs, figures) | {"busy_ratio_mean": _mean(busy)}
     return RadioMetrics(links, vehicles, _distances_table(pairs, bin_m), totals)
 
 
@@ -239,7 +243,7 @@ def _links_table(node_ids: list[str], codes: NDArray[np.intp], count: int, figur
 
 
 def _vehicles_table(
-    recorded: RecordedRun, codes: NDArray[np.intp], count: int, figures: dict[str, Array]
+    recorded: RecordedRun, codes: NDArray[np.intp], count: int, figures: dict[str, Array], busy: Array
 ) -> pa.Table:
     sender, receiver = divmod(codes, max(count, 1))
 
@@ -262,7 +266,6 @@ def _vehicles_table(
         "heard_vehicles": np.bincount(receiver[figures["delivered"] > 0], minlength=count),
         **{name: mean(name) for name in ("latency_mean_ms", "inter_reception_mean_ms", "age_mean_ms")},
     }
-    busy = recorded.busy_ratio
     columns["busy_ratio_mean"] = busy.mean(axis=0) if len(busy) else np.full(count, np.nan)
     named = {"node": pa.array(recorded.node_ids, pa.string())}
     return pa.table(named | {name: _column(values) for name, values in columns.items()}).cast(VEHICLES)

@@ -1,7 +1,7 @@
 """The folder of a run: everything that is kept of it, written so that an interruption leaves it readable.
 
-`scenario.toml` first, `events.jsonl` line by line as things happen, tables and `verdict.json` at the end, each
-put in place in one step.
+`scenario.toml` first, `events.jsonl` line by line as things happen, tables, `world.npz` and `verdict.json` at the
+end, each put in place in one step. `run_files` and `recorded_run` read it.
 """
 
 from __future__ import annotations
@@ -15,13 +15,29 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+
 from emulator.records.atomic import disk_errors, whole
-from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.records.code_digest import code_digests
+from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
 from vnet.errors import VnetError
 
 RUNS = Path("runs")
+SCENARIO_FILE = "scenario.toml"
+EVENTS_FILE = "events.jsonl"
+TRACE_FILE = "trace.parquet"
+STATES_FILE = "states.parquet"
+METRICS_FILE = "metrics.parquet"
+BUSY_FILE = "busy.parquet"
+WORLD_FILE = "world.npz"
+VERDICT_FILE = "verdict.json"
 REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
 """Names of a run's report and recording, and of the list of the runs in a folder."""
+AGAIN = "again"
+"""The folder, in a run's own, of the second run of `--check-determinism`."""
+FORMAT = 2
+"""Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +57,9 @@ class RunFolder:
         self.path = path
         self.logs = path / "logs"
         self.events: list[Event] = []
+        self.scenario_text = ""
+        """`scenario.toml` as it is now."""
+        self._digests: dict[str, dict[str, str]] = {}
 
     @classmethod
     def create(cls, path: Path | None, scenario: Scenario) -> RunFolder:
@@ -54,18 +73,39 @@ class RunFolder:
                 raise VnetError(f"--out {path}: exists and is not an empty folder")
             folder = cls(path or _claim(default))
             folder.logs.mkdir(parents=True)
-            (folder.path / "scenario.toml").write_text(dump_scenario(scenario))
-            (folder.path / "events.jsonl").touch()
+            # Digests are those of the start: what is edited while the run is on has not been read.
+            folder._digests = {"inputs": input_digests(scenario), "code": code_digests(scenario)}
+            folder.put_scenario(scenario)
+            (folder.path / EVENTS_FILE).touch()
             if path is None:
                 _point_latest_to(folder.path)
         return folder
+
+    @property
+    def code(self) -> dict[str, str]:
+        """The digests of program and vnet at the run's start."""
+        return self._digests["code"]
+
+    @property
+    def scenario_path(self) -> Path:
+        """The file that runs it again."""
+        return self.path / SCENARIO_FILE
+
+    def put_scenario(self, scenario: Scenario) -> None:
+        """Write the scenario, with every default and the digests of what the run has read at its start."""
+        self.scenario_text = dump_scenario(scenario, self._digests)
+        self.put(SCENARIO_FILE, lambda path: write_text(path, self.scenario_text))
+
+    def put_table(self, name: str, table: pa.Table) -> None:
+        """Write a table as Parquet in one step."""
+        self.put(name, lambda path: pq.write_table(table, path, compression="zstd"))
 
     def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
         """Write down what happened at an emulated instant."""
         event = Event(time_ns, kind, node, details)
         self.events.append(event)
         line = json.dumps({"time_ns": time_ns, "kind": kind, "node": node, **details})
-        with disk_errors(self.path), (self.path / "events.jsonl").open("a") as file:
+        with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:
             file.write(line + "\n")
 
     def put(self, name: str, write: Callable[[Path], None]) -> None:
@@ -76,28 +116,6 @@ class RunFolder:
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
         self.put(name, lambda path: write_text(path, json.dumps(data, indent=2) + "\n"))
-
-
-def check_is_run(folder: Path) -> None:
-    """Raises VnetError if the folder is not a run's."""
-    if not (folder / "scenario.toml").is_file():
-        raise VnetError(f"{folder}: not a run's folder: there is no scenario.toml in it")
-
-
-def read_events(folder: Path) -> list[Event]:
-    """The events of a run. Raises VnetError if they cannot be read."""
-    events = []
-    try:
-        lines = (folder / "events.jsonl").read_text().splitlines()
-    except OSError as error:
-        raise VnetError(f"{folder}: not a run's folder: events.jsonl: {error.strerror}") from None
-    for line in lines:
-        try:
-            data = json.loads(line)
-            events.append(Event(data.pop("time_ns"), data.pop("kind"), data.pop("node"), data))
-        except (ValueError, KeyError, AttributeError):
-            continue  # the last line of a run that was killed
-    return events
 
 
 def write_text(path: Path, text: str) -> None:

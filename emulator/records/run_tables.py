@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import NOT_ARRIVING, ROW, decided_ns
-from emulator.records.recorded_run import VALUES_AS_LIST
-from emulator.stream.messages import WEIGHT, Beliefs, is_cloud
+from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
 from emulator.world.world import Instant
 from vnet.errors import VnetError
 from vnet.types import Array
 
 ROWS_AT_ONCE = 1 << 14
+VALUES_AS_LIST = pa.list_(pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))]))
+"""The type of the states' column `values` as a list, which more functions of Arrow know than maps."""
 
 
 class TableFile:

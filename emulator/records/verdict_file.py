@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -14,12 +14,15 @@ from vnet.bounded import read_bounded
 from vnet.errors import VnetError
 
 LARGEST_BYTES = 64 * 2**20
+RENAMED_CHECKS = {"bit:": "effect:"}
+"""How names of checks began in folders of format 1, and how they begin now."""
 
 
 @dataclass(frozen=True)
 class Record:
     """The fields of `verdict.json`; lengths in metres, times in seconds."""
 
+    format: int
     verdict: Verdict
     checks: list[CheckResult]
     not_exercised: list[NotExercised]
@@ -54,14 +57,24 @@ class Record:
 _RECORD = TypeAdapter(Record)
 
 
-def read_record(folder: Path) -> Record:
-    """Read RUN/verdict.json. Raises VnetError where there is none, or it is not what vnet writes."""
-    path = folder / "verdict.json"
+def read_record(path: Path) -> Record:
+    """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
     try:
-        return _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
-    except OSError as error:
-        raise VnetError(f"{path}: {error.strerror}") from None
+        record = _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
     except ValidationError as error:
         raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
+    return replace(
+        record,
+        checks=[replace(check, name=_new_name(check.name)) for check in record.checks],
+        not_exercised=[replace(check, name=_new_name(check.name)) for check in record.not_exercised],
+    )
+
+
+def _new_name(check: str) -> str:
+    """The name that a check has now."""
+    for old, new in RENAMED_CHECKS.items():
+        if check.startswith(old):
+            return new + check.removeprefix(old)
+    return check

@@ -15,7 +15,7 @@ from rich.text import Text
 from emulator.checks.replay import compare_folders
 from emulator.pages.text import cell
 from emulator.records.key_figures import KEY_FIGURES
-from emulator.records.run_folder import check_is_run
+from emulator.records.run_files import check_is_run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Finding, Verdict
 from emulator.report.source import Source
@@ -42,7 +42,7 @@ class Comparison:
             check_is_run(folder)
         sources = Source(first), Source(second)
         for source in sources:
-            _ = source.record, source.scenario, source.recorded
+            _ = source.record, source.scenario
         return cls(*sources, _told(compare_folders(first, second)))
 
     @property

@@ -11,13 +11,12 @@ from typing import Any
 from urllib.parse import quote
 
 from emulator.pages.page import put_page, render
-from emulator.records.run_folder import INDEX, RECORDING, REPORT
-from emulator.records.verdict_file import Record, read_record
-from emulator.report.source import when
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_files import is_run_folder
+from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE
+from emulator.records.verdict_file import Record
 from vnet.errors import VnetError
 
-MARKS = ("scenario.toml", "verdict.json", "events.jsonl")
-"""A folder with any of these is a run's."""
 NUMBERS = {
     "vehicles": "number less",
     "emulated (s)": "number less",
@@ -60,28 +59,29 @@ def index_page(folder: Path) -> str:
 
 def _entries(folder: Path) -> Iterator[Entry]:
     try:
-        below = [path for path in folder.iterdir() if any((path / mark).is_file() for mark in MARKS)]
+        below = [path for path in folder.iterdir() if is_run_folder(path)]
     except OSError as error:
         raise VnetError(f"{folder}: cannot be read: {error.strerror or error}") from None
     for path in below:
         if path.is_symlink() and path.resolve().parent == folder.resolve():
             continue  # `latest`, which is listed under its own name
+        run = RecordedRun.open(path)
         record, without = None, "no verdict"
         problem = "no verdict.json: it is still going on, or was ended from outside"
-        if (path / "verdict.json").exists():
+        if run.has_record:
             try:
-                record = read_record(path)
+                record = run.record
             except VnetError as error:
                 without, problem = "broken", str(error).removeprefix(f"{path}/")
         try:
-            yield Entry(path, when(path), record, without, problem)
+            yield Entry(path, run.when, record, without, problem)
         except VnetError:
             continue  # it has just been removed
 
 
 def _row(entry: Entry, is_latest: bool) -> dict[str, Any]:
     folder, record = entry.folder, entry.record
-    files = [name for name in ("scenario.toml", "verdict.json", RECORDING) if (folder / name).is_file()]
+    files = [name for name in (SCENARIO_FILE, VERDICT_FILE, RECORDING) if (folder / name).is_file()]
     return {
         "name": folder.name,
         "link": _link(folder, REPORT if (folder / REPORT).is_file() else ""),

@@ -1,58 +1,41 @@
-"""A run's files as reports read them: what is missing or broken is told in one line, and the rest is shown."""
+"""A run as reports show it: what is missing or broken is told in one line, and the rest is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
-from pydantic import ValidationError
 
 from emulator.pages.canvas import Span
-from emulator.records.busy import busy_windows, read_busy
-from emulator.records.metrics import STATES as ALL_STATES
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
-from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event, read_events
-from emulator.records.verdict_file import Record, read_record
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE, Event
+from emulator.records.verdict_file import Record
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.sections import first_problem
-from emulator.scenario.toml import LARGEST_BYTES, parse_toml
-from vnet.bounded import read_bounded
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
-_NAME = pa.dictionary(pa.int32(), pa.string())
-# The columns that reports need, and their types.
-TRACE = {
-    "sent_ns": pa.int64(),
-    "sender": _NAME,
-    "seq": pa.int64(),
-    "receiver": _NAME,
-    "outcome": _NAME,
-    "cause": pa.string(),
-    "arrival_ns": pa.int64(),
-    "copy": pa.int16(),
+COLUMNS = {
+    TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "outcome", "cause", "arrival_ns", "copy"),
+    STATES_FILE: ("period", "time_ns", "node", "position_m", "values"),
+    METRICS_FILE: (
+        "time_ns",
+        "reporting",
+        "common_error_rmse_m",
+        "deviation_m",
+        "position_rmse_m",
+        "fix_rmse_m",
+        "consensus_error_m",
+        "common_error_anees",
+        "position_anees",
+    ),
 }
-ON_AIR = {"left_ns": pa.int64()}
-"""A column that the trace has where senders share a medium."""
-STATES = {name: ALL_STATES.field(name).type for name in ("period", "time_ns", "node", "position_m", "values")}
-FIGURES = (
-    "common_error_rmse_m",
-    "deviation_m",
-    "position_rmse_m",
-    "fix_rmse_m",
-    "consensus_error_m",
-    "common_error_anees",
-    "position_anees",
-)
-METRICS = {"time_ns": pa.int64(), "reporting": pa.int64()} | dict.fromkeys(FIGURES, pa.float64())
+"""The columns that reports need."""
 CUT = ("interrupted", "stalled")
 """Events that end a run before its time."""
 T = TypeVar("T")
@@ -60,90 +43,54 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Source:
-    """A run's folder. Its properties read the files, and raise VnetError where one is not there or not vnet's."""
+    """A run as the pages show it. Properties raise VnetError where a file is not there or not vnet's."""
 
     folder: Path
 
     @cached_property
+    def recorded(self) -> OpenedRun:
+        """The run, with the columns that reports need."""
+        return RecordedRun.open(self.folder, COLUMNS)
+
+    @property
     def scenario_text(self) -> str:
-        """scenario.toml."""
-        path = self.folder / "scenario.toml"
-        try:
-            return read_bounded(path, LARGEST_BYTES).decode("utf-8", "replace")
-        except (OSError, ValueError) as error:
-            raise VnetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        """The text of scenario.toml."""
+        return self.recorded.scenario_text
 
-    @cached_property
+    @property
     def scenario(self) -> Scenario:
-        """The scenario; files that it names need not be there any more."""
-        path = self.folder / "scenario.toml"
-        try:
-            data = parse_toml(self.scenario_text)
-            data.pop("inputs", None)
-            return Scenario.model_validate(data)
-        except ValidationError as error:
-            raise VnetError(f"{path}: {first_problem(error, Scenario)}") from None
-        except ValueError as error:
-            raise VnetError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
+        """The scenario."""
+        return self.recorded.scenario
 
-    @cached_property
+    @property
     def record(self) -> Record:
-        """verdict.json."""
-        return read_record(self.folder)
+        """The contents of verdict.json."""
+        return self.recorded.record
 
-    @cached_property
+    @property
     def events(self) -> list[Event]:
-        """events.jsonl."""
-        try:
-            events = read_events(self.folder)
-        except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
-            raise VnetError(f"{self.folder / 'events.jsonl'}: not vnet's events: {error!r}") from None
-        for event in events:
-            if type(event.time_ns) is not int or not isinstance(event.kind, str):
-                raise VnetError(f"{self.folder / 'events.jsonl'}: not vnet's events: {event.kind!r}")
-        return events
+        """The events."""
+        return self.recorded.events
+
+    @property
+    def metrics(self) -> pa.Table:
+        """The metrics."""
+        return self.recorded.metrics
 
     @cached_property
     def busy_ratio(self) -> Array:
-        """(windows, N), how busy each vehicle found the medium. Raises VnetError if senders share none."""
+        """(windows, N), how busy each vehicle found the medium. Raises VnetError if there is no MAC."""
         if self.scenario.radio.mac is None:
             raise VnetError("no MAC configured ([radio.mac])")
-        windows = busy_windows(read_busy(self.folder), self.recorded.node_ids)
-        if not len(windows):
+        if not len(self.recorded.busy_ratio):
             raise VnetError("the run was over within the first window")
-        return windows
-
-    @cached_property
-    def recorded(self) -> RecordedRun:
-        """The tables, so far as reports need them, as arrays."""
-        on_air = {} if self.scenario.radio.mac is None else ON_AIR
-        trace, states = self._table("trace", TRACE | on_air), self._table("states", STATES)
-        busy = maybe(lambda: read_busy(self.folder)) if on_air else None
-        not_needed = pa.table({})  # the metrics: what can be drawn without them is drawn
-        return RecordedRun(self.scenario, trace, states, not_needed, self.events, busy=busy)
+        return self.recorded.busy_ratio
 
     @cached_property
     def radio(self) -> RadioMetrics:
-        """The radio in figures."""
-        return radio_metrics(self.recorded)
-
-    @cached_property
-    def metrics(self) -> pa.Table:
-        """metrics.parquet."""
-        return self._table("metrics", METRICS)
-
-    def _table(self, name: str, columns: dict[str, pa.DataType]) -> pa.Table:
-        path = self.folder / f"{name}.parquet"
-        try:
-            table = pq.read_table(path, columns=list(columns))
-        except FileNotFoundError:
-            raise VnetError(f"{path.name} is not there") from None
-        except (OSError, pa.ArrowException) as error:
-            raise VnetError(f"{path.name} cannot be read: {error}") from None
-        for column, kind in columns.items():
-            if column not in table.column_names or table.schema.field(column).type != kind:
-                raise VnetError(f"{path.name} has no column {column} of {kind}")
-        return table.unify_dictionaries()
+        """The radio in figures, without the channel busy ratio where its table cannot be read."""
+        has_busy = maybe(lambda: self.recorded.busy_ratio) is not None
+        return radio_metrics(self.recorded, has_busy=has_busy)
 
     # Metrics, events and times, as the figures need them.
 
@@ -184,21 +131,6 @@ class Source:
     def cut(self) -> Event | None:
         """The event that ended the run before its time."""
         return next((event for event in maybe(lambda: self.events) or () if event.kind in CUT), None)
-
-    @property
-    def when(self) -> datetime:
-        """When the run ended, or was last heard of. Raises VnetError if the folder is gone."""
-        return when(self.folder)
-
-
-def when(folder: Path) -> datetime:
-    """When a run ended, or was last heard of, in local time. Raises VnetError if the folder is gone."""
-    for path in (folder / "verdict.json", folder / "events.jsonl", folder):
-        try:
-            return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
-        except OSError:
-            continue
-    raise VnetError(f"{folder}: no such folder")
 
 
 def maybe(read: Callable[[], T]) -> T | None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
 from emulator.records.key_figures import KEY_FIGURES
-from emulator.records.run_folder import REPORT, RUNS, Event
+from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE, Event
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Verdict
 from emulator.report.figures import draw
@@ -82,7 +82,7 @@ def _facts(source: Source, record: Record | None) -> Iterator[str]:
         yield {"lockstep": "in lockstep", "realtime": "in real time"}[scenario.run.pacing]
         yield scenario.program.entry
         yield f"seed {scenario.run.seed}"
-    yield f"{source.when:%Y-%m-%d %H:%M}"
+    yield f"{source.recorded.when:%Y-%m-%d %H:%M}"
 
 
 def _note(source: Source, record: Record | None) -> str:
@@ -90,7 +90,7 @@ def _note(source: Source, record: Record | None) -> str:
     if record is not None:
         cut = source.cut
         return f"The run was {cut.kind} at {cut.time_ns / 1e9:.1f} s." if cut else ""
-    if (source.folder / "verdict.json").exists():  # the checks' section says why
+    if source.recorded.has_record:  # the checks' section says why
         return "The verdict of this run cannot be read. Its other files:"
     return "This run has no verdict: it is still going on, or it was ended from outside. Its other files:"
 
@@ -230,7 +230,7 @@ def _scenario(source: Source) -> dict[str, Any]:
 def _commands(source: Source, record: Record | None) -> list[str]:
     """Commands that reproduce the run, its verdict and this page."""
     folder = shlex.quote(str(source.folder))
-    first = record.reproduce if record else f"vnet run {shlex.quote(str(source.folder / 'scenario.toml'))}"
+    first = record.reproduce if record else f"vnet run {shlex.quote(str(source.folder / SCENARIO_FILE))}"
     return [first, f"vnet check {folder}", f"vnet report {folder}"]
 
 

@@ -10,7 +10,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -349,7 +349,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
-    recorded_digests = data.pop("inputs", {})
+    recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
     for override in overrides:
@@ -379,10 +379,10 @@ def _instead(path: Path) -> str:
         return ""
 
 
-def dump_scenario(scenario: Scenario) -> str:
-    """The scenario as TOML with every default spelled out and the digests of its input files."""
+def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] | None = None) -> str:
+    """The scenario as TOML with every default, and `digests`, by section; without any, those of its inputs."""
     data = scenario.model_dump(mode="json", exclude_none=True)
-    data["inputs"] = input_digests(scenario)
+    data |= {"inputs": input_digests(scenario)} if digests is None else digests
     return tomli_w.dumps(data)
 
 

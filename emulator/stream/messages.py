@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
+from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
 from emulator.records.metrics import PeriodFigures, collect
+from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run_folder import Event
-from emulator.scenario.scenario import Scenario, dump_scenario
-from emulator.world.world import Instant, World, components
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import Instant, components
 from vnet.node import Report
 from vnet.types import Array
 
@@ -30,8 +31,6 @@ LATENCY_BIN_NS = 2_000_000
 """Width of a bin of the latency histogram."""
 LATENCY_BINS = 50
 """Bins of the latency histogram."""
-WEIGHT = "weight."
-"""Prefix of the reported values that are weights of a fusion; a node's id follows."""
 LONGEST_DETAIL = 200
 """Characters of a detail of an event."""
 
@@ -51,49 +50,34 @@ def unpack_pairs(message: Mapping[str, Any]) -> NDArray[np.int32]:
     return np.frombuffer(message["pairs"], dtype="<i4").reshape(-1, 4)
 
 
-def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
+def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) -> dict[str, Any]:
     """Return the message of a run's constants; only faults may be added to its `scenario` during the run.
 
     `node_ids`; lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`, which is infinite for a line in both
     directions from its point); `range_m` (None if links or path loss decide connectivity); `component` (int16, n),
     the connected component of each vehicle at the start (-1: absent); `area_m` (float32, 2 × 2), the corners of the
-    bounding box of all positions during the run; `moves`, true if vehicles drive; `scenario`, resolved, as TOML.
+    bounding box of all positions during the run; `moves`, true if vehicles drive; `scenario_text`, the resolved
+    scenario as TOML.
     """
-    start = world.at(0)
     radio = scenario.radio
     connectivity = connectivity_of(radio, scenario.run.seed, world.links)
-    in_range = connectivity.in_range(start.position_m, distances_m(start.position_m))
-    label = components(start.position_m, radio.range_m, in_range)
+    in_range = connectivity.in_range(world.position_m, distances_m(world.position_m))
+    label = components(world.position_m, radio.range_m, in_range)
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),
-        "lane_point_m": pack(world.lane_map.point_m),
-        "lane_heading_rad": pack(world.lane_map.heading_rad),
-        "lane_length_m": pack(world.lane_map.length_m),
+        "lane_point_m": pack(world.lane_point_m),
+        "lane_heading_rad": pack(world.lane_heading_rad),
+        "lane_length_m": pack(world.lane_length_m),
         "range_m": radio.range_m if radio.links is None and radio.path_loss is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),
-        "area_m": pack([np.nanmin(world.course_m, axis=(0, 1)), np.nanmax(world.course_m, axis=(0, 1))]),
-        "moves": world.moves,
-        "period_ns": world.period_ns,
+        "area_m": pack(world.area_m),
+        "moves": scenario.network.moves,
+        "period_ns": scenario.period_ns,
         "duration_ns": scenario.duration_ns,
-        "scenario": dump_scenario(scenario),
+        "scenario": scenario_text,
     }
-
-
-@dataclass(frozen=True)
-class Beliefs:
-    """The nodes' reports in a period: arrays (n, 2) and (n, 4), NaN where a node reported nothing.
-
-    `clouds` are the coordinates x, y, x, y, … of each node's cloud, and `weights` (n,) those of its fusion.
-    """
-
-    estimate_m: Array
-    covariance_m2: Array
-    common_error_m: Array
-    common_error_covariance_m2: Array
-    clouds: Mapping[str, ArrayLike]
-    weights: Mapping[str, Array]
 
 
 def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
@@ -114,11 +98,6 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
         },
         weights={n: w for n, r in last.items() if (w := _weights(weight_index, r)) is not None},
     )
-
-
-def is_cloud(count: int) -> bool:
-    """Return true if `count` numbers can be the coordinates of points."""
-    return count % 2 == 0
 
 
 def _weights(index: Mapping[str, int], report: Report) -> Array | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +11,17 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.records.busy import busy_windows, mean_busy, read_busy
+from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.metrics import PeriodFigures
-from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import Event, check_is_run, read_events
-from emulator.records.run_tables import StatesReader, TableFile, TraceReader
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run_files import check_is_run
+from emulator.records.run_folder import STATES_FILE, Event
+from emulator.records.run_tables import StatesReader, TraceReader
 from emulator.stream.messages import event_message, period_message, scene_message
-from emulator.world.world import World, build_world
 from vnet.errors import VnetError
 from vnet.types import Array
 
+POSITIONS = {STATES_FILE: ("period", "node", "position_m")}
 Message = tuple[str, dict[str, Any]]
 
 
@@ -31,31 +31,18 @@ def messages(folder: Path) -> Iterator[Message]:
     Raises VnetError if the folder is not a finished run's; while its tables are read, if they do not fit together.
     """
     check_is_run(folder)
-    events = read_events(folder)
-    scenario = load_scenario(folder / "scenario.toml")
-    world = build_world(scenario)
-    number = {node: number for number, node in enumerate(world.node_ids)}
-    states = StatesReader(folder / "states.parquet", number, world.period_ns)
-    trace = TraceReader(folder / "trace.parquet", number)
-    figures = _figures(TableFile(folder / "metrics.parquet", [field.name for field in fields(PeriodFigures)]))
-    busy = busy_windows(None if scenario.radio.mac is None else read_busy(folder), world.node_ids)
-    return _Playback(scenario, world, events, figures, trace, states, busy).messages()
-
-
-def _figures(file: TableFile) -> list[PeriodFigures]:
-    figures = [PeriodFigures(**row) for piece in file.pieces() for row in piece.to_pylist()]
-    if [row.period for row in figures] != list(range(len(figures))):
-        raise file.error("its rows are not those of one period after the other")
-    return figures
+    run = RecordedRun.open(folder)
+    number = {node: number for number, node in enumerate(run.world.node_ids)}
+    trace, states = run.trace_reader(number), run.states_reader(number)
+    busy = busy_windows(run.busy, run.world.node_ids)
+    return _Playback(run, run.figures(), trace, states, busy).messages()
 
 
 @dataclass(frozen=True)
 class _Playback:
     """A run's files."""
 
-    scenario: Scenario
-    world: World
-    events: Sequence[Event]
+    run: OpenedRun
     figures: Sequence[PeriodFigures]
     trace: TraceReader
     states: StatesReader
@@ -63,34 +50,41 @@ class _Playback:
 
     def messages(self) -> Iterator[Message]:
         """See the function."""
-        yield "scene", scene_message(self.world, self.scenario)
-        events = _by_period(self.events, self.world.period_ns, len(self.figures))
+        run = self.run
+        yield "scene", scene_message(run.world, run.scenario, run.scenario_text)
+        events = _by_period(run.events, run.scenario.period_ns, len(self.figures))
         if self.figures:
             yield from self._periods(events)
         yield "end", {"events": list(map(event_message, events[-1]))}
 
     def _periods(self, events: Sequence[Sequence[Event]]) -> Iterator[Message]:
-        # Who was up, and which faults there are, is told by the events and the positions.
-        nothing = pa.table({})
-        course_m = self.world.course_m if self.world.moves else None
-        recorded = RecordedRun(self.scenario, nothing, self.states.first(), nothing, self.events, course_m)
-        down = _Down(recorded)
+        node_ids, period_ns = self.run.world.node_ids, self.run.scenario.period_ns
+        told = self._events_and_positions()
+        down = _Down(told)
         states = self.states.periods()
         for figures, happened in zip(self.figures, events, strict=False):
             if (state := next(states, None)) is None:
                 raise self._misfit("fewer")
-            start_ns, end_ns = figures.time_ns, figures.time_ns + self.world.period_ns
-            faults = [planned.label for planned in recorded.plan if planned.acts_between(start_ns, end_ns)]
+            start_ns, end_ns = figures.time_ns, figures.time_ns + period_ns
+            faults = [planned.label for planned in told.plan if planned.acts_between(start_ns, end_ns)]
             up = ~down.at(end_ns - 1)
             rows = self.trace.until(end_ns)
             instant, beliefs = state
-            busy = mean_busy(self.busy, len(self.world.node_ids), start_ns, end_ns)
-            message = period_message(
-                self.world.node_ids, instant, end_ns, beliefs, figures, rows, up, faults, happened, busy
-            )
+            busy = mean_busy(self.busy, len(node_ids), start_ns, end_ns)
+            message = period_message(node_ids, instant, end_ns, beliefs, figures, rows, up, faults, happened, busy)
             yield "period", message
         if next(states, None) is not None:
             raise self._misfit("more")
+
+    def _events_and_positions(self) -> RecordedRun:
+        """The run without its big tables: events and positions tell who was up, and which faults there were."""
+        run, nothing = self.run, pa.table({})
+        course_m = None
+        if run.moves:
+            course_m = RecordedRun.open(run.folder, POSITIONS).vectors("position_m")
+        return RecordedRun(
+            run.scenario, nothing, self.states.first(), nothing, run.events, course_m, None, run.world
+        )
 
     def _misfit(self, how: str) -> VnetError:
         return VnetError(f"{self.states.path}: is of {how} periods than the {len(self.figures)} of metrics.parquet")

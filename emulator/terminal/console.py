@@ -33,6 +33,14 @@ def one_line_errors(log_format: LogFormat = LogFormat.TEXT) -> Iterator[None]:
         raise typer.Exit(WRONG_USAGE) from None
 
 
+def tell(message: str, log_format: LogFormat = LogFormat.TEXT) -> None:
+    """Say on stderr in one line what a user should know, though nothing is wrong."""
+    if log_format is LogFormat.JSON:
+        print(json.dumps({"kind": "note", "message": message}), file=sys.stderr)
+    else:
+        print(f"vnet: note: {message}", file=sys.stderr)
+
+
 def _say(message: str, log_format: LogFormat) -> None:
     if log_format is LogFormat.JSON:
         print(json.dumps({"kind": "error", "message": message, "exit_status": WRONG_USAGE}), file=sys.stderr)

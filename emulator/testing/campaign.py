@@ -27,7 +27,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.records.atomic import write_atomically
-from emulator.records.run_folder import RUNS
+from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.matrix import column_of, count_verdicts, page
@@ -243,7 +243,7 @@ class Campaign:
             folder = self._folder / "failures" / f"{next(self._numbers):03d}"
         again = self._workshop.run(shrunk, folder)
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "scenario.toml").write_text(dump_scenario(shrunk))
+        (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
         (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
 
@@ -270,7 +270,7 @@ class Campaign:
             "seed": outcome.seed,
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
-            "command": f"vnet simulate {shlex.quote(str(outcome.folder / 'scenario.toml'))}",
+            "command": f"vnet simulate {shlex.quote(str(outcome.folder / SCENARIO_FILE))}",
             "folder": f"failures/{outcome.folder.name}",
         }
 

@@ -26,7 +26,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
 from emulator.records.metrics import PeriodFigures
-from emulator.records.run_folder import Event, RunFolder
+from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
 from emulator.scenario.fault_families import LONGEST_S, Selector
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
@@ -111,7 +111,7 @@ class RunHarness:
     @property
     def reproduce(self) -> str:
         """The command that runs the same again."""
-        return f"vnet {self._run.command} {shlex.quote(str(self.folder / 'scenario.toml'))}"
+        return f"vnet {self._run.command} {shlex.quote(str(self.folder / SCENARIO_FILE))}"
 
     # Its course.
 

@@ -9,13 +9,13 @@ speeds hardly change it says what all of them say.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from emulator.scenario.scenario import Scenario
+from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
 from vnet.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
@@ -25,13 +25,11 @@ PARTICLES = 500
 STEP_NS = 500_000_000
 
 
-class Limit:
+class HearsAllBound:
     """Fed with the messages of a run, period by period; see the module's text."""
 
     def __init__(self, scene: Mapping[str, Any], particles: int = PARTICLES) -> None:
-        data = tomllib.loads(scene["scenario"])
-        data.pop("inputs", None)
-        scenario = Scenario.model_validate(data)
+        scenario = parse_recorded_scenario(scene["scenario"], Path("scenario"))
         world = scenario.world
         self._node_ids = scene["node_ids"]
         self._component = np.frombuffer(scene["component"], dtype="<i2")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,10 @@ import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.paper_values import paper_rmse
-from emulator.scenario.scenario import Scenario
+from emulator.records.run_folder import SCENARIO_FILE
+from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.stream.messages import unpack
-from emulator.viewer.bound import Limit
+from emulator.viewer.bound import HearsAllBound
 from emulator.viewer.drawing import (
     BLUE,
     COMMON_RINGS_M,
@@ -61,7 +63,7 @@ class OverviewScene:
         self._canvas = canvas
         self._node_ids: list[str] = scene["node_ids"]
         few, lanes = len(self._node_ids) <= LIMIT_VEHICLES, len(scene["lane_heading_rad"]) > 0
-        self._limit = Limit(scene) if few and lanes and not scene["moves"] else None
+        self._limit = HearsAllBound(scene) if few and lanes and not scene["moves"] else None
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
@@ -238,9 +240,8 @@ def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
 
 def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
     """The outcomes that no reception of this run can have, whatever faults are injected."""
-    data = tomllib.loads(scene["scenario"])
-    data.pop("inputs", None)
-    scenario, vehicles = Scenario.model_validate(data), len(scene["node_ids"])
+    scenario = parse_recorded_scenario(scene["scenario"], Path(SCENARIO_FILE))
+    vehicles = len(scene["node_ids"])
     return {outcome for outcome in Outcome if not outcome.facts.is_possible(scenario, vehicles)}
 
 

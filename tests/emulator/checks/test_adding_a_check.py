@@ -8,7 +8,7 @@ import pytest
 
 from docs.generate import checks as check_page
 from emulator.checks import registry
-from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge, read_recorded_run
+from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.checks.registry import CHECKS, Check, WithoutPositions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
@@ -107,7 +107,7 @@ def test_a_campaign_has_its_column(tmp_path: Path) -> None:
 
 
 def test_without_positions_each_check_is_treated_as_its_entry_says(tmp_path: Path) -> None:
-    recorded = read_recorded_run(simulated(tmp_path / "run", duration_s=0.05))
+    recorded = RecordedRun.open(simulated(tmp_path / "run", duration_s=0.05))
     assert not len(recorded.states)
     judgement = judge(recorded)
     unknown_names = {check.name for check in judgement.checks if check.verdict is Verdict.UNKNOWN}

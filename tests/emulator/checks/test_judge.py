@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binom
 
-from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.trace import read_trace
-from emulator.records.run_folder import Event, RunFolder, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError
@@ -42,8 +41,8 @@ def run_scenario(folder: Path, scenario: Scenario) -> RecordedRun:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
-    states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
-    return RecordedRun(scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder))
+    run = RecordedRun.open(folder)
+    return RecordedRun(scenario, run.trace, run.states, run.metrics, run.events, world=run.world)
 
 
 @pytest.fixture(scope="module")
@@ -402,7 +401,7 @@ def test_a_matrix_in_which_nobody_hears_leaves_no_radio_to_judge(tmp_path: Path)
 def test_a_folder_without_one_of_its_files_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
     four(tmp_path)
     (tmp_path / "run" / name).unlink()
-    with pytest.raises(VnetError, match=r"not (the folder of a finished run|a run's folder)") as refused:
+    with pytest.raises(VnetError, match=r"not a (finished run|run)'s folder") as refused:
         check_run(tmp_path / "run")
     assert "\n" not in str(refused.value)
 
@@ -412,5 +411,5 @@ def test_a_file_that_was_cut_short_is_refused(name: str, tmp_path: Path) -> None
     four(tmp_path)
     path = tmp_path / "run" / name
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(VnetError, match="not the folder of a finished run"):
+    with pytest.raises(VnetError, match=rf"{name}: (cannot be read|not JSON)"):
         check_run(tmp_path / "run")

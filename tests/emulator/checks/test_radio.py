@@ -11,13 +11,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.radio.csma import Csma
-from emulator.radio.trace import read_trace
-from emulator.records.run_folder import RunFolder, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import checked, result, verdict
@@ -42,11 +42,8 @@ def run(folder: Path, faults: list[dict[str, Any]] | None = None, **radio: Any) 
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
-    states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
-    busy = pq.read_table(folder / "busy.parquet") if "mac" in radio else None
-    return RecordedRun(
-        scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder), busy=busy
-    )
+    done = RecordedRun.open(folder)
+    return RecordedRun(scenario, done.trace, done.states, done.metrics, done.events, busy=done.busy)
 
 
 @pytest.fixture(scope="module")
@@ -283,9 +280,9 @@ def test_a_busy_table_that_cannot_be_read_is_said_in_one_line(tmp_path: Path) ->
     path = folder / "busy.parquet"
     table = pq.read_table(path)
     spoilt = (
-        (table.drop_columns(["node"]), "has the columns"),
+        (table.drop_columns(["node"]), "has no column 'node'"),
         (table.slice(1), "not those of 12 vehicles"),
-        (table.set_column(1, "node", pa.array(["x"] * len(table))), "not those of 12 vehicles"),
+        (table.set_column(1, "node", pa.array(["x"] * len(table)).dictionary_encode()), "not those of 12 vehicles"),
     )
     for wrong, text in spoilt:
         pq.write_table(wrong, path)

@@ -220,7 +220,7 @@ def test_a_run_stands_beside_its_analysis(tmp_path: Path) -> None:
 
 
 def test_a_run_that_cannot_be_used_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(VnetError, match=r"no metrics\.parquet in it"):
+    with pytest.raises(VnetError, match="not a run's folder"):
         analyze(scenario(ring(4)), tmp_path)
     with pytest.raises(VnetError, match="no deviation in it; its program reported no common error"):
         analyze(scenario(ring(4)), write_metrics(tmp_path, [None] * 5))

@@ -13,11 +13,11 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from emulator.checks.judge import RecordedRun, read_recorded_run
 from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
@@ -54,8 +54,8 @@ async def reports(node: Any) -> None:
 
 
 @pytest.fixture(scope="module")
-def recorded(folder: Path) -> RecordedRun:
-    return read_recorded_run(folder)
+def recorded(folder: Path) -> OpenedRun:
+    return RecordedRun.open(folder)
 
 
 # pcapng, as its draft describes it.
@@ -105,14 +105,14 @@ def packets(data: bytes) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def capture(recorded: RecordedRun) -> bytes:
+def capture(recorded: OpenedRun) -> bytes:
     file = io.BytesIO()
     count = write_pcapng(recorded, file)
     assert count == len(packets(file.getvalue()))
     return file.getvalue()
 
 
-def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: RecordedRun) -> None:
+def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: OpenedRun) -> None:
     (first, section), *rest = blocks(capture)
     assert first == 0x0A0D0D0A and struct.unpack_from("<IHH", section) == (0x1A2B3C4D, 1, 0)
     interfaces = [body for kind, body in rest if kind == 1]
@@ -122,7 +122,7 @@ def test_a_capture_has_an_interface_for_each_vehicle(capture: bytes, recorded: R
 
 
 def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
-    capture: bytes, recorded: RecordedRun
+    capture: bytes, recorded: OpenedRun
 ) -> None:
     found = packets(capture)
     assert [packet["time_ns"] for packet in found] == sorted(packet["time_ns"] for packet in found)
@@ -140,7 +140,7 @@ def test_every_delivery_is_an_inbound_packet_and_every_emission_an_outbound_one(
     assert outbound == sorted(emission[:2] for emission in sent)
 
 
-def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, recorded: RecordedRun) -> None:
+def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         data = packet["bytes"]
         version, length, present = struct.unpack_from("<BxHI", data)
@@ -158,7 +158,7 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
 
 
-def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: RecordedRun) -> None:
+def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
     for packet in packets(capture):
         fields = packet["comment"].split("; ")
         if packet["direction"] == 1:
@@ -177,7 +177,7 @@ def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: Recorded
 # MCAP.
 
 
-def test_mcap_has_every_period_frame_and_event_in_order(recorded: RecordedRun) -> None:
+def test_mcap_has_every_period_frame_and_event_in_order(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     count = write_mcap(recorded, file)
     file.seek(0)
@@ -207,7 +207,7 @@ def test_mcap_has_every_period_frame_and_event_in_order(recorded: RecordedRun) -
     assert attachment.name == "scenario.toml" and b"[network]" in attachment.data
 
 
-def test_mcap_shows_who_is_there_where_it_is(recorded: RecordedRun) -> None:
+def test_mcap_shows_who_is_there_where_it_is(recorded: OpenedRun) -> None:
     file = io.BytesIO()
     write_mcap(recorded, file)
     file.seek(0)
@@ -225,7 +225,7 @@ TOPICS = ("/tf", "/vehicles/fix")
 # CSV.
 
 
-def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: RecordedRun, tmp_path: Path) -> None:
+def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, tmp_path: Path) -> None:
     tables = {}
     for name in write_csv(recorded, tmp_path):
         with (tmp_path / name).open(newline="") as file:

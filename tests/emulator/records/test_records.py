@@ -10,13 +10,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import CheckResult, Judgement, NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import CheckResult, Judgement, NotExercised, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.trace import read_trace, sha256_of_table
+from emulator.radio.trace import sha256_of_table
 from emulator.records.metrics import Metrics, summarize
-from emulator.records.run_folder import Event, RunFolder, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, build_world
 from vnet.errors import VnetError
@@ -33,10 +34,10 @@ def beacons(folder: Path, **radio: float) -> RecordedRun:
     conclude(emulation, wall_s, "simulate")
     return RecordedRun(
         scenario,
-        read_trace(folder / "trace.parquet"),
+        pq.read_table(folder / "trace.parquet"),
         pq.read_table(folder / "states.parquet"),
         pq.read_table(folder / "metrics.parquet"),
-        read_events(folder),
+        RecordedRun.open(folder).events,
     )
 
 
@@ -183,7 +184,7 @@ def test_a_folder_judges_itself_again_and_notices_tampering(tmp_path: Path) -> N
 
 def test_the_hash_survives_the_file_and_sees_every_cell(recorded: RecordedRun, tmp_path: Path) -> None:
     pq.write_table(recorded.trace, tmp_path / "again.parquet", compression="none")
-    assert sha256_of_table(read_trace(tmp_path / "again.parquet")) == sha256_of_table(recorded.trace)
+    assert sha256_of_table(pq.read_table(tmp_path / "again.parquet")) == sha256_of_table(recorded.trace)
     mask = np.arange(len(recorded.trace)) == 0
     for column in ("sent_ns", "seq", "size_bytes", "copy"):
         values = np.array(recorded.trace[column].to_pylist())
@@ -257,5 +258,5 @@ def test_events_are_on_disk_at_once_and_a_torn_line_is_no_harm(tmp_path: Path) -
     folder.event(5, "died", "v01", how="SIGKILL")
     with (folder.path / "events.jsonl").open("a") as file:
         file.write('{"time_ns": 6, "ki')
-    assert read_events(folder.path) == [Event(5, "died", "v01", {"how": "SIGKILL"})]
+    assert RecordedRun.open(folder.path).events == [Event(5, "died", "v01", {"how": "SIGKILL"})]
     assert json.loads((folder.path / "events.jsonl").read_text().splitlines()[0])["kind"] == "died"

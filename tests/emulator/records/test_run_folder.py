@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.records.run_folder import Event, RunFolder, read_events
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario, load_scenario
 from vnet.errors import VnetError
 
@@ -63,7 +64,7 @@ def test_a_folder_holds_its_scenario_from_the_start(tmp_path: Path) -> None:
     scenario = Scenario.model_validate({"run": {"seed": 11}, "radio": {"loss": 0.25}})
     folder = RunFolder.create(tmp_path / "deep" / "run", scenario)
     assert load_scenario(folder.path / "scenario.toml") == scenario
-    assert read_events(folder.path) == []
+    assert RecordedRun.open(folder.path).events == []
     assert folder.logs.is_dir()
 
 
@@ -134,16 +135,16 @@ def test_events_up_to_the_cut_survive_a_cut_anywhere(
     folder = RunFolder.create(tmp_path_factory.mktemp("events") / "run", Scenario())
     for time_ns, kind, node, details in events:
         folder.event(time_ns, kind, node, **details)
-    assert read_events(folder.path) == folder.events == [Event(*event) for event in events]
+    assert RecordedRun.open(folder.path).events == folder.events == [Event(*event) for event in events]
     path = folder.path / "events.jsonl"
     whole = path.read_bytes()
     cut = data.draw(st.integers(0, len(whole)))
     path.write_bytes(whole[:cut])
     complete = whole[: cut + 1].count(b"\n")  # a line that only lacks its end can be read
-    assert read_events(folder.path) == folder.events[:complete]
+    assert RecordedRun.open(folder.path).events == folder.events[:complete]
 
 
 def test_events_of_no_run_are_refused_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(VnetError, match="not a run's folder") as refused:
-        read_events(tmp_path)
+        _ = RecordedRun.open(tmp_path).events
     assert "\n" not in str(refused.value)

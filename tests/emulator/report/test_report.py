@@ -12,11 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
-from emulator.checks.judge import read_recorded_run
 from emulator.cli import report as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
-from emulator.records.verdict_file import read_record
+from emulator.records.recorded_run import RecordedRun
 from emulator.report.compare_page import comparison_page
 from emulator.report.comparison import Comparison
 from emulator.report.index import write_index
@@ -90,7 +89,7 @@ def test_figures_have_axes_with_units_and_are_those_of_the_verdict(cooperative: 
     page = page_of(cooperative)
     for label in ("common error (m)", "RMSE of position (m)", "emulated time (s)", "latency (ms)", "distance (km)"):
         assert label in page.text
-    record = read_record(cooperative)
+    record = RecordedRun.open(cooperative).record
     assert f"{record.figures['common_error_rmse_m']:.3f} m" in page.text
     for name, value in key_figures(record).items():
         assert f"{name} {value}" in page.text
@@ -115,7 +114,7 @@ def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
     run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
     page = page_of(run)
     assert "channel busy ratio (%)" in page.text and "expected: " not in page.text
-    figures = radio_metrics(read_recorded_run(run))
+    figures = radio_metrics(RecordedRun.open(run))
     delivered, busy = figures.totals["delivery_ratio"], figures.totals["busy_ratio_mean"]
     assert delivered is not None and busy is not None
     assert f"packet delivery ratio {100 * delivered:.1f} %" in page.text
@@ -164,7 +163,7 @@ def test_figures_that_need_no_metrics_are_drawn_without_them(beacon: Path) -> No
     (beacon / "metrics.parquet").write_bytes(b"no table")
     page = page_of(beacon)
     assert {"outcomes", "totals", "links", "latency", "ages", "degrees"} <= set(page.ids)
-    assert "metrics.parquet cannot be read" in page.text
+    assert "metrics.parquet: cannot be read" in page.text
 
 
 def test_a_verdict_that_cannot_be_read_is_not_taken_for_a_run_that_goes_on(beacon: Path) -> None:
@@ -195,7 +194,7 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     assert "no verdict.json: it is still going on" in page.text
     assert "./beacon-1/report.html" in page.references and "./half-1/" in page.references
     assert not list(runs.glob(".*.part"))
-    share = read_record(beacon).share_of("delivered")
+    share = RecordedRun.open(beacon).record.share_of("delivered")
     assert share is not None and f"{100 * share:.2f}" in page.text
 
 

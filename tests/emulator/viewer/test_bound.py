@@ -12,7 +12,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import pack, unpack
-from emulator.viewer.bound import Limit
+from emulator.viewer.bound import HearsAllBound
 from emulator.world.world import build_world
 
 
@@ -40,7 +40,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
 
 
 def steps(told: list[dict[str, Any]], particles: int = 500) -> list[float | None]:
-    limit = Limit(told[0], particles)
+    limit = HearsAllBound(told[0], particles)
     return [limit.step(period) for period in told[1:]]
 
 

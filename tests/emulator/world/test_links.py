@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emulator.records.recorded_world import RecordedWorld
 from emulator.scenario.scenario import Radio, Scenario
 from emulator.stream.messages import scene_message
 from emulator.world.links import load_links
@@ -86,4 +87,4 @@ def test_a_matrix_of_another_size_than_the_network_is_refused_with_the_world() -
 def test_observers_are_told_no_range_where_it_means_nothing() -> None:
     for radio, range_m in (({"range_m": 500.0}, 500.0), ({"links": [[0, 1], [1, 0]]}, None)):
         scenario = Scenario.model_validate({"network": {"vehicles": 2}, "radio": radio})
-        assert scene_message(build_world(scenario), scenario)["range_m"] == range_m
+        assert scene_message(RecordedWorld.of(build_world(scenario)), scenario, "")["range_m"] == range_m

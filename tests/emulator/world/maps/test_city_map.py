@@ -11,6 +11,7 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
+from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
 from emulator.stream.messages import scene_message, unpack
@@ -64,7 +65,7 @@ def test_programs_get_the_lanes_around_where_vehicles_drive(tmp_path: Path) -> N
     assert isinstance(whole, RoadMap) and isinstance(near, RoadMap)
     assert len(whole) == 8, "two roads of two pieces, both ways"
     assert sorted(set(np.round(whole.heading_rad, 2) % 6.28)) == pytest.approx([0, 1.57, 3.14, 4.71], abs=0.01)
-    scene = scene_message(build_world(driving(tmp_path)), driving(tmp_path))
+    scene = scene_message(RecordedWorld.of(build_world(driving(tmp_path))), driving(tmp_path), "")
     assert unpack(scene["lane_length_m"])[:, 0] == pytest.approx(whole.length_m, rel=1e-5)
 
 

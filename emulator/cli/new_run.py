@@ -1,0 +1,24 @@
+"""A new run's folder for the commands that run a scenario; that its code has changed is told in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from emulator.records.code_digest import changed_code
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.recorded import recorded_code
+from emulator.scenario.scenario import Scenario
+from emulator.terminal.console import LogFormat, tell
+
+
+def create_folder(out: Path | None, path: Path, scenario: Scenario, log_format: LogFormat) -> RunFolder:
+    """Create the folder of a run of `scenario`, which was read from `path`.
+
+    Where `path` is of another run's folder, and program or vnet have changed since, the run goes on: one line says
+    so, and the event `code_changed` records it.
+    """
+    folder = RunFolder.create(out, scenario)
+    if changed := changed_code(recorded_code(path), folder.code):
+        tell(f"{path}: {changed}", log_format)
+        folder.event(0, "code_changed", what=changed)
+    return folder

@@ -1,0 +1,32 @@
+"""What nodes reported in a period, as arrays: the same for a run that is on, and for one that is read again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from numpy.typing import ArrayLike
+
+from vnet.types import Array
+
+WEIGHT = "weight."
+"""How the values begin by which programs report the weights of their fusion; a node's id follows."""
+
+
+@dataclass(frozen=True)
+class Beliefs:
+    """What nodes reported in a period: arrays (n, 2) and (n, 4), NaN where a node said nothing; and by node the
+    numbers of its cloud, point by point, and the weights (n,) of its fusion.
+    """
+
+    estimate_m: Array
+    covariance_m2: Array
+    common_error_m: Array
+    common_error_covariance_m2: Array
+    clouds: Mapping[str, ArrayLike]
+    weights: Mapping[str, Array]
+
+
+def is_cloud(count: int) -> bool:
+    """Return whether so many numbers can be points."""
+    return count % 2 == 0

@@ -1,0 +1,160 @@
+"""SHA-256 of the code that a run depends on: the program, and vnet itself.
+
+The program is every module that its entry leads to by `import`, wherever in a module that stands, from outside the
+standard library and site-packages; modules of the entry's own package count wherever they are installed. Sources
+are read, and nothing is imported: whoever records a program need not run it.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from typing import Any
+
+from emulator.scenario.scenario import Scenario
+
+OWN = ("vnet", "emulator")
+"""The packages that are vnet itself."""
+LEFT_OUT = "experiments"
+"""The part of vnet on which no run depends."""
+_SITE = ("purelib", "platlib", "stdlib", "platstdlib")
+
+
+def code_digests(scenario: Scenario) -> dict[str, str]:
+    """Return digests of the `program` of a scenario, its exceptions included, and of `vnet`.
+
+    A program that cannot be found has none.
+    """
+    return digests_of(entries_of(scenario))
+
+
+def digests_of(entries: tuple[str, ...]) -> dict[str, str]:
+    """Return the same for the entries of a scenario's programs."""
+    digest = program_digest(entries)
+    return {"entries": " ".join(entries), **({"program": digest} if digest else {}), "vnet": vnet_digest()}
+
+
+def changed_code(recorded: Mapping[str, Any], now: Mapping[str, str]) -> str:
+    """Say what has changed of the code since `recorded`; "" if nothing, or if these are other programs."""
+    if recorded.get("entries") != now["entries"]:
+        return ""
+    names = {"program": f"the program {now['entries'].replace(' ', ', ')}", "vnet": "vnet"}
+    changed = [
+        words for key, words in names.items() if key in recorded and key in now and recorded[key] != now[key]
+    ]
+    return f"{' and '.join(changed)} changed since this run was recorded" if changed else ""
+
+
+def entries_of(scenario: Scenario) -> tuple[str, ...]:
+    """The entries of all programs of a scenario, sorted."""
+    program = scenario.program
+    return tuple(sorted({program.entry, *(exception.entry for exception in program.exceptions)}))
+
+
+def program_digest(entries: Iterable[str]) -> str | None:
+    """One digest of the programs with these entries, `package.module:function`; None if one cannot be found."""
+    modules: dict[str, Path | None] = {}
+    for entry in entries:
+        name = entry.partition(":")[0]
+        _collect(name, name.partition(".")[0], modules)
+        if modules.get(name) is None:
+            return None
+    digest = hashlib.sha256()
+    for name, path in sorted(modules.items()):
+        if path is not None:
+            digest.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+@cache
+def vnet_digest() -> str:
+    """One digest of vnet's own sources, but for `LEFT_OUT`."""
+    digest = hashlib.sha256()
+    for package in OWN:
+        spec = importlib.util.find_spec(package)
+        for folder in (spec.submodule_search_locations or []) if spec else []:
+            for path in sorted(Path(folder).rglob("*.py")):
+                name = path.relative_to(folder)
+                if LEFT_OUT not in name.parts:
+                    digest.update(f"{package}/{name.as_posix()}\0".encode())
+                    digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _collect(name: str, own: str, modules: dict[str, Path | None]) -> None:
+    """Add a module, its packages, and all that they import, to `modules`: the source of each, or None if foreign.
+
+    `own` is the package of the entry.
+    """
+    waiting = [name]
+    while waiting:
+        parts = waiting.pop().split(".")
+        for length in range(1, len(parts) + 1):
+            module = ".".join(parts[:length])
+            if module in modules:
+                continue
+            modules[module] = path = _source(module, own)
+            if path is not None:
+                waiting += _imported(module, path)
+
+
+def _source(module: str, own: str) -> Path | None:
+    """The source of a module of the program; None if it is another's, or no source."""
+    top = module.partition(".")[0]
+    if top in OWN or top in sys.stdlib_module_names:
+        return None
+    spec = _find(module)
+    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+        return None
+    path = Path(spec.origin)
+    return path if top == own or not _is_installed(path) else None
+
+
+def _find(module: str) -> ModuleSpec | None:
+    """Where a module is, found without importing it or its packages; as programs are: beside here, too."""
+    parent, _, _ = module.rpartition(".")
+    try:
+        if not parent:
+            here = [str(Path.cwd())]
+            return importlib.util.find_spec(module) or PathFinder.find_spec(module, here)
+        package = _find(parent)
+        locations = None if package is None else package.submodule_search_locations
+        return None if locations is None else PathFinder.find_spec(module, list(locations))
+    except (ImportError, ValueError):
+        return None
+
+
+def _is_installed(path: Path) -> bool:
+    """Whether a file is of the standard library, or was installed."""
+    return any(path.is_relative_to(folder) for folder in _installed_folders())
+
+
+@cache
+def _installed_folders() -> tuple[Path, ...]:
+    return tuple(Path(sysconfig.get_path(name)) for name in _SITE)
+
+
+def _imported(module: str, path: Path) -> Iterator[str]:
+    """What a source imports, by absolute name; a name that is imported from a package may be a module, or not."""
+    try:
+        tree = ast.parse(path.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            start = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
+            base = ".".join(part for part in (start, node.module) if part)
+            if base:
+                yield base
+                yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")

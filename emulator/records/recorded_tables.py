@@ -1,0 +1,251 @@
+"""A run's tables as arrays: its nodes, where they were, the trace column by column, the states by period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from emulator.radio.connectivity import connectivity_of
+from emulator.radio.dot11p import airtimes_ns
+from emulator.radio.outcomes import Stage, decided_at
+from emulator.records.busy import busy_windows
+from emulator.records.positions import Places
+from emulator.records.recorded_world import RecordedWorld
+from emulator.records.run_folder import Event
+from emulator.records.run_tables import VALUES_AS_LIST
+from emulator.records.verdicts import MOST_ROWS
+from emulator.scenario.scenario import Scenario
+from emulator.world.links import load_links
+from vnet.errors import VnetError
+from vnet.types import Array, IntArray, Mask
+
+ARRIVED = decided_at(Stage.ARRIVAL)
+ON_AIR = decided_at(Stage.RECEPTION, Stage.ARRIVAL)
+"""What becomes of pairs that come as far as the radio."""
+
+
+@dataclass(frozen=True)
+class RecordedTables:
+    """The scenario, the three tables, and the events."""
+
+    scenario: Scenario
+    trace: pa.Table
+    states: pa.Table
+    metrics: pa.Table
+    events: Sequence[Event]
+    known_m: Array | None = None
+    """True positions (periods, N, 2), where the states have not got them all."""
+    busy: pa.Table | None = None
+    """busy.parquet, where there is a MAC."""
+    world: RecordedWorld | None = None
+    """world.npz, where the scenario takes its links from a file."""
+
+    # Nodes and where they are.
+
+    @cached_property
+    def node_ids(self) -> list[str]:
+        """The nodes in the order of their numbers, which is that of the states' rows."""
+        first = self.states.filter(pc.equal(self.states["period"], 0))
+        return [str(node) for node in first["node"].to_pylist()]
+
+    @cached_property
+    def number(self) -> dict[str, int]:
+        """The number of each node."""
+        return {node: number for number, node in enumerate(self.node_ids)}
+
+    def number_of(self, node: str | None) -> int:
+        """The number of a node that trace or events name. Raises VnetError if the states do not know it."""
+        if node not in self.number:
+            raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
+        return self.number[node]
+
+    @property
+    def moves(self) -> bool:
+        """Whether vehicles drive, enter and leave; else they stand but for their place in the lane."""
+        return self.scenario.network.moves
+
+    @cached_property
+    def places(self) -> Places:
+        """Where the vehicles were. Raises ScenarioError if the scenario's links do not fit them."""
+        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self._links())
+        position_m = self.vectors("position_m") if self.known_m is None else self.known_m
+        some = position_m if self.moves else position_m[:1]
+        return Places(some, self.moves, self.scenario.period_ns, connectivity)
+
+    def _links(self) -> Mask | None:
+        """Who (row) hears whom (column), (N, N), where the scenario says so; files are not read again."""
+        radio, count = self.scenario.radio, len(self.node_ids)
+        if not isinstance(radio.links, Path):
+            return load_links(radio, count)
+        links = None if self.world is None else self.world.links
+        if links is None or len(links) != count:
+            raise VnetError(f"radio.links = {str(radio.links)!r}: no links of {count} vehicles were recorded")
+        return links
+
+    @cached_property
+    def busy_ratio(self) -> Array:
+        """(windows, N), how busy each vehicle found the medium; no windows where senders share none."""
+        return busy_windows(self.busy, self.node_ids)
+
+    # The trace, column by column.
+
+    def column(self, name: str) -> IntArray:
+        """A column of whole numbers of the trace; -1 where there is none."""
+        column = pc.fill_null(self.trace[name], -1) if self.trace[name].null_count else self.trace[name]
+        return np.asarray(column.to_numpy(), dtype=np.int64)
+
+    def nodes(self, name: str) -> NDArray[np.intp]:
+        """A column of node ids of the trace as numbers."""
+        column = self.trace[name].combine_chunks()
+        code = np.array([self.number_of(node) for node in column.dictionary.to_pylist()], dtype=np.intp)
+        return np.asarray(code[column.indices.to_numpy()], dtype=np.intp)
+
+    @cached_property
+    def sender(self) -> NDArray[np.intp]:
+        """Who sent each row's frame."""
+        return self.nodes("sender")
+
+    @cached_property
+    def receiver(self) -> NDArray[np.intp]:
+        """Who was to hear it."""
+        return self.nodes("receiver")
+
+    @cached_property
+    def sent_ns(self) -> IntArray:
+        """When it was sent."""
+        return self.column("sent_ns")
+
+    @cached_property
+    def arrival_ns(self) -> IntArray:
+        """When it arrived; -1 where it did not."""
+        return self.column("arrival_ns")
+
+    @cached_property
+    def shares_air(self) -> bool:
+        """Whether the trace tells when frames were on air."""
+        return "on_air_ns" in self.trace.column_names
+
+    @cached_property
+    def on_air_ns(self) -> IntArray:
+        """When its transmission began; -1 where it never did."""
+        return self.column("on_air_ns")
+
+    @cached_property
+    def airtime_ns(self) -> IntArray:
+        """How long its transmission takes, but for throttles."""
+        return airtimes_ns(self.scenario.radio, self.column("size_bytes"))
+
+    @cached_property
+    def seq(self) -> IntArray:
+        """Its number among its sender's."""
+        return self.column("seq")
+
+    @cached_property
+    def copy(self) -> IntArray:
+        """0, or the number of the copy."""
+        return self.column("copy")
+
+    @cached_property
+    def digest(self) -> NDArray[np.uint64]:
+        """The digest of what arrives."""
+        return np.asarray(self.trace["payload_digest"].to_numpy(), dtype=np.uint64)
+
+    @cached_property
+    def arrived(self) -> Mask:
+        """Whether it came as far as its receiver."""
+        return self.outcome_is(*ARRIVED)
+
+    def outcome_is(self, *names: str) -> Mask:
+        """Which rows have one of these outcomes."""
+        mask = pc.is_in(self.trace["outcome"].cast(pa.string()), pa.array(names))
+        return np.asarray(mask.to_numpy(zero_copy_only=False), dtype=bool)
+
+    @cached_property
+    def placed(self) -> Mask:
+        """Whether it is known where the vehicles were when a row's frame was sent."""
+        return self.places.known(self.sent_ns)
+
+    @cached_property
+    def in_range(self) -> Mask:
+        """Whether a row's sender and receiver were then in range of each other, as far as that is known."""
+        return self.places.pairs_in_range(self.sender, self.receiver, self.sent_ns)
+
+    @cached_property
+    def _by_time(self) -> tuple[NDArray[np.intp], IntArray]:
+        """The rows in the order in which their frames were sent, and when that was."""
+        order = np.argsort(self.sent_ns, kind="stable")
+        return order, self.sent_ns[order]
+
+    def sent_between(self, start_ns: int, end_ns: int) -> NDArray[np.intp]:
+        """The rows whose frames were sent in [start, end)."""
+        order, sent_ns = self._by_time
+        first, last = np.searchsorted(sent_ns, (start_ns, end_ns))
+        return order[first:last]
+
+    @cached_property
+    def frame(self) -> IntArray:
+        """One number for each (sender, seq)."""
+        return np.asarray(self.sender * (int(self.seq.max(initial=0)) + 1) + self.seq)
+
+    @cached_property
+    def emission(self) -> IntArray:
+        """One number for each (sender, seq, copy)."""
+        return np.asarray(self.frame * (int(self.copy.max(initial=0)) + 1) + self.copy)
+
+    def rows(self, broken: Mask | IntArray | NDArray[np.intp]) -> list[dict[str, Any]]:
+        """The first offending rows of the trace, by mask or by number."""
+        indices = np.flatnonzero(broken) if broken.dtype == bool else np.asarray(broken)
+        listed = self.trace.take(pa.array(np.sort(indices)[:MOST_ROWS].astype(np.int64))).to_pylist()
+        return [{**row, "payload_digest": f"{row['payload_digest']:016x}"} for row in listed]
+
+    # The states, as arrays over (period, node).
+
+    @cached_property
+    def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
+        return period, np.array([self.number_of(n) for n in self.states["node"].to_pylist()], dtype=np.intp)
+
+    @property
+    def periods(self) -> int:
+        """How many periods were kept."""
+        return int(self._place[0].max(initial=-1)) + 1
+
+    def vectors(self, name: str) -> Array:
+        """A column of points of the states (periods, N, 2); NaN where there is none."""
+        return self._spread(self.states[name].combine_chunks(), 2)
+
+    def _spread(self, column: pa.Array, size: int) -> Array:
+        spread = np.full((self.periods, len(self.node_ids), size), np.nan)
+        there = np.asarray(column.is_valid())
+        period, node = self._place
+        flat = np.asarray(column.drop_null().flatten().to_numpy(zero_copy_only=False), dtype=float)
+        spread[period[there], node[there]] = flat.reshape(-1, size)
+        return spread
+
+    def value(self, name: str) -> Array:
+        """A number that programs report by this name (periods, N); NaN where there is none."""
+        lists = pc.map_lookup(self.states["values"].combine_chunks(), name, "first")
+        return self._spread(pc.if_else(pc.equal(pc.list_value_length(lists), 1), lists, None), 1)[..., 0]
+
+    @cached_property
+    def reported(self) -> Mask:
+        """(periods, N), who reported anything in which period."""
+        values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
+        something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
+        for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
+            something |= np.asarray(self.states[name].combine_chunks().is_valid())
+        reported = np.zeros((self.periods, len(self.node_ids)), dtype=bool)
+        reported[self._place] = something
+        return reported
+
+    def period_starts_ns(self) -> IntArray:
+        """When each period starts."""
+        return np.arange(self.periods, dtype=np.int64) * self.scenario.period_ns

@@ -1,0 +1,231 @@
+"""The files of a run's folder, as files that others may have written: bounded, typed, and wrong in one line.
+
+Nothing else opens them. `recorded_run` makes arrays of them, and says what they mean together.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import fields, replace
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from emulator.radio.trace import Trace
+from emulator.records.busy import busy_table
+from emulator.records.metrics import METRICS, STATES, PeriodFigures
+from emulator.records.recorded_world import RecordedWorld
+from emulator.records.run_folder import (
+    BUSY_FILE,
+    EVENTS_FILE,
+    FORMAT,
+    METRICS_FILE,
+    SCENARIO_FILE,
+    STATES_FILE,
+    TRACE_FILE,
+    VERDICT_FILE,
+    WORLD_FILE,
+    Event,
+)
+from emulator.records.run_tables import StatesReader, TableFile, TraceReader
+from emulator.records.verdict_file import Record, read_record
+from emulator.scenario.recorded import parse_recorded_scenario
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.toml import LARGEST_BYTES
+from emulator.world.world import build_world
+from vnet.bounded import read_bounded
+from vnet.errors import ScenarioError, VnetError, printable
+
+LARGEST_EVENTS_BYTES = 1 << 28
+MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
+"""A folder with any of these is a run's."""
+WITH_MAC = ("on_air_ns", "left_ns")
+"""Columns that the trace has where there is a MAC."""
+TABLES: dict[str, pa.Schema] = {
+    TRACE_FILE: Trace(["v01"], knows_air=True).to_table().schema,
+    STATES_FILE: STATES,
+    METRICS_FILE: METRICS,
+    BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
+}
+"""The tables, with the columns that they must have."""
+Columns = Mapping[str, Collection[str]]
+T = TypeVar("T")
+
+
+class RunFiles:
+    """A run's folder. Each file is read when it is first asked for; VnetError says what is wrong with it.
+
+    Of the tables that `columns` names, only those columns are read.
+    """
+
+    def __init__(self, folder: Path, columns: Columns | None = None) -> None:
+        self.folder = folder
+        self._columns = columns or {}
+
+    @cached_property
+    def scenario_text(self) -> str:
+        """The text of scenario.toml."""
+        path = self.folder / SCENARIO_FILE
+        return self._read(path, lambda: read_bounded(path, LARGEST_BYTES).decode("utf-8", "replace"))
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario; the files that it names need not be there any more."""
+        return parse_recorded_scenario(self.scenario_text, self.folder / SCENARIO_FILE)
+
+    @cached_property
+    def record(self) -> Record:
+        """What verdict.json says. A format that this vnet does not know is refused."""
+        path = self.folder / VERDICT_FILE
+        record = self._read(path, lambda: read_record(path))
+        if not 1 <= record.format <= FORMAT:
+            raise VnetError(
+                f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
+                f"reads 1 to {FORMAT}"
+            )
+        return replace(record, reproduce=_from_here(record.reproduce, self.folder))
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """The events, in the order in which they were written; a last line that was cut off is left out."""
+        path = self.folder / EVENTS_FILE
+        return self._read(path, lambda: _parse_events(path, read_bounded(path, LARGEST_EVENTS_BYTES)))
+
+    @cached_property
+    def world(self) -> RecordedWorld:
+        """What world.npz holds. Folders of format 1 have none: their input files are needed."""
+        path = self.folder / WORLD_FILE
+        if path.exists():
+            return self._read(path, lambda: RecordedWorld.read(path))
+        if self.record.format > 1:
+            raise VnetError(f"{self.folder}: not a finished run's folder: there is no {WORLD_FILE} in it")
+        try:
+            return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
+        except ScenarioError as error:
+            text = f"{self.folder}: of format 1 (vnet 0.1.0), which needs the run's input files: {error}"
+            raise VnetError(text) from None
+
+    @cached_property
+    def trace(self) -> pa.Table:
+        """A row for each frame and receiver in range."""
+        return self._table(TRACE_FILE, left_out=WITH_MAC if self.scenario.radio.mac is None else ())
+
+    @cached_property
+    def states(self) -> pa.Table:
+        """A row for each vehicle and period."""
+        return self._table(STATES_FILE)
+
+    @cached_property
+    def metrics(self) -> pa.Table:
+        """A row for each period."""
+        return self._table(METRICS_FILE)
+
+    @cached_property
+    def busy(self) -> pa.Table | None:
+        """A row for each vehicle and 100 ms; None where there is no MAC."""
+        return None if self.scenario.radio.mac is None else self._table(BUSY_FILE)
+
+    # Tables a piece at a time.
+
+    def trace_reader(self, number: Mapping[str, int]) -> TraceReader:
+        """The trace forward in time; `number` gives each node's."""
+        return TraceReader(self.folder / TRACE_FILE, number)
+
+    def states_reader(self, number: Mapping[str, int]) -> StatesReader:
+        """The states period by period; `number` gives each node's."""
+        return StatesReader(self.folder / STATES_FILE, number, self.scenario.period_ns)
+
+    def figures(self) -> list[PeriodFigures]:
+        """The rows of the metrics. Raises VnetError unless there is one for each period in turn."""
+        file = TableFile(self.folder / METRICS_FILE, [field.name for field in fields(PeriodFigures)])
+        figures = [PeriodFigures(**row) for piece in file.pieces() for row in piece.to_pylist()]
+        if [row.period for row in figures] != list(range(len(figures))):
+            raise file.error("its rows are not those of one period after the other")
+        return figures
+
+    # What lies in the folder.
+
+    @property
+    def has_record(self) -> bool:
+        """Whether there is a verdict.json: the run has come to its end."""
+        return (self.folder / VERDICT_FILE).exists()
+
+    @property
+    def when(self) -> datetime:
+        """When the run ended, or was last heard of, in local time. Raises VnetError if the folder is gone."""
+        for path in (self.folder / VERDICT_FILE, self.folder / EVENTS_FILE, self.folder):
+            try:
+                return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
+            except OSError:
+                continue
+        raise VnetError(f"{self.folder}: no such folder")
+
+    def _read(self, path: Path, read: Callable[[], T]) -> T:
+        """What `read` makes of a file; what goes wrong is told in one line."""
+        try:
+            return read()
+        except FileNotFoundError:
+            raise VnetError(f"{self.folder}: not a run's folder: there is no {path.name} in it") from None
+        except OSError as error:
+            raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+        except (ValueError, pa.ArrowException) as error:
+            raise VnetError(f"{path}: cannot be read: {printable(' '.join(str(error).split()), 300)}") from None
+
+    def _table(self, name: str, left_out: Collection[str] = ()) -> pa.Table:
+        """A table with the types that it must have."""
+        path, schema = self.folder / name, TABLES[name]
+        if not path.is_file():
+            check_is_run(self.folder)
+            raise VnetError(f"{self.folder}: not a finished run's folder: there is no {name} in it")
+        wanted = self._columns.get(name)
+        table: pa.Table = self._read(path, lambda: pq.read_table(path, columns=wanted and list(wanted)))
+        for column in wanted or schema.names:
+            found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
+            if not found and column not in left_out:
+                raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
+        return table.unify_dictionaries()
+
+
+def _from_here(command: str, folder: Path) -> str:
+    """The command that runs a run again, with the path of its scenario as the folder is called now."""
+    try:
+        words = shlex.split(command)
+    except ValueError:
+        return command
+    named = [str(folder / SCENARIO_FILE) if Path(word).name == SCENARIO_FILE else word for word in words]
+    return command if named == words else shlex.join(named)
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Return whether a folder is that of a run, broken ones included."""
+    return any((folder / mark).is_file() for mark in MARKS)
+
+
+def check_is_run(folder: Path) -> None:
+    """Raise VnetError if the folder has no scenario, and so is not a run's."""
+    if not (folder / SCENARIO_FILE).is_file():
+        raise VnetError(f"{folder}: not a run's folder: there is no {SCENARIO_FILE} in it")
+
+
+def _parse_events(path: Path, content: bytes) -> list[Event]:
+    """The events of a file. Raises VnetError where a line is JSON, but no event."""
+    events = []
+    for line in content.decode("utf-8", "replace").splitlines():
+        try:
+            data = json.loads(line)
+        except (ValueError, RecursionError):
+            continue  # the last line of a run that was killed
+        if not isinstance(data, dict) or not data.keys() >= {"time_ns", "kind", "node"}:
+            continue
+        time_ns, kind, node = (data.pop(key) for key in ("time_ns", "kind", "node"))
+        if type(time_ns) is not int or not isinstance(kind, str) or not isinstance(node, (str, type(None))):
+            raise VnetError(f"{path}: not vnet's events: {printable(line, 100)}")
+        events.append(Event(time_ns, kind, node, data))
+    return events

@@ -1,0 +1,61 @@
+"""What every reader of a run's folder makes of it, as plain texts and bytes that can be compared."""
+
+import io
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from emulator.checks.judge import check_run
+from emulator.cli.commands import app
+from emulator.export.mcap_file import write_mcap
+from emulator.export.pcapng import write_pcapng
+from emulator.export.tables import write_csv
+from emulator.records.recorded_run import RecordedRun
+from emulator.report.compare_page import comparison_page
+from emulator.report.comparison import Comparison
+from emulator.report.source import Source
+from emulator.report.write import report_page
+from emulator.stream.playback import messages
+from tests.support.recordings import read_back
+
+READERS = ("check", "report", "play", "compare", "pcapng", "mcap", "csv", "radio")
+Readings = dict[str, str | bytes]
+
+
+def readings(folder: Path, other: Path, scratch: Path) -> Readings:
+    """What all `READERS` make of a run, without its folder's name; `other` is the run that it is compared with."""
+    recorded = RecordedRun.open(folder)
+    pcapng, mcap = io.BytesIO(), io.BytesIO()
+    write_pcapng(recorded, pcapng)
+    write_mcap(recorded, mcap)
+    tables = scratch / "csv"
+    tables.mkdir(parents=True)
+    written = {name: (tables / name).read_text() for name in write_csv(recorded, tables)}
+    shutil.rmtree(tables)
+    read = {
+        "check": repr(asdict(check_run(folder))) + command("check", str(folder)),
+        "report": report_page(Source(folder)),
+        "play": repr(list(messages(folder))),
+        "compare": comparison_page(Comparison.of(folder, other)),
+        "csv": repr(written),
+        "radio": command("radio", str(folder)),
+    }
+    named = {name: text.replace(str(folder), "RUN") for name, text in read.items()}
+    return {**named, "pcapng": pcapng.getvalue(), "mcap": mcap.getvalue()}
+
+
+def rendered(folder: Path) -> str:
+    """What `vnet render` draws of a run."""
+    command("render", str(folder))
+    drawn = read_back(folder / "recording.rrd")
+    del drawn["/__properties"]  # when it was made
+    return repr(sorted(drawn.items()))
+
+
+def command(*arguments: str) -> str:
+    """Run `vnet ARGUMENTS` in this process, which must succeed; returns what it prints."""
+    done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    return done.stdout
