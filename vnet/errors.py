@@ -42,7 +42,7 @@ def shown(value: object) -> str:
 
 
 def first_names(names: Sequence[object], most: int = 8, with_total: bool = False) -> str:
-    """Return the first `most` names, with commas between; an ellipsis, with the total if wanted, ends a longer list."""
+    """Return the first `most` names, with commas; an ellipsis, with the total if wanted, ends a longer list."""
     total = f" ({len(names)})" if with_total else ""
     return ", ".join(map(str, names[:most])) + (f", …{total}" if len(names) > most else "")
 
