@@ -62,16 +62,16 @@ class Comparison:
 
     @cached_property
     def checks(self) -> list[Row]:
-        """The verdict, and that of each check; "left out" where a run could not exercise it."""
+        """The verdict, and that of each check; "not applicable" where a run could not exercise it."""
         judged = [
             {check.name: check.verdict.value for check in record.checks}
-            | {left.name: "left out" for left in record.not_exercised}
+            | {left.name: "not applicable" for left in record.not_exercised}
             for record in self.records
         ]
         rows = [{"check": "the run", A: self.records[0].verdict.value, B: self.records[1].verdict.value}]
         for name in judged[0] | judged[1]:
-            verdicts = [each.get(name, "left out") for each in judged]
-            if verdicts != ["left out"] * 2:
+            verdicts = [each.get(name, "not applicable") for each in judged]
+            if verdicts != ["not applicable"] * 2:
                 rows.append({"check": name, A: verdicts[0], B: verdicts[1]})
         return rows
 

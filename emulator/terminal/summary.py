@@ -65,7 +65,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
         table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
     console.print(table)
     for reason, names in left_out(judgement).items():
-        console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
+        console.print(Text(f"not applicable: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
