@@ -15,7 +15,7 @@ from emulator.checks.channel import changed_bytes
 from emulator.checks.latency import bounds
 from emulator.checks.senders import is_noise
 from emulator.faults.plan import PlannedFault
-from emulator.radio.csma import times_ns
+from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
@@ -171,7 +171,7 @@ def _slowed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
         on_air = on_air[np.argsort(begin_ns[on_air])]
         silent_ns = np.maximum.accumulate(np.append(0, (begin_ns + recorded.airtime_ns)[on_air]))
         free_ns = np.maximum(ready_ns, silent_ns[np.searchsorted(begin_ns[on_air], begin_ns)])
-        aifs_ns, window = times_ns(radio.mac)
+        aifs_ns, window = edca_parameters(radio.mac)
         slow |= begin_ns > free_ns + aifs_ns + (window + 2) * SLOT_NS + recorded.guard_ns
     return np.asarray(slow)
 

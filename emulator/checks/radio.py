@@ -13,9 +13,10 @@ from scipy.special import gammainccinv
 from scipy.stats import chi2
 
 from emulator.checks.channel import nothing_seen, received_twice
-from emulator.radio.csma import times_ns
+from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import DETECTION_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
+from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
@@ -31,7 +32,7 @@ TELLING_VARIANCE = 5.0
 """Least variance of the number of faded receptions on a link: with less, a sum is not yet normal."""
 GRID_DB = 0.25
 FACTORS = 1024
-NEVER_SENT = ("queue_full", "oversize", "held_back")
+NEVER_SENT = decided_at(Stage.SENDER)
 LEAST_PAUSE_NS = 25_000_000
 ROUNDING = 1e-6
 
@@ -224,7 +225,9 @@ def _without_pause(air: _Air) -> NDArray[np.intp]:
     order = np.argsort(air.sender, kind="stable")
     same = air.sender[order[1:]] == air.sender[order[:-1]]
     begin_ns, end_ns = air.begin_ns[order], air.end_ns[order]
-    early = (begin_ns[1:] < end_ns[:-1] + times_ns(radio.mac).aifs) | (begin_ns[1:] < begin_ns[:-1] + least_ns)
+    early = (begin_ns[1:] < end_ns[:-1] + edca_parameters(radio.mac).aifs_ns) | (
+        begin_ns[1:] < begin_ns[:-1] + least_ns
+    )
     return np.asarray(air.rows[order[1:][same & early]])
 
 
@@ -237,7 +240,7 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
     if radio.fading is not None:
         return np.zeros(0, np.intp)
     assert radio.mac is not None
-    earlier, later = air.near(times_ns(radio.mac).aifs)
+    earlier, later = air.near(edca_parameters(radio.mac).aifs_ns)
     noticed = air.begin_ns[later] >= air.begin_ns[earlier] + DETECTION_NS
     earlier, later = earlier[noticed], later[noticed]
     sent_ns = recorded.sent_ns[air.rows[earlier]]

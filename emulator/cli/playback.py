@@ -1,4 +1,4 @@
-"""`vnet render` and `vnet play`: a run that is over, drawn anew from its files alone."""
+"""`vnet render` and `vnet play`: a finished run, drawn again from its files alone."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import track
 
 from emulator.cli.viewing import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import RECORDING, RunFolder
 from emulator.stream.pace import play as play_scheduled
 from emulator.stream.pace import schedule
 from emulator.stream.playback import Message, messages
 from emulator.terminal.console import one_line_errors
-from emulator.viewer.sinks import RECORDING, Sinks, has_display, place_to_serve
+from emulator.viewer.sinks import Sinks, has_display, place_to_serve
 from vnet.errors import VnetError
 from vnet.units import NS_PER_S
 
@@ -36,7 +36,7 @@ def render(
     ] = None,
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
-    """Make a run's recording anew, and where it lies in the run's folder the report, from its files alone."""
+    """Rebuild a run's recording (and its report, where the recording is the run's own) from its files alone."""
     from emulator.report.write import write_report  # matplotlib is slow to import
 
     with one_line_errors():

@@ -17,34 +17,20 @@ from xml.etree import ElementTree
 
 import matplotlib
 import numpy as np
+from markupsafe import Markup
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from emulator.pages.page import escape
+from emulator.pages.palette import PALETTE
+from emulator.pages.text import as_text
 from vnet.types import Array
 
-# Light paper's colours, which page.STYLE has under these names.
-PALETTE = {
-    "ink": "#1b1f24",
-    "quiet": "#59626d",
-    "line": "#d5d9df",
-    "grid": "#e6e9ed",
-    "paper": "#ffffff",
-    "blue": "#0072b2",
-    "orange": "#e69f00",
-    "green": "#009e73",
-    "red": "#d55e00",
-    "purple": "#cc79a7",
-    "sky": "#56b4e9",
-    "grey": "#8b929b",
-    "sand": "#bdb35c",
-    "rust": "#8a3a00",
-    "navy": "#004166",
-}
-INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY, SAND, RUST, NAVY = PALETTE.values()
-_VARIABLE = {colour: f"var(--{name})" for name, colour in PALETTE.items()}
+INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY = (
+    colour.light for colour in PALETTE.values()
+)
+_VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190
 """A figure's width, and the height of what is inside its axes, at the size that it is drawn for."""
@@ -221,7 +207,7 @@ def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
     return time_s[kept], value[kept]
 
 
-def to_svg(figure: Figure, key: str, label: str) -> str:
+def to_svg(figure: Figure, key: str, label: str) -> Markup:
     """The figure as an `<svg>` element for a page; `key` makes its ids its own, `label` says what it shows."""
     file = io.BytesIO()
     figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
@@ -232,9 +218,10 @@ def to_svg(figure: Figure, key: str, label: str) -> str:
         for child in [child for child in parent if child.tag.endswith(("}metadata", "}style"))]:
             parent.remove(child)
         _make_plain(parent, names)
-    height = root.attrib["viewBox"]
+    view_box = root.attrib["viewBox"]
     body = "".join(ElementTree.tostring(child, encoding="unicode") for child in root)
-    return f'<svg class="chart" viewBox="{height}" role="img" aria-label="{escape(label)}">{body}</svg>'
+    start = Markup('<svg class="chart" viewBox="{}" role="img" aria-label="{}">').format(view_box, as_text(label))
+    return start + Markup(body) + Markup("</svg>")
 
 
 _REFERENCE = re.compile(r"url\(#(.+?)\)")

@@ -20,6 +20,8 @@ from emulator.scenario.scenario import Scenario, dump_scenario
 from vnet.errors import VnetError
 
 RUNS = Path("runs")
+REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
+"""Names of a run's report and recording, and of the list of the runs in a folder."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the faults do to a vehicle's GNSS receiver and clock: functions of the plan and the time alone."""
+"""Effects of faults on GNSS receivers and clocks: functions of the fault plan and the time alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vnet.types import Array
 
 
 class FaultyGnss:
-    """The fixes of a run as the receivers give them: the world's, and what faults make of them."""
+    """The fixes of a run as programs get them: the world's, changed by faults."""
 
     def __init__(self, world: World, faults: Sequence[PlannedFault], seed: int) -> None:
         self._world = world
@@ -26,7 +26,7 @@ class FaultyGnss:
         self._seed = seed
 
     def fix(self, period: int, number: int) -> Fix | None:
-        """The fix of vehicle `number` at the start of `period`; None in an outage."""
+        """Return the fix of vehicle `number` at the start of `period`; None in an outage."""
         time_ns = period * self._world.period_ns
         acting = [
             planned
@@ -46,17 +46,20 @@ class FaultyGnss:
         return replace(fix, position_m=position_m)
 
     def at(self, period: int) -> Instant:
-        """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""
+        """Return the truth at the start of `period`, with the fixes that programs get (NaN in an outage)."""
         instant = self._world.at(period)
         if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
             return instant
         nothing = np.full(2, np.nan)
-        there = instant.present.tolist()
-        fixes = [self.fix(period, number) if here else None for number, here in enumerate(there)]
+        present = instant.present.tolist()
+        fixes = [self.fix(period, number) if is_present else None for number, is_present in enumerate(present)]
         return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
 
     def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
-        """The position that frozen receivers repeat: their last before the earliest freeze, or first since."""
+        """Return the position before other faults: the fix's, or that of a frozen receiver.
+
+        A frozen receiver repeats its last position before the earliest freeze, or its first one since.
+        """
         frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
         if not frozen:
             return fix.position_m
@@ -69,7 +72,7 @@ class FaultyGnss:
         fault = planned.fault
         assert isinstance(fault, GnssFault)
         if isinstance(fault, RandomPos):
-            # A stream of its own for each vehicle and period, whatever was drawn before.
+            # Drawn for each vehicle and period, independent of other draws.
             draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
             angle, away_m = 2 * math.pi * draws[0], fault.radius_m * math.sqrt(draws[1])
             return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
@@ -78,7 +81,7 @@ class FaultyGnss:
 
 
 def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockError:
-    """How the clock of a vehicle goes at `time_ns`: skews add up; drifts multiply, so that it never stands."""
+    """Return the clock error of a vehicle at `time_ns`: skews add; drifts multiply, so the clock never stops."""
     acting = [planned for planned in faults if planned.acts_at(time_ns) and planned.nodes[number]]
     offset_ns = sum(p.fault.offset_ms * 1e6 for p in acting if isinstance(p.fault, Skew))
     drifts = [(p.start_ns, p.fault.rate_ppm / 1e6) for p in acting if isinstance(p.fault, Drift)]

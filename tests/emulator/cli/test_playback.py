@@ -135,6 +135,7 @@ def until(process: subprocess.Popen[str], beginning: str) -> None:
     assert any(line.startswith(beginning) for line in process.stdout), "it ended before"
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
     with playing(watched.folder, "--speed", "inf") as process:
         until(process, "played")
@@ -142,6 +143,7 @@ def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
         assert process.wait(30) == 0
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals) -> None:
     with playing(watched.folder, "--speed", "0.001", "--from", "0.5") as process:
