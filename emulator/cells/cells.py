@@ -1,8 +1,8 @@
 """The cells of an experiment: one run each, many at once, never the same one twice.
 
-A cell is a scenario and the labels of its place in a table. What is kept of a run is its metrics, period by period,
-and a few figures; the file of a finished cell bears the digest of its scenario and of the code, so that an
-experiment that was interrupted goes on where it stopped, and one whose scenario or program has changed runs anew.
+A cell is a scenario and its labels in a table. A run leaves its metrics, period by period, and a few figures. The
+file of a finished cell is named by the digest of its scenario and of the code: an experiment that was interrupted
+goes on where it stopped, and a cell whose scenario or program has changed runs again.
 """
 
 from __future__ import annotations
@@ -94,12 +94,12 @@ def read_states(cell: Cell, folder: Path) -> pa.Table:
 
 
 def has_result(cell: Cell, folder: Path) -> bool:
-    """Whether a cell has been simulated."""
+    """Return whether a cell has been simulated."""
     return _result_path(folder / "cells", cell).exists()
 
 
 def has_states(cell: Cell, folder: Path) -> bool:
-    """Whether a cell has been simulated, and its states kept."""
+    """Return whether a cell has been simulated and its states kept."""
     return _states_path(folder / "cells", cell).exists()
 
 
@@ -206,7 +206,7 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
 
 
 def _rms_columns(rows: list[list[float | None]]) -> list[float]:
-    """By column; none where vehicles move and the number of components changes."""
+    """Root mean square of each column; none where vehicles move and the number of components changes."""
     if len({len(row) for row in rows}) > 1:
         return []
     table = np.array([[np.nan if value is None else value for value in row] for row in rows], dtype=float)

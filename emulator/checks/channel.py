@@ -1,4 +1,4 @@
-"""Checks of the radio: every pair has one outcome, and the outcomes are those of range, cap and luck."""
+"""Checks of the radio: each reception has one outcome, and the outcomes fit range, cap and random draws."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.o
 
 
 def nothing_seen(name: str, recorded: RecordedRun, text: str) -> Finding:
-    """Nothing observed is unknown, unless there was nobody to observe it."""
+    """Return unknown, as nothing was observed; not applicable if no vehicle has another in range."""
     if not recorded.places.most_in_range:
         return NotExercised(name, "no vehicle has another in range")
     return unknown(name, text)
 
 
 def check_conservation(recorded: RecordedRun) -> Finding:
-    """Every frame has exactly one row, with exactly one outcome, for each receiver in range; so have its copies."""
+    """Check that each frame, and each copy, has one row with one outcome for each receiver in range."""
     name = "conservation"
     if not len(recorded.trace):
         return nothing_seen(name, recorded, "no frame was sent")
@@ -50,8 +50,8 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     return result(
         name,
         total,
-        f"{len(frames):,} frames, {len(recorded.trace):,} pairs in range, each with one outcome",
-        f"{total} frames or pairs without exactly one outcome",
+        f"{len(frames):,} frames, {len(recorded.trace):,} receptions in range, each with one outcome",
+        f"{total} frames or receptions without exactly one outcome",
         recorded.rows(offending),
         frames=len(frames),
         pairs=len(recorded.trace),
@@ -69,7 +69,7 @@ def _repeated(recorded: RecordedRun) -> Mask:
 
 
 def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
-    """Rows of frames that have not one for each in range; what is only received twice may have fewer."""
+    """Rows of frames without exactly one row for each receiver in range; duplicates may have fewer."""
     first, inverse, rows = np.unique(recorded.emission, return_index=True, return_inverse=True, return_counts=True)[
         1:
     ]
@@ -83,12 +83,12 @@ def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
 def _orphans(recorded: RecordedRun) -> Mask:
     """Copies that name no fault, or no original that was sent by then."""
     copies = recorded.copy > 0
-    frame, place = np.unique(recorded.frame, return_inverse=True)
+    frame, index = np.unique(recorded.frame, return_inverse=True)
     original_ns = np.full(len(frame), NEVER_NS)
-    np.minimum.at(original_ns, place[~copies], recorded.sent_ns[~copies])
+    np.minimum.at(original_ns, index[~copies], recorded.sent_ns[~copies])
     named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
-    return np.asarray(copies & (nameless | (original_ns[place] > recorded.sent_ns)))
+    return np.asarray(copies & (nameless | (original_ns[index] > recorded.sent_ns)))
 
 
 def _out_of_order(recorded: RecordedRun) -> Mask:
@@ -102,15 +102,15 @@ def _out_of_order(recorded: RecordedRun) -> Mask:
 
 
 def _mistimed(recorded: RecordedRun) -> Mask:
-    """What arrived has a time of arrival after its sending, and nothing else has one."""
+    """Rows whose arrival time is not after the sending time, is missing, or should not be there."""
     there = recorded.arrival_ns >= 0
     return np.asarray((there != recorded.arrived) | (there & (recorded.arrival_ns <= recorded.sent_ns)))
 
 
 def _missing_numbers(recorded: RecordedRun) -> int:
-    """How many numbers are missing below the last: of each sender's frames, and of each frame's copies.
+    """Count the numbers missing below the last one, of each sender's frames and of each frame's copies.
 
-    What a vehicle sends while nobody is near has no rows, so that its numbers may be missing.
+    Frames sent while no receiver is in range have no rows, so their numbers may be missing.
     """
     first = np.unique(recorded.emission, return_index=True)[1]
     originals = first[recorded.copy[first] == 0]
@@ -122,14 +122,14 @@ def _missing_numbers(recorded: RecordedRun) -> int:
         missing += int((np.diff(seqs) - 1)[~lonely].sum())
     copies = first[recorded.copy[first] > 0]
     copies = copies[~recorded.places.ever_lonely[recorded.sender[copies]]]
-    frame, place = np.unique(recorded.frame[copies], return_inverse=True)
+    frame, index = np.unique(recorded.frame[copies], return_inverse=True)
     last = np.zeros(len(frame), dtype=np.int64)
-    np.maximum.at(last, place, recorded.copy[copies])
+    np.maximum.at(last, index, recorded.copy[copies])
     return missing + int(last.sum()) - len(copies)
 
 
 def check_range(recorded: RecordedRun) -> Finding:
-    """Nothing reached a receiver out of range."""
+    """Check that nothing was delivered to a receiver out of range."""
     name = "range"
     delivered = recorded.outcome_is("delivered")
     if not delivered.any():
@@ -142,7 +142,7 @@ def check_range(recorded: RecordedRun) -> Finding:
 
 
 def check_peer_cap(recorded: RecordedRun) -> Finding:
-    """Each receiver hears its nearest `max_peers` live senders in range, and no other."""
+    """Check that each receiver hears its nearest `max_peers` live senders in range, and no other."""
     name = "peer_cap"
     cap = recorded.scenario.radio.max_peers
     largest = recorded.places.most_in_range
@@ -157,14 +157,14 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
     if not broken and not capped.any():
         text = f"the cap of {cap} never acted, though up to {largest} are in range: those beyond it sent nothing"
         return unknown(name, text, **figures)
-    text = f"{int(capped.sum()):,} pairs beyond the nearest {cap} (up to {largest} in range)"
+    text = f"{int(capped.sum()):,} receptions beyond the nearest {cap} (up to {largest} in range)"
     return result(
-        name, broken, text, f"{broken} pairs on the wrong side of the cap", recorded.rows(wrong), **figures
+        name, broken, text, f"{broken} receptions on the wrong side of the cap", recorded.rows(wrong), **figures
     )
 
 
 def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
-    # What was sent at the very instant of a death may have come before or after it: it is not judged.
+    # Frames sent at the instant of a death may have been sent before or after it: they are not judged.
     judged = capped | recorded.outcome_is("fault", *ON_AIR)
     judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns)
     everybody = np.arange(len(recorded.node_ids))
@@ -182,11 +182,11 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
 
 
 def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Mask:
-    """(N, N), rows are senders: whom each receiver's cap admits when these nodes (N,) are up."""
+    """Return the links (N, N), rows are senders, that the receivers' caps admit when these nodes (N,) are up."""
     index = int(recorded.places.index(np.array([time_ns]))[0])
     in_range = recorded.places.in_range(index) & up[:, None]
     distance_m: Array = np.where(in_range, recorded.places.distance_m(index), np.inf)
-    # The nearest first, of equally near ones those of lower number; who is out of range is last.
+    # Nearest first, equally near ones by number, those out of range last.
     nearest = np.argsort(distance_m, axis=0, kind="stable")[: recorded.scenario.radio.max_peers]
     admitted = np.zeros_like(in_range)
     np.put_along_axis(admitted, nearest, True, axis=0)
@@ -194,16 +194,16 @@ def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Mask:
 
 
 def check_loss_rate(recorded: RecordedRun) -> Finding:
-    """Among the pairs that no fault decided, the share of lost ones is in the binomial band of `radio.loss`."""
+    """Check that the share of lost receptions is in the binomial band of `radio.loss`."""
     name = "loss_rate"
     loss = recorded.scenario.radio.loss
     drawing = drew_for_loss(recorded)
     lost, drawn = int((drawing & recorded.outcome_is("lost")).sum()), int(drawing.sum())
     if drawn == 0:
-        return nothing_seen(name, recorded, "no pair came as far as the loss")
+        return nothing_seen(name, recorded, "no reception came as far as the loss")
     low, high = binomial_band(drawn, loss, LOSS_BAND)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": loss, "low": low, "high": high}
-    text = f"{lost:,} of {drawn:,} pairs lost, {lost / drawn:.2%}; {loss:.2%} expected"
+    text = f"{lost:,} of {drawn:,} receptions lost, {lost / drawn:.2%}; {loss:.2%} expected"
     wrong_way = recorded.outcome_is("lost") if lost > high else drawing & ~recorded.outcome_is("lost")
     outside = not low <= lost <= high
     rows = recorded.rows(wrong_way) if outside else []
@@ -211,17 +211,17 @@ def check_loss_rate(recorded: RecordedRun) -> Finding:
 
 
 def drew_for_loss(recorded: RecordedRun) -> Mask:
-    """Pairs that came as far as the radio's loss. What is received twice was drawn for once."""
+    """Return the receptions that came as far as the radio's loss; duplicates had one draw."""
     return np.asarray(recorded.outcome_is("lost", *ARRIVED) & ~received_twice(recorded))
 
 
 def received_twice(recorded: RecordedRun) -> Mask:
-    """Rows that are no transmission of their own: duplicates on the way to one receiver."""
+    """Return the rows that are no transmission of their own: duplicates of a reception."""
     return np.asarray(recorded.caused_by("duplicate") & (recorded.copy > 0))
 
 
 def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, float]:
-    """The least and the most of `drawn` that may happen."""
+    """Return the least and the most of `drawn` that are in the binomial band of this share."""
     if not 0 < probability < 1:
         return (probability * drawn,) * 2
     low, high = (int(edge) for edge in binom.interval(share, drawn, probability))
@@ -229,7 +229,7 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
 
 
 def check_isolation(recorded: RecordedRun) -> Finding:
-    """What arrives was sent, byte for byte, and programs received nothing that did not arrive."""
+    """Check that every arrival was sent, byte for byte, and that programs report no more than arrived."""
     name = "isolation"
     refused = sum(int(event.details.get("count", 0)) for event in recorded.event("refused_total"))
     arrived = int(recorded.arrived.sum())
@@ -240,18 +240,18 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     broken = int(foreign.sum()) + len(claims)
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
     text = f"{arrived:,} arrivals as they were sent"
-    text += f"; {reporting} programs report what they heard, and it is no more than that" if reporting else ""
-    broken_text = f"{int(foreign.sum())} arrivals of what nobody sent, {len(claims)} reports of more than arrived"
+    text += f"; {reporting} programs report no more received packets than that" if reporting else ""
+    broken_text = f"{int(foreign.sum())} arrivals that were never sent, {len(claims)} reports of more than arrived"
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
     return result(name, broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 
 
 def _foreign(recorded: RecordedRun) -> Mask:
-    """Arrivals with other bytes than their frame's, though no fault says that it changed them."""
+    """Arrivals with other bytes than their frame's that no fault changed."""
     differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded)
     replaced = _replaced(recorded)
     differs |= recorded.arrived & _not_of_that_age(recorded, replaced)
-    # What a vehicle handed over and a stale frame took the place of is in no row of its own.
+    # A frame that a stale one replaced is in no row of its own.
     differs &= ~(recorded.caused_by("DataReplay") & np.isin(recorded.frame, recorded.frame[replaced]))
     twice = np.flatnonzero(differs & received_twice(recorded))
     if len(twice):
@@ -263,17 +263,17 @@ def _foreign(recorded: RecordedRun) -> Mask:
 
 
 def changed_bytes(recorded: RecordedRun) -> Mask:
-    """Rows with other bytes than their frame's, so far as an original that nothing corrupted tells them."""
-    frame, place = np.unique(recorded.frame, return_inverse=True)
+    """Return the rows with other bytes than their frame's, as far as an uncorrupted original shows them."""
+    frame, index = np.unique(recorded.frame, return_inverse=True)
     plain = np.flatnonzero((recorded.copy == 0) & ~recorded.caused_by("corrupt"))[::-1]
     said = np.zeros(len(frame), dtype=np.uint64)
     known = np.zeros(len(frame), dtype=bool)
-    said[place[plain]], known[place[plain]] = recorded.digest[plain], True
-    return np.asarray(known[place] & (recorded.digest != said[place]))
+    said[index[plain]], known[index[plain]] = recorded.digest[plain], True
+    return np.asarray(known[index] & (recorded.digest != said[index]))
 
 
 def _replaced(recorded: RecordedRun) -> Mask:
-    """Originals that a stale frame may have taken the place of. (Where they were cut, they name the cut.)
+    """Originals that a stale frame may have replaced. (If a fault cut them, they name that fault.)
 
     A sender's frames are remembered from when a fault first makes it misbehave.
     """
@@ -291,7 +291,7 @@ def _replaced(recorded: RecordedRun) -> Mask:
 
 
 def _not_of_that_age(recorded: RecordedRun, replaced: Mask) -> Mask:
-    """Stale frames that are not what their sender sent so long ago, where that was not stale itself."""
+    """Stale frames that differ from the frame their sender sent that long ago, unless that was stale itself."""
     wrong = np.zeros(len(replaced), dtype=bool)
     sound = ~recorded.caused_by("corrupt")
     for planned in recorded.plan:
@@ -303,9 +303,9 @@ def _not_of_that_age(recorded: RecordedRun, replaced: Mask) -> Mask:
             own = own[np.lexsort((sound[own], recorded.seq[own], recorded.sent_ns[own]))]
             late = mine[recorded.sender[mine] == sender]
             before_ns = recorded.sent_ns[late] - round(planned.fault.age_s * NS_PER_S)
-            place = np.searchsorted(recorded.sent_ns[own], before_ns, side="right") - 1
-            old = own[np.maximum(place, 0)]
-            wrong[late] = (place < 0) | (
+            index = np.searchsorted(recorded.sent_ns[own], before_ns, side="right") - 1
+            old = own[np.maximum(index, 0)]
+            wrong[late] = (index < 0) | (
                 sound[old] & ~replaced[old] & (recorded.digest[late] != recorded.digest[old])
             )
     return wrong
@@ -316,7 +316,7 @@ def _what(recorded: RecordedRun) -> tuple[IntArray, ...]:
 
 
 def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
-    """Reports in which a program claims to have `heard`, all in all, more packets than had arrived by then."""
+    """Reports whose sum of `heard` packets is more than had arrived by then."""
     heard = recorded.value("heard")
     claimed = np.cumsum(np.nan_to_num(heard), axis=0)
     claims = []

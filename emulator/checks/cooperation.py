@@ -1,4 +1,4 @@
-"""Checks of what cooperating vehicles believe: they agree, they recover, and nobody is lost."""
+"""Checks of cooperating vehicles' estimates: they agree, they recover, and none diverges."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from vnet.units import NS_PER_S
 
 MEAN_TOLERANCE_M = 1.0
 AT_REST_S = 5.0
-"""How long after the start, or the last fault, the consensus has to settle."""
+"""Time after the start, or the last fault, that the consensus has to settle."""
 WITHIN_S = 10.0
 BACK_FACTOR, BACK_LEAST_M = 2.0, 0.3
 LEVEL_PERIODS = 20
 
 
 def honest(recorded: RecordedRun) -> Mask:
-    """(N,), the nodes that run the program of the scenario; what exceptions say of themselves is their affair."""
+    """Return the nodes (N,) that run the scenario's program; exceptions are not judged by their reports."""
     excepted = {node for exception in recorded.scenario.program.exceptions for node in exception.nodes}
     return np.array([node not in excepted for node in recorded.node_ids], dtype=bool)
 
 
 def ups(recorded: RecordedRun) -> Mask:
-    """(periods, N), who was up throughout a period."""
+    """Return the nodes that were up throughout each period (periods, N)."""
     up = np.ones((recorded.periods, len(recorded.node_ids)), dtype=bool)
     start_ns = recorded.period_starts_ns()
     for span in recorded.down:
@@ -39,7 +39,7 @@ def ups(recorded: RecordedRun) -> Mask:
 
 
 def _components(recorded: RecordedRun, among: Mask, time_ns: int) -> list[Mask]:
-    """The parts of the network in which all hear of each other, links in both directions, among some nodes (N,)."""
+    """The connected components by links in both directions among some nodes (N,), of two nodes or more."""
     linked = admitted_by_cap(recorded, among, time_ns)
     linked &= linked.T & among[:, None]
     count, label = connected_components(linked, directed=False)
@@ -48,7 +48,7 @@ def _components(recorded: RecordedRun, among: Mask, time_ns: int) -> list[Mask]:
 
 
 def check_consensus_mean(recorded: RecordedRun) -> Finding:
-    """At the end, every vehicle's mean is near the mean of what the vehicles of its component believe."""
+    """Check that at the end each vehicle's mean is near the mean of its component's estimates."""
     name = "consensus_mean"
     mean_m, common_m = recorded.vectors("mean_m"), recorded.vectors("common_error_estimate_m")
     if not np.isfinite(mean_m).any():
@@ -59,7 +59,9 @@ def check_consensus_mean(recorded: RecordedRun) -> Finding:
     off_m = _off_the_mean(recorded, mean_m, common_m)
     judged = int(np.isfinite(off_m).sum())
     if not judged:
-        return NotExercised(name, "no component of which all are honest, up and sure of a mean")
+        return NotExercised(
+            name, "no component in which all vehicles run the scenario's program, are up and report a mean"
+        )
     worst_m = float(np.nanmax(off_m))
     off = [
         {"node": recorded.node_ids[node], "off_m": float(off_m[node])}
@@ -74,7 +76,7 @@ def check_consensus_mean(recorded: RecordedRun) -> Finding:
 
 
 def _off_the_mean(recorded: RecordedRun, mean_m: Array, common_m: Array) -> Array:
-    """(N,), how far each vehicle's mean was off its component's over the last second; NaN where nobody can say."""
+    """Distance (N,) of each vehicle's mean from its component's over the last second; NaN where unknown."""
     last = slice(-max(1, NS_PER_S // recorded.scenario.period_ns), None)
     up: Mask = np.asarray(ups(recorded)[last].all(axis=0))
     known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
@@ -87,7 +89,7 @@ def _off_the_mean(recorded: RecordedRun, mean_m: Array, common_m: Array) -> Arra
 
 
 def check_convergence(recorded: RecordedRun) -> Finding:
-    """After every heal the vehicles agree again about as well as before the first fault, in time."""
+    """Check that after every heal the vehicles agree again in time, nearly as well as before the first fault."""
     name = "convergence"
     common_m = recorded.vectors("common_error_estimate_m")
     if not recorded.plan:
@@ -111,7 +113,7 @@ def check_convergence(recorded: RecordedRun) -> Finding:
             late.append({"heal_s": heal_ns / NS_PER_S, "until_s": until_ns / NS_PER_S, "deviation_m": best_m})
             cut += until_ns - heal_ns < round(WITHIN_S * NS_PER_S)
     if not late and not recoveries:
-        return NotExercised(name, "no fault was left to heal in peace")
+        return NotExercised(name, "no time without faults after a heal")
     figures = {"level_m": level_m if np.isfinite(level_m) else None, "limit_m": limit_m, "recovered_s": recoveries}
     text = f"agreement within {limit_m:.2f} m again, {max(recoveries, default=0):.1f} s after a fault at most"
     broken_text = f"no agreement within {limit_m:.2f} m after {len(late)} heals"
@@ -126,7 +128,7 @@ def _deviation(recorded: RecordedRun, common_m: Array) -> Array:
     up = ups(recorded)
     everybody = np.ones(len(recorded.node_ids), dtype=bool)
     period_ns = recorded.scenario.period_ns
-    # Where vehicles move, each period has components of its own, among those that are there.
+    # Where vehicles move, each period has its own components, among the vehicles in the network.
     pieces = [slice(k, k + 1) for k in range(len(common_m))] if recorded.moves else [slice(None)]
     for piece in pieces:
         among = up[piece.start] if recorded.moves else everybody
@@ -142,9 +144,9 @@ def _deviation(recorded: RecordedRun, common_m: Array) -> Array:
 
 
 def _rests(recorded: RecordedRun) -> Sequence[tuple[int, int]]:
-    """The times in which the network may recover: from when no fault acts, for so long as it should take.
+    """The times in which the network should recover: from the end of all faults, WITHIN_S long.
 
-    One that the next fault cuts short is left out.
+    A time that the next fault cuts short is not judged.
     """
     period_ns = recorded.scenario.period_ns
     end_ns = len(recorded.period_starts_ns()) * period_ns
@@ -159,7 +161,7 @@ def _rests(recorded: RecordedRun) -> Sequence[tuple[int, int]]:
 
 
 def check_bounded_error(recorded: RecordedRun) -> Finding:
-    """No vehicle that is up, and neither lies nor is lied to by its receiver, is lost (MODEL 6)."""
+    """Check that no vehicle diverges (MODEL 6) that is up, runs the scenario's program and has a good receiver."""
     name = "bounded_error"
     common_m = recorded.vectors("common_error_estimate_m")
     if not np.isfinite(common_m).any():
@@ -178,12 +180,12 @@ def check_bounded_error(recorded: RecordedRun) -> Finding:
 
 
 def _deceived(recorded: RecordedRun) -> Mask:
-    """(periods, N), whose receiver a fault bends, and for so long afterwards as a vehicle may take to recover."""
+    """Vehicles (periods, N) on whose receiver a fault acts, and for WITHIN_S afterwards."""
     deceived = np.zeros((recorded.periods, len(recorded.node_ids)), dtype=bool)
     for planned in recorded.plan:
         if isinstance(planned.fault, GnssFault):
             start_ns = recorded.period_starts_ns()
             when = (planned.start_ns <= start_ns) & (start_ns < planned.end_ns + round(WITHIN_S * NS_PER_S))
-            # Where it follows a region, whoever has been within it.
+            # Where it follows a region, every vehicle that has been within it.
             deceived |= when[:, None] & (np.logical_or.accumulate(recorded.struck(planned)) | planned.nodes)
     return deceived

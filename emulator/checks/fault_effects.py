@@ -47,7 +47,7 @@ def check_fault_effects(recorded: RecordedRun) -> Iterator[Finding]:
         elif planned.start_ns >= recorded.closed_ns:
             yield unknown(name, "the run ended before it began")
         elif isinstance(planned.fault, SenderFault) and _held_down(recorded, planned):
-            yield NotExercised(name, "other faults kept its vehicles from sending all the while")
+            yield NotExercised(name, "other faults kept its vehicles from sending throughout")
         else:
             yield effect(planned.fault, recorded, planned, name)
 
@@ -122,7 +122,7 @@ def _wrong_fixes(name: str, count: int) -> CheckResult:
 
 
 def _held_down(recorded: RecordedRun, planned: PlannedFault) -> bool:
-    """Whether each of a fault's nodes was down or stood still, by other faults, from its start to its end."""
+    """Return whether other faults kept each of a fault's nodes down or paused from its start to its end."""
     spans = [(span.node, span.start_ns, span.end_ns) for span in recorded.down if span.planned]
     for pause in recorded.plan:
         if isinstance(pause.fault, ProcessFault) and not pause.fault.ends:
@@ -148,7 +148,7 @@ def _delayed(recorded: RecordedRun, planned: PlannedFault) -> int:
 
 
 def _overflowed(recorded: RecordedRun, planned: PlannedFault) -> int:
-    """Pairs of frames for which a throttled queue was full, or that came to a shared medium too late."""
+    """Receptions of frames for which a throttled queue was full, or that reached a shared medium late."""
     full = recorded.outcome_is("queue_full")
     if recorded.shares_air:
         full |= _slowed(recorded, planned)
@@ -157,10 +157,10 @@ def _overflowed(recorded: RecordedRun, planned: PlannedFault) -> int:
 
 
 def _slowed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
-    """Which frames came to a shared medium later than the longest access delay explains.
+    """Frames that came to a shared medium later than the longest access delay explains.
 
-    Either by all that the throttle takes; or so long after everybody else that without it they would have been on
-    air by then, if no congestion control held them back.
+    Either by the whole time that the throttle takes; or so long after all other frames that without the throttle
+    they would have been on air by then, if no congestion control held them back.
     """
     radio, begin_ns = recorded.scenario.radio, recorded.on_air_ns
     assert isinstance(planned.fault, Throttle) and radio.mac is not None
@@ -177,7 +177,7 @@ def _slowed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
 
 
 def _silenced(recorded: RecordedRun, planned: PlannedFault) -> int:
-    """Nodes that sent or reported before, and not while the fault acted; or at which nobody was there to hear."""
+    """Count the nodes that sent or reported before but not during the fault, or that missed frames by it."""
     start_ns = recorded.period_starts_ns()
     end_ns = start_ns + recorded.scenario.period_ns
     before, during = end_ns <= planned.start_ns, (start_ns >= planned.start_ns) & (end_ns <= planned.end_ns)
@@ -218,7 +218,7 @@ def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault, name: str
 
 
 def _disturbed(recorded: RecordedRun) -> Mask:
-    """(N,), vehicles that stand still or start anew at some time, and send at other times for that reason."""
+    """Vehicles (N,) that are paused or restarted at some time, and send at other times for that reason."""
     disturbed = np.zeros(len(recorded.node_ids), dtype=bool)
     for planned in recorded.plan:
         if isinstance(planned.fault, ProcessFault):

@@ -40,7 +40,7 @@ def _pauses(fault: Fault) -> bool:
 
 
 def check_causes(recorded: RecordedRun) -> Finding:
-    """A row names a fault exactly where one acted that can do this, on this link and at this time."""
+    """Check that a row names a fault exactly where a fitting one acted, on this link and at this time."""
     name = "causes"
     if not recorded.plan:
         broken = recorded.outcome_is("fault") | (recorded.cause != NO_FAULT)
@@ -54,8 +54,8 @@ def check_causes(recorded: RecordedRun) -> Finding:
         broken = ~explained | (recorded.outcome_is("fault") & (recorded.cause == NO_FAULT))
         broken |= recorded.cause == UNHEARD_OF
     count, named = int(broken.sum()), int((recorded.cause != NO_FAULT).sum())
-    text = f"{named:,} pairs name a fault that acted on them"
-    broken_text = f"{count} pairs name no fault that acted on them"
+    text = f"{named:,} receptions name a fault that acted on them"
+    broken_text = f"{count} receptions name no fault that acted on them"
     return result(name, count, text, broken_text, recorded.rows(broken), named=named, wrong=count)
 
 
@@ -91,7 +91,7 @@ def _(fault: StaleMessages, recorded: RecordedRun) -> Mask:
 
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:
-    """Nothing that was sent across a cut (partition, block, range, swizzle) while it acted went on."""
+    """Check that nothing sent across a cut (partition, block, range, swizzle) passed it."""
     name = "partition_respected"
     cuts = begun(recorded, _cuts)
     if not cuts:
@@ -103,24 +103,24 @@ def check_partition_respected(recorded: RecordedRun) -> Finding:
         return unknown(name, "no frame was sent across a cut")
     passed = across & recorded.outcome_is(*ON_AIR)
     count = int(passed.sum())
-    text = f"{int(across.sum()):,} pairs across a cut, and nothing passed"
-    broken_text = f"{count} of {int(across.sum()):,} pairs passed a cut"
+    text = f"{int(across.sum()):,} receptions across a cut, and none passed"
+    broken_text = f"{count} of {int(across.sum()):,} receptions passed a cut"
     return result(name, count, text, broken_text, recorded.rows(passed), across=int(across.sum()), passed=count)
 
 
 def check_down_respected(recorded: RecordedRun) -> Finding:
-    """A node that is down is silent and deaf: no frame, no report, and what arrives is `receiver_down`."""
+    """Check that a node that is down neither sends, reports nor receives: arrivals there are `receiver_down`."""
     name = "down_respected"
     if not recorded.down:
         return NotExercised(name, "no node was down" if recorded.plan else NO_FAULTS)
     sure = ~recorded.is_unsure(recorded.sent_ns)
     speaking = sure & recorded.is_down(recorded.sender, recorded.sent_ns)
     judged = recorded.arrived & ~recorded.is_unsure(recorded.arrival_ns)
-    if recorded.closed_ns < recorded.scenario.duration_ns:  # what was in flight then was decided at once
+    if recorded.closed_ns < recorded.scenario.duration_ns:  # frames in flight were decided at once
         judged &= recorded.arrival_ns < recorded.closed_ns
-    deaf = recorded.is_down(recorded.receiver, recorded.arrival_ns)
-    hearing = judged & deaf & recorded.outcome_is("delivered")
-    missing = judged & ~deaf & recorded.outcome_is("receiver_down")
+    receiver_down = recorded.is_down(recorded.receiver, recorded.arrival_ns)
+    hearing = judged & receiver_down & recorded.outcome_is("delivered")
+    missing = judged & ~receiver_down & recorded.outcome_is("receiver_down")
     # A node may report and end by itself at one instant; a fault acts before anything else does.
     spans = [(span.node, span.start_ns + (not span.planned), span.end_ns) for span in recorded.down]
     reports = _reports_within(recorded, spans)
@@ -130,8 +130,8 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
     return result(
         name,
         broken,
-        f"{len({span.node for span in recorded.down})} nodes were down, and silent and deaf",
-        f"{broken} frames, arrivals or reports do not fit who was down",
+        f"{len({span.node for span in recorded.down})} nodes were down, and neither sent nor received",
+        f"{broken} frames, arrivals or reports contradict the nodes' being up or down",
         recorded.rows(wrong) + reports,
         **figures,
         reports=len(reports),
@@ -139,7 +139,7 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
 
 
 def check_pause_respected(recorded: RecordedRun) -> Finding:
-    """A node that stands still sends nothing and reports nothing."""
+    """Check that a paused node sends nothing and reports nothing."""
     name = "pause_respected"
     pauses = begun(recorded, _pauses)
     if not pauses:
@@ -152,8 +152,8 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
         spans += [(node, planned.start_ns, planned.end_ns) for node in np.flatnonzero(planned.nodes).tolist()]
     reports = _reports_within(recorded, spans)
     broken = int(speaking.sum()) + len(reports)
-    broken_text = f"{int(speaking.sum())} frames and {len(reports)} reports of nodes that stood still"
-    text = f"{len({span[0] for span in spans})} nodes stood still and were silent"
+    broken_text = f"{int(speaking.sum())} frames and {len(reports)} reports of paused nodes"
+    text = f"{len({span[0] for span in spans})} nodes were paused, and sent and reported nothing"
     rows = recorded.rows(speaking) + reports
     return result(name, broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
 
@@ -174,7 +174,7 @@ def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]
 
 
 def check_outage_respected(recorded: RecordedRun) -> Finding:
-    """A receiver has no fix exactly while an outage acts on it."""
+    """Check that a receiver has no fix exactly while an outage acts on it."""
     name = "outage_respected"
     outages = begun(recorded, lambda fault: isinstance(fault, GnssOutage))
     there = np.isfinite(recorded.vectors("position_m")[..., 0])
@@ -195,7 +195,7 @@ def check_outage_respected(recorded: RecordedRun) -> Finding:
 
 
 def check_fault_loss(recorded: RecordedRun) -> Iterator[Finding]:
-    """Each fault that loses pairs by chance does so at its rate."""
+    """Yield for each fault that loses receptions by chance whether it does so at its rate."""
     for planned in begun(recorded, _loses):
         yield _loss_of(recorded, planned)
 
@@ -206,17 +206,17 @@ def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
     drawing = _drew_for(recorded, planned)
     drawn, lost = int(drawing.sum()), int((hit & drawing).sum())
     if not drawn:
-        return unknown(name, "no pair came as far as this fault", pairs=0)
+        return unknown(name, "no reception came as far as this fault", pairs=0)
     expected, low, high = loss_band(planned.fault, recorded, planned, drawing)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": expected, "low": low, "high": high}
-    text = f"{lost:,} of {drawn:,} pairs lost, {lost / drawn:.2%}; {expected:.2%} expected"
+    text = f"{lost:,} of {drawn:,} receptions lost, {lost / drawn:.2%}; {expected:.2%} expected"
     outside = not low <= lost <= high
     rows = recorded.rows(drawing & (hit if lost > high else ~hit)) if outside else []
     return result(name, int(outside), text, f"{text}: outside its band", rows, **figures)
 
 
 def _drew_for(recorded: RecordedRun, planned: PlannedFault) -> Mask:
-    """Pairs that came as far as a fault of chance: cut by none, and lost to none of those before it."""
+    """Receptions that came as far as a fault of chance: not cut, and not lost to an earlier one."""
     reached = recorded.reached(planned, -recorded.guard_ns) & ~received_twice(recorded)
     later = [other.number for other in begun(recorded, _loses) if other.number >= planned.number]
     further = recorded.outcome_is(*ON_AIR) | (recorded.outcome_is("fault") & np.isin(recorded.cause, later))
@@ -252,14 +252,14 @@ def _(fault: BurstLoss, recorded: RecordedRun, planned: PlannedFault, drawing: M
 
 
 def _steps(recorded: RecordedRun, planned: PlannedFault) -> Array:
-    """How many frames each row's sender had sent since a fault began, the row's included."""
+    """Number of frames that each row's sender had sent since a fault began, the row's included."""
     while_acting = recorded.acting(planned, recorded.sent_ns, recorded.guard_ns) & ~received_twice(recorded)
     first = np.flatnonzero(while_acting)[np.unique(recorded.emission[while_acting], return_index=True)[1]]
     first = first[np.lexsort((recorded.emission[first], recorded.sent_ns[first], recorded.sender[first]))]
     sender = recorded.sender[first]
-    place = np.arange(len(first)) - np.searchsorted(sender, sender) + 1
+    index = np.arange(len(first)) - np.searchsorted(sender, sender) + 1
     order = np.argsort(recorded.emission[first])
     steps = np.zeros(len(recorded.trace))
     where = np.searchsorted(recorded.emission[first][order], recorded.emission[while_acting])
-    steps[while_acting] = place[order][where]
+    steps[while_acting] = index[order][where]
     return steps

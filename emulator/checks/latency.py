@@ -1,4 +1,4 @@
-"""The latency law: what may pass between sending and arrival, by the radio, the queue and the faults that delay."""
+"""The bounds on latency: from the radio, the sender's queue, and the faults that delay."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS
 
 BAND_SIGMAS = 4.9
-"""One mean in a million is further off."""
+"""Half-width of the band of a mean, in standard deviations: one sound mean in a million is further off."""
 ROUNDING_NS = 2
 NO_EPISODE = -1
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """For each row: the earliest and latest arrival, the airtime, and whether its frame surely waited for no other.
+    """Bounds of each row: the earliest and latest arrival, the airtime, and whether its frame waited for no other.
 
     Times in nanoseconds; `latest_ns` supposes that every access delay was the longest.
     """
@@ -37,7 +37,7 @@ class Bounds:
 
 
 def bounds(recorded: RecordedRun, without: PlannedFault | None = None) -> Bounds:
-    """When each row's frame may have arrived, if it arrived at all; as if `without` one of the faults."""
+    """Return the bounds on the arrival of each row's frame, if it arrived; as if `without` one of the faults."""
     radio = recorded.scenario.radio
     plan = [planned for planned in recorded.plan if planned is not without]
     start_ns, end_ns, airtime_ns, alone = _queue(recorded, plan)
@@ -89,23 +89,23 @@ def _courses(
     start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
     episode = _episodes(recorded, plan, sender, sent_ns)
     who, plain, slow, within = -1, (0.0, 0.0), (0.0, 0.0), NO_EPISODE
-    for place, (node, time_ns, number) in enumerate(
+    for index, (node, time_ns, number) in enumerate(
         zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), strict=True)
     ):
-        usual, fast, slowest, offered = airtime_ns[place].tolist()
+        usual, fast, slowest, offered = airtime_ns[index].tolist()
         if node != who:
             who, plain, within = node, (0.0, 0.0), NO_EPISODE
-        waits[place] = number != NO_EPISODE or plain[1] > time_ns
+        waits[index] = number != NO_EPISODE or plain[1] > time_ns
         if number == NO_EPISODE:
-            start[place], end[place] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + usual
-            plain = start[place] + usual, end[place]
+            start[index], end[index] = max(time_ns, plain[0]), max(time_ns + delay_ns, plain[1]) + usual
+            plain = start[index] + usual, end[index]
         else:
             slow = slow if number == within else plain
-            start[place], end[place] = max(time_ns, slow[0]), max(time_ns + delay_ns, slow[1]) + slowest
-            slow = start[place] + fast, end[place]
+            start[index], end[index] = max(time_ns, slow[0]), max(time_ns + delay_ns, slow[1]) + slowest
+            slow = start[index] + fast, end[index]
             plain = plain[0], max(time_ns + delay_ns, plain[1]) + offered
             if fast == usual < slowest:  # in real time: perhaps not throttled yet, or no longer
-                start[place], end[place] = max(time_ns, plain[0]), max(end[place], plain[1])
+                start[index], end[index] = max(time_ns, plain[0]), max(end[index], plain[1])
         within = number
     return start, end, waits
 
@@ -140,7 +140,7 @@ def _bitrates(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, A
 
 
 def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array]:
-    """What faults add to the latency of each row: at least, and at most."""
+    """Latency that faults add to each row in ns: at least, and at most."""
     least, most = np.zeros(len(recorded.trace)), np.zeros(len(recorded.trace))
     guard_ns = recorded.guard_ns
     for planned in plan:
@@ -157,7 +157,7 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
 
 
 def check_latency(recorded: RecordedRun) -> Finding:
-    """What arrives does so after its airtime and latency, and no later than queue, jitter and faults explain."""
+    """Check that arrivals are neither earlier nor later than airtime, latency, queue, jitter and faults explain."""
     name = "latency"
     timed = recorded.arrived & (recorded.arrival_ns >= 0)
     if not timed.any():
@@ -172,7 +172,7 @@ def check_latency(recorded: RecordedRun) -> Finding:
     off = bool(mean) and abs(mean["mean_ms"] - mean["expected_ms"]) > mean["band_ms"]
     text = f"{int(timed.sum()):,} arrivals within their bounds"
     if mean:
-        text += f"; mean {mean['mean_ms']:.3f} ms where nothing queues, {mean['expected_ms']:.3f} ms expected"
+        text += f"; mean {mean['mean_ms']:.3f} ms without queueing, {mean['expected_ms']:.3f} ms expected"
     broken_text = (
         f"{figures['early']} too early, {figures['late']} too late" if broken else f"{text}: outside its band"
     )

@@ -1,4 +1,4 @@
-"""Checks of a physical radio: frames fade as often as they should, and the medium is shared by its rules."""
+"""Checks of a physical radio: frames fade as often as predicted, and the medium is shared by its rules."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from emulator.scenario.scenario import Radio
 from vnet.types import Array, IntArray, Mask
 
 SIGMAS = 4.9
-"""One sum in a million is further off."""
+"""Half-width of bands in standard deviations: one sound sum in a million is further off."""
 CERTAIN = 1e-6
 TELLING_VARIANCE = 5.0
-"""Of how many faded on a link: with less, a sum is not yet normal."""
+"""Least variance of the number of faded receptions on a link: with less, a sum is not yet normal."""
 GRID_DB = 0.25
 FACTORS = 1024
 NEVER_SENT = decided_at(Stage.SENDER)
@@ -38,28 +38,28 @@ ROUNDING = 1e-6
 
 
 def check_fading(recorded: RecordedRun) -> Finding:
-    """Of the pairs that came as far as the receiver, so many faded as path loss, fading and noise make expect."""
+    """Check that as many receptions faded as path loss, fading and noise predict."""
     name = "fading"
     radio = recorded.scenario.radio
     if not radio.is_physical:
         return NotExercised(name, "unit-disc radio: no fading")
     drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
-        return nothing_seen(name, recorded, "no pair came as far as the receiver")
+        return nothing_seen(name, recorded, "no reception came as far as the receiver")
     survives = _survival(recorded, radio, drawing)
     faded = recorded.outcome_is("faded")[drawing]
     expected, seen = float((1 - survives).sum()), int(faded.sum())
     away = SIGMAS * sqrt(float((survives * (1 - survives)).sum())) + (log(1e6) / 3 if expected > 0 else 0)
     broken = not expected - away <= seen <= expected + away
     share, law = seen / len(drawing), expected / len(drawing)
-    text = f"{seen:,} of {len(drawing):,} pairs faded, {share:.2%}; {law:.2%} expected"
+    text = f"{seen:,} of {len(drawing):,} receptions faded, {share:.2%}; {law:.2%} expected"
     figures: dict[str, Any] = {"faded": seen, "pairs": len(drawing), "rate": share, "expected": law}
     unlike, figures["links"] = _unlike_their_law(recorded, drawing, survives, faded)
     broken_text = f"{text}: outside its band" if broken else f"{text}, but not on the links on which they should"
     rows = drawing[faded == (seen > expected)]
     if radio.fading is None and (impossible := np.where(faded, survives >= 1, survives <= 0)).any():
         rows, unlike = drawing[impossible], True
-        broken_text = f"{len(rows)} pairs did what cannot be"
+        broken_text = f"{len(rows)} receptions have an impossible outcome"
         figures["impossible"] = len(rows)
     return result(name, broken + unlike, text, broken_text, recorded.rows(rows), **figures)
 
@@ -67,7 +67,7 @@ def check_fading(recorded: RecordedRun) -> Finding:
 def _unlike_their_law(
     recorded: RecordedRun, rows: NDArray[np.intp], survives: Array, faded: Mask
 ) -> tuple[bool, int]:
-    """Whether the links all in all differ from what is expected of each, by χ²; and how many say anything."""
+    """Return whether the links together differ from their expectations by χ², and how many links count."""
     link = recorded.sender[rows] * len(recorded.node_ids) + recorded.receiver[rows]
     variance, differs = np.bincount(link, survives * (1 - survives)), np.bincount(link, faded - (1 - survives))
     telling = variance >= TELLING_VARIANCE
@@ -76,7 +76,7 @@ def _unlike_their_law(
 
 
 def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Array:
-    """(n,) the probabilities with which pairs arrive if nobody else sends."""
+    """Return the probabilities (n,) that receptions arrive if no other vehicle sends."""
     sender, receiver, sent_ns = recorded.sender[rows], recorded.receiver[rows], recorded.sent_ns[rows]
     power_mw = recorded.places.pair_powers_mw(sender, receiver, sent_ns)
     shape = np.zeros(len(rows), np.intp)
@@ -156,21 +156,22 @@ class _Air:
         return other[order], np.searchsorted(one[order], np.arange(len(self.rows) + 1))
 
     def met(self, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Pairs of a place in `rows` of the trace and a transmission that overlapped that row's."""
+        """Return pairs of an index into `rows` of the trace and a transmission that overlapped that row's."""
         other, starts = self._overlaps
         emission = self.recorded.emission
         by_emission = np.argsort(emission[self.rows])
         mine = by_emission[np.searchsorted(emission[self.rows], emission[rows], sorter=by_emission)]
         count = starts[mine + 1] - starts[mine]
-        place = np.repeat(np.arange(len(rows)), count)
-        nth = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
-        return place, other[np.repeat(starts[mine], count) + nth]
+        index = np.repeat(np.arange(len(rows)), count)
+        nth = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
+        return index, other[np.repeat(starts[mine], count) + nth]
 
 
 def check_medium(recorded: RecordedRun) -> Finding:
-    """Senders share the air by the rules: nobody sends twice at once, without a pause, or into what it senses.
+    """Check that senders share the medium by its rules.
 
-    What collided met another transmission that its receiver could hear, and nobody hears while it sends.
+    No vehicle sends twice at once, without a pause, or while it senses another transmission. A collided frame met
+    another transmission that its receiver could hear, and no vehicle receives while it sends.
     """
     name = "medium"
     if not recorded.shares_air:
@@ -189,14 +190,14 @@ def check_medium(recorded: RecordedRun) -> Finding:
     counts["too_idle"] = _too_idle(air)
     total = sum(counts.values())
     collided = int(recorded.outcome_is("collided").sum())
-    text = f"{len(air.rows):,} transmissions by the rules of access, {collided:,} pairs collided"
+    text = f"{len(air.rows):,} transmissions by the rules of the MAC, {collided:,} receptions collided"
     broken_text = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
     rows = recorded.rows(np.concatenate(list(broken.values())))
     return result(name, total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)
 
 
 def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:
-    """Rows that were on air before they were sent, or faster than a throttle lets them, or though given up."""
+    """Rows that were on air before they were sent, sooner than a throttle allows, or though discarded."""
     began = recorded.on_air_ns >= 0
     end_ns = np.where(began, recorded.on_air_ns + recorded.airtime_ns, recorded.sent_ns)
     left_ns = recorded.column("left_ns")
@@ -233,7 +234,7 @@ def _without_pause(air: _Air) -> NDArray[np.intp]:
 def _into_others(air: _Air) -> NDArray[np.intp]:
     """Transmissions that begin while their sender senses another one, or before it has waited long enough.
 
-    Fading differs from frame to frame: with it nobody can say what a sender sensed.
+    Fading differs from frame to frame: with it, what a sender sensed is not known.
     """
     recorded, radio = air.recorded, air.recorded.scenario.radio
     if radio.fading is not None:
@@ -249,13 +250,13 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
 
 
 def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
-    """Which of these rows of the trace met a transmission that their receiver could hear, or its own."""
+    """Return the mask of these rows that met a transmission that their receiver could hear, or its own."""
     recorded = air.recorded
-    place, other = air.met(rows)
-    receiver = recorded.receiver[rows][place]
+    index, other = air.met(rows)
+    receiver = recorded.receiver[rows][index]
     heard = recorded.places.pairs_in_range(air.sender[other], receiver, recorded.sent_ns[air.rows[other]])
     heard |= air.sender[other] == receiver
-    return np.asarray(np.bincount(place, weights=heard, minlength=len(rows)) > 0)
+    return np.asarray(np.bincount(index, weights=heard, minlength=len(rows)) > 0)
 
 
 def _collided_alone(air: _Air) -> NDArray[np.intp]:
@@ -266,13 +267,13 @@ def _collided_alone(air: _Air) -> NDArray[np.intp]:
 def _heard_while_sending(air: _Air) -> NDArray[np.intp]:
     recorded = air.recorded
     rows = np.flatnonzero(recorded.arrived & ~received_twice(recorded))
-    place, other = air.met(rows)
-    itself = air.sender[other] == recorded.receiver[rows][place]
-    return np.asarray(rows[np.unique(place[itself])])
+    index, other = air.met(rows)
+    itself = air.sender[other] == recorded.receiver[rows][index]
+    return np.asarray(rows[np.unique(index[itself])])
 
 
 def _too_idle(air: _Air) -> int:
-    """How many busy ratios are less than what their own vehicle sent."""
+    """Count the channel busy ratios that are less than the vehicle's own transmissions."""
     ratio = air.recorded.busy_ratio
     sent_ns = np.zeros(ratio.shape)
     for shift in range(int((air.end_ns - air.begin_ns).max(initial=0)) // WINDOW_NS + 2):

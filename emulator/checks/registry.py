@@ -85,7 +85,7 @@ class Check:
 
     @property
     def per_fault(self) -> bool:
-        """Whether there is a finding for each fault."""
+        """True if there is a finding for each fault."""
         return self.name.endswith(":LABEL")
 
     def findings(self, recorded: RecordedRun) -> Iterator[Finding]:

@@ -45,39 +45,39 @@ def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
 def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
     """Compare tables (name, first, second) of two runs; the first difference is shown."""
     for name, first, second in tables:
-        place = first_difference(first, second)
-        if place is not None:
-            return _difference(name, first, second, place)
+        index = first_difference(first, second)
+        if index is not None:
+            return _difference(name, first, second, index)
     text = f"two runs agree: {len(tables[0][1]):,} rows of the trace, all states and metrics"
     return result("replay", 0, text, "", rows_each=len(tables[0][1]))
 
 
-def _difference(name: str, first: pa.Table, second: pa.Table, place: int) -> Finding:
-    ours, theirs = _row(first, place), _row(second, place)
+def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> Finding:
+    ours, theirs = _row(first, index), _row(second, index)
     differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
     how = ", ".join(differing) if ours and theirs else "one has no such row"
     shown = [
-        {"run": run, "row": place, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
+        {"run": run, "row": index, **{key: _shown(row[key]) for key in row if key in ABOUT or key in differing}}
         for run, row in (("first", ours), ("again", theirs))
     ]
-    text = f"two runs differ, first in row {place} of the {name}: {how}"
-    return result("replay", 1, "", text, shown, table=name, row=place, differing=differing)
+    text = f"two runs differ, first in row {index} of the {name}: {how}"
+    return result("replay", 1, "", text, shown, table=name, row=index, differing=differing)
 
 
 def first_difference(first: pa.Table, second: pa.Table) -> int | None:
     """The number of the first row in which two tables differ, or None."""
     shared = min(len(first), len(second))
-    place = None if len(first) == len(second) else shared
+    index = None if len(first) == len(second) else shared
     for name in first.column_names:
         ours, theirs = first[name].slice(0, shared), second[name].slice(0, shared)
         if not ours.equals(theirs):
             differing = _first(ours, theirs)
-            place = differing if place is None or (differing is not None and differing < place) else place
-    return place
+            index = differing if index is None or (differing is not None and differing < index) else index
+    return index
 
 
 def _first(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
-    """The first place where two columns differ; NaN is like NaN."""
+    """Return the index of the first row in which two columns differ; NaN equals NaN."""
     if pa.types.is_integer(ours.type) and not ours.null_count and not theirs.null_count:
         differing = np.flatnonzero(ours.to_numpy() != theirs.to_numpy())
         return int(differing[0]) if len(differing) else None
@@ -85,8 +85,8 @@ def _first(ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> int | None:
     return next((number for number, (a, b) in enumerate(pairs) if a != b and str(a) != str(b)), None)
 
 
-def _row(table: pa.Table, place: int) -> dict[str, Any]:
-    return dict(table.slice(place, 1).to_pylist()[0]) if place < len(table) else {}
+def _row(table: pa.Table, index: int) -> dict[str, Any]:
+    return dict(table.slice(index, 1).to_pylist()[0]) if index < len(table) else {}
 
 
 def _shown(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Checks of the course of a run: everybody lived and reported, and the machine kept up."""
+"""Checks of the run itself: all processes lived and reported, and the machine kept up."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from vnet.units import NS_PER_S
 LATE_SHARE_LIMIT = 0.001
 LIVENESS_NS = NS_PER_S
 START_UP_NS = 5 * NS_PER_S
-"""In real time, how long a process that is started anew may take until its program reports."""
+"""Time that a restarted process may take, in real time, until its program reports."""
 MEMORY_SPAN_S, MEMORY_SAMPLES = 15.0, 9
 MEMORY_FACTOR = 1.05
 
 
 def check_transport(recorded: RecordedRun) -> Finding:
-    """No message between agents and emulator went missing."""
+    """Check that no message between agents and emulator went missing."""
     name = "transport"
     gaps = sum(int(event.details.get("count", 1)) for event in recorded.event("transport_gap"))
     lost = recorded.outcome_is("transport")
@@ -35,7 +35,7 @@ def check_transport(recorded: RecordedRun) -> Finding:
 
 
 def check_agents_alive(recorded: RecordedRun) -> Finding:
-    """No process died and no program crashed, but for those that a fault ended."""
+    """Check that no process died and no program crashed, except those that a fault ended."""
     name = "agents_alive"
     gone = [event for event in recorded.event("died", "crashed") if not _was_killed(recorded, event)]
     if not gone and not recorded.event("started"):
@@ -52,7 +52,7 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
 
 
 def _was_killed(recorded: RecordedRun, event: Event) -> bool:
-    """Whether a process that died was meant to."""
+    """Return whether a fault ended the process that died."""
     if event.kind != "died" or event.node not in recorded.number:
         return False
     node = recorded.number_of(event.node)
@@ -61,7 +61,7 @@ def _was_killed(recorded: RecordedRun, event: Event) -> bool:
 
 
 def check_progress(recorded: RecordedRun) -> Finding:
-    """The run came to its end: nobody span, nobody hung, nobody interrupted it."""
+    """Check that the run reached its end: no busy loop, no hang, no interruption."""
     name = "progress"
     if spun := recorded.event("spun"):
         event = spun[0]
@@ -84,7 +84,7 @@ def check_progress(recorded: RecordedRun) -> Finding:
 
 
 def check_finite(recorded: RecordedRun) -> Finding:
-    """No report holds a number that is none."""
+    """Check that no report holds NaN or infinity."""
     name = "finite"
     if not len(recorded.metrics):
         return NotExercised(name, "no period was completed")
@@ -100,10 +100,10 @@ def check_finite(recorded: RecordedRun) -> Finding:
 
 
 def check_kept_up(recorded: RecordedRun) -> Finding:
-    """Real time: the machine delivered on time."""
+    """Check that in real time the machine delivered on time."""
     name = "kept_up"
     if recorded.scenario.run.pacing != "realtime":
-        return NotExercised(name, "in lockstep nothing can be late")
+        return NotExercised(name, "lockstep: nothing can be late")
     late = recorded.event("late_deliveries")
     if not late or not late[-1].details["total"]:
         return unknown(name, "no delivery was timed")
@@ -114,7 +114,7 @@ def check_kept_up(recorded: RecordedRun) -> Finding:
 
 
 def check_liveness(recorded: RecordedRun) -> Finding:
-    """Once no fault acts any more, every node that is up reports at least once a second."""
+    """Check that after the last fault every node that is up reports at least once a second."""
     name = "liveness"
     if not recorded.reported.any():
         return NotExercised(name, "the program reports nothing")
@@ -152,7 +152,7 @@ def _where(silent: list[dict[str, Any]]) -> str:
 
 
 def _expected_to_report(recorded: RecordedRun, window: int) -> Mask:
-    """Nodes that show that they report once a second, and those that a fault took whose program does elsewhere."""
+    """Nodes that report once a second at some time, and nodes taken by a fault whose program does elsewhere."""
     able = np.zeros(len(recorded.node_ids), dtype=bool)
     for node in range(len(able)):
         periods = np.flatnonzero(recorded.reported[:, node])
@@ -167,7 +167,7 @@ def _expected_to_report(recorded: RecordedRun, window: int) -> Mask:
 
 
 def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
-    """From when until when a node is up, each time; in real time not before its process has had time to start."""
+    """Spans [from, until) in which a node is up; in real time they begin once its process had time to start."""
     start_up_ns = START_UP_NS if recorded.scenario.run.pacing == "realtime" else 0
     times, from_ns = [], 0
     for span in sorted((span for span in recorded.down if span.node == node), key=lambda span: span.start_ns):
@@ -178,14 +178,14 @@ def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
 
 
 def check_presence(recorded: RecordedRun) -> Finding:
-    """Vehicles enter and leave when their trips say so."""
+    """Check that vehicles enter and leave when their trips do."""
     name = "presence"
     if not recorded.moves:
         return NotExercised(name, "vehicles stand where they are")
     there = recorded.places.present()
     changes = _changes(recorded, there)
     if not changes and not recorded.event("entered", "left"):
-        return NotExercised(name, "all vehicles are there from the beginning to the end")
+        return NotExercised(name, "all vehicles are in the network throughout")
     known_ns = len(there) * recorded.scenario.period_ns  # of what came later no states are kept
     events = [event for event in recorded.event("entered", "left") if event.time_ns < known_ns]
     told = {(event.kind, str(event.node), event.time_ns) for event in events}
@@ -195,16 +195,16 @@ def check_presence(recorded: RecordedRun) -> Finding:
     rows = [{"what": what, "node": node, "time_ns": t, "event": "missing"} for what, node, t in missing]
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
     entered = sum(kind == "entered" for kind, _, _ in changes)
-    text = f"vehicles entered {entered} times and left {len(changes) - entered} times, as their trips say"
+    text = f"vehicles entered ({entered}) and left ({len(changes) - entered}) as their trips do"
     return result(name, len(rows), text, f"{len(rows)} events do not fit the trips", rows, changes=len(changes))
 
 
 Change = tuple[str, str, int]
-"""What happened (entered, left), to whom, and when in ns."""
+"""The kind of event (entered, left), the vehicle, and the time in ns."""
 
 
 def _changes(recorded: RecordedRun, there: Mask) -> list[Change]:
-    """Who enters and leaves when, as the true positions have it."""
+    """Vehicles that enter and leave, by the true positions."""
     period, node = np.nonzero(there[1:] != there[:-1])
     kinds = np.where(there[1:][period, node], "entered", "left").tolist()
     times_ns = ((period + 1) * recorded.scenario.period_ns).tolist()
@@ -213,7 +213,7 @@ def _changes(recorded: RecordedRun, there: Mask) -> list[Change]:
 
 
 def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
-    """Whether an event tells of a change, or need not: of whom an event has not told that it is there."""
+    """Return whether an event reports a change, or none is needed: the vehicle's entry was not reported either."""
     kind, node, time_ns = change
     if change in told:
         return True
@@ -230,7 +230,7 @@ def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
 
 
 def _may_come_late(recorded: RecordedRun, one: Change, there: Mask) -> bool:
-    """Whether a vehicle may enter at an instant at which it has been there for some time.
+    """Return whether a vehicle may enter later than its trip does.
 
     In real time its process has to start first, and one that a fault has taken waits until it ends.
     """
@@ -241,7 +241,7 @@ def _may_come_late(recorded: RecordedRun, one: Change, there: Mask) -> bool:
 
 
 def check_memory(recorded: RecordedRun) -> Finding:
-    """No agent's process holds hardly more in the last third of its life than in the second.
+    """Check that no agent's process holds much more memory in the last third of its life than in the second.
 
     Judged by the events `memory` {node, time_s, rss_kb}, a series each from the start of a process to its end; the
     emulator's own grows with the trace that it keeps, and is not judged.

@@ -1,4 +1,4 @@
-"""Checks of what faults do within a vehicle: the copies that misbehaving senders send, and receivers' fixes."""
+"""Checks of faults within a vehicle: the copies of misbehaving senders, and the fixes of GNSS receivers."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from vnet.units import NS_PER_S
 Rows = NDArray[np.intp]
 
 CERTAIN = 1e-6
-"""How unlikely sums of sound fixes are."""
+"""Probability below which a sum of fixes is not that of a receiver without faults."""
 
 
 def check_copies(recorded: RecordedRun) -> Finding:
-    """Floods and Sybils send each frame as often as they should, and what is replayed is as old as it should be."""
+    """Check that floods and Sybils send each frame as often as configured, and replays one of the right age."""
     name = "copies"
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
         return NotExercised(name, "no fault sends frames again" if recorded.plan else NO_FAULTS)
@@ -36,14 +36,14 @@ def check_copies(recorded: RecordedRun) -> Finding:
     again, often = np.unique(recorded.frame[copies[at_once]], return_counts=True)
     counted = np.zeros(len(originals), dtype=np.int64)
     order = np.argsort(recorded.frame[originals])
-    place = np.searchsorted(recorded.frame[originals][order], again)
-    counted[order[place]] = often
+    index = np.searchsorted(recorded.frame[originals][order], again)
+    counted[order[index]] = often
     wrong = originals[counted != _due(recorded, originals)]
-    # What is replayed may have been sent near a change.
+    # Replayed frames may have been sent near a change.
     odd = _replayed_wrongly(recorded, copies[~at_once], _first_rows(recorded, once & (recorded.copy == 0)))
     broken = len(wrong) + len(odd)
-    text = f"{len(copies):,} frames sent again, as often and as late as they should be"
-    broken_text = f"{len(wrong)} frames not sent as often as they should be, {len(odd)} replayed at another time"
+    text = f"{len(copies):,} frames sent again, as often and as late as configured"
+    broken_text = f"{len(wrong)} frames not sent as often as configured, {len(odd)} replayed at another time"
     rows = recorded.rows(np.concatenate([wrong, np.array(odd, dtype=np.intp)])) if broken else []
     return result(name, broken, text, broken_text, rows, copies=len(copies), miscounted=len(wrong), odd=len(odd))
 
@@ -53,7 +53,7 @@ def _of(recorded: RecordedRun, rows: Rows) -> list[tuple[int, int]]:
 
 
 def _near_a_change(recorded: RecordedRun) -> Mask:
-    """In real time nobody can say whether these rows' frames were sent before or after a fault began or ended."""
+    """Rows sent, in real time, too close to a fault's start or end to tell which came first."""
     near = np.zeros(len(recorded.trace), dtype=bool)
     for planned in recorded.plan:
         for edge_ns in (planned.start_ns, planned.end_ns):
@@ -62,7 +62,7 @@ def _near_a_change(recorded: RecordedRun) -> Mask:
 
 
 def _due(recorded: RecordedRun, rows: Rows) -> IntArray:
-    """How many times faults send each of these frames again at once."""
+    """Number of times that faults send each of these frames again at once."""
     due = np.zeros(len(rows), dtype=np.int64)
     for planned in recorded.plan:
         acts = planned.nodes[recorded.sender[rows]] & recorded.acting(planned, recorded.sent_ns[rows])
@@ -81,7 +81,7 @@ def _first_rows(recorded: RecordedRun, wanted: NDArray[np.bool_]) -> Rows:
 
 
 def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> list[int]:
-    """Late copies that are not of the last frame that was old enough for a replay that acted on its sender."""
+    """Late copies that are not of the last frame old enough for a replay that acted on the sender."""
     frame_ns = dict(_of(recorded, originals))
     sent_ns = {
         sender: np.sort(recorded.sent_ns[originals[recorded.sender[originals] == sender]])
@@ -98,14 +98,14 @@ def _replayed_wrongly(recorded: RecordedRun, late: Rows, originals: Rows) -> lis
 
 
 def _last_before(sent_ns: IntArray, time_ns: int, planned: PlannedFault) -> int | None:
-    """When the last frame was sent that is as old as a replay wants it."""
+    """Time at which the last frame was sent that is old enough for a replay, in ns."""
     assert isinstance(planned.fault, DataReplay)
-    place = int(np.searchsorted(sent_ns, time_ns - round(planned.fault.age_s * NS_PER_S), side="right"))
-    return int(sent_ns[place - 1]) if place else None
+    index = int(np.searchsorted(sent_ns, time_ns - round(planned.fault.age_s * NS_PER_S), side="right"))
+    return int(sent_ns[index - 1]) if index else None
 
 
 def check_gnss(recorded: RecordedRun) -> Finding:
-    """What fixes have beyond truth, common error, and what faults add to them, is receiver noise."""
+    """Check that fixes differ from truth, common error and the offsets of faults by receiver noise."""
     name = "gnss"
     sigma_m = recorded.scenario.world.gnss.sigma_m
     error_m = recorded.vectors("fix_m") - recorded.vectors("position_m") - recorded.vectors("common_error_m")
@@ -124,16 +124,16 @@ def check_gnss(recorded: RecordedRun) -> Finding:
     groups = {label: group & usable for label, group in groups.items()}
     judged = {label: error_m[group] for label, group in groups.items() if group.any()}
     if not judged:
-        return unknown(name, "no fix is known to be what a receiver gives")
+        return unknown(name, "no fix is free of faults with random effect")
     rows = [_described(label, error) for label, error in judged.items() if not is_noise(error, sigma_m)]
     fixes = sum(map(len, judged.values()))
     text = f"{fixes:,} fixes have the noise of {sigma_m:g} m"
-    broken_text = f"fixes are not as they should be: {', '.join(row['under'] for row in rows)}"
+    broken_text = f"fixes do not have the receiver's noise: {', '.join(row['under'] for row in rows)}"
     return result(name, len(rows), text, broken_text, rows, fixes=fixes)
 
 
 def _displaced(recorded: RecordedRun, planned: PlannedFault) -> Array:
-    """What a fault adds to the fixes (periods, N, 2)."""
+    """Offset that a fault adds to the fixes (periods, N, 2)."""
     fault, start_ns = planned.fault, recorded.period_starts_ns()
     moved = np.zeros((len(start_ns), 2))
     if isinstance(fault, GnssFault) and fault.displacement_m(0) is not None:
@@ -142,7 +142,7 @@ def _displaced(recorded: RecordedRun, planned: PlannedFault) -> Array:
 
 
 def is_noise(error_m: Array, sigma_m: float) -> bool:
-    """Whether errors (n, 2) are independent, zero-mean and of this deviation, as far as sums tell."""
+    """Return whether errors (n, 2) are independent, zero-mean and of this deviation, judged by their sums."""
     if sigma_m == 0:
         return bool(np.abs(error_m).max() < 1e-6)
     squares, mean = float(np.sum(error_m**2)) / sigma_m**2, error_m.mean(axis=0) / sigma_m

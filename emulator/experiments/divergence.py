@@ -1,4 +1,4 @@
-"""Does the default profile ever lose its way? Many seeds on each network, and the worst of them (MODEL 6)."""
+"""Divergence of the default profile (MODEL 6): many seeds on each network, and the worst of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emulator.experiments.tables import MISSING, markdown_table
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
 
 LENGTH_S = 30.0
-"""A vehicle that goes astray does so at first, before anybody knows the common error."""
+"""Length of a run: a vehicle that diverges does so at first, before any vehicle knows the common error."""
 
 
 def divergence_cells(
@@ -31,7 +31,7 @@ def divergence_cells(
 
 
 def report(results: Sequence[Result]) -> str:
-    """How many vehicles diverged, and RMSE over the seeds, in Markdown."""
+    """Return the number of divergent vehicles and the RMSE over the seeds, in Markdown."""
     header = ["network", "runs", "emulated [s]", "counted from [s]", "divergent vehicles", "runs with any"]
     header += ["RMSE, median [m]", "95th percentile [m]", "worst [m]"]
     rows = [_row(select(results, network=network)) for network in unique(results, "network")]
@@ -46,7 +46,7 @@ def report(results: Sequence[Result]) -> str:
 
 
 def _summary(results: Sequence[Result]) -> str:
-    """How many runs had a divergent vehicle; where none, how many may have had one at most."""
+    """The number of runs with a divergent vehicle; if none, an upper bound on their share."""
     diverged = sum(row["divergent"] > 0 for row in results)
     text = f"{diverged} of {len(results)} runs had a vehicle that diverged"
     if diverged:

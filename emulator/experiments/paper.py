@@ -109,7 +109,7 @@ def write_crossing(path: Path) -> None:
 
 
 def counted_from(duration_s: float) -> float:
-    """From when on a run of the default profile counts: SETTLED_S, or two thirds of a short run."""
+    """Return the time from which a run of the default profile counts: SETTLED_S, or two thirds of a short run."""
     return min(SETTLED_S, duration_s * 2 / 3)
 
 

@@ -1,4 +1,4 @@
-"""What the experiments found, in Markdown: means over seeds ± standard errors, beside the paper's figures."""
+"""Reports of the experiments in Markdown: means over seeds ± standard errors, beside the paper's figures."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def _cost(rows: list[Result], _: list[Result]) -> str:
 
 
 def _wanted(results: Sequence[Result], networks: Sequence[str]) -> str:
-    """What is wanted of optimized weights, and whether it is so."""
+    """The requirements on optimized weights, and whether they are met."""
     names = [f"at most {LIMIT_RATIO} × the limit", "in each component", "no vehicle diverged"]
     names += [f"{a} not worse than {b}" for a, b in COMPARED]
     columns = []
@@ -218,7 +218,7 @@ def _yes(so: bool) -> str:
 
 
 def _not_worse(difference: float, error: float, seeds: int) -> str:
-    """Whether a difference of errors is not above zero by more than two standard errors; unknown of one seed."""
+    """Return whether a difference of errors is at most two standard errors above zero; unknown for one seed."""
     if seeds < 2:
         return "unknown" if seeds else "–"
     if difference > 2 * error:

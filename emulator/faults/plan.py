@@ -1,7 +1,7 @@
-"""The plan of a run's faults: which act at an instant, and when that changes next.
+"""The plan of a run's faults: those that act at an instant, and the next instant at which that changes.
 
-What acts is always worked out from the plan and the time, never by doing and undoing: so faults overlap, and end in
-any order, without leaving anything behind.
+The acting faults are always computed from the plan and the time, never by doing and undoing. So faults may overlap,
+and end in any order, without leaving anything behind.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from vnet.errors import ScenarioError
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
-NO_DURATION_NS = 0.1
-"""Less than an instant: a fault of this duration does not act."""
-Places = tuple[Mask, Mask | None]
+MIN_DURATION_NS = 0.1
+"""Duration in ns of a fault that was healed before it began: less than an instant, so that it does not act."""
+Selection = tuple[Mask, Mask | None]
+"""The nodes (N,) and the links (N, N) on which a fault acts."""
 
 
 @dataclass(frozen=True)
 class PlannedFault:
-    """A fault with its place in the plan, the instants [start, end) between which it acts, and where.
+    """A fault with its number in the plan, the time [start, end) in which it acts, and its nodes and links.
 
     `nodes` (N,) are those selected; `links` (N, N), rows are senders, those it acts on; None for faults of nodes.
-    `moving` tells both anew for each instant, where vehicles drive into a region and out of it.
+    `moving` selects both again at each instant, where vehicles drive into a region and out of it.
     """
 
     number: int
@@ -39,7 +40,7 @@ class PlannedFault:
     end_ns: int
     nodes: Mask
     links: Mask | None
-    moving: Callable[[int], Places] | None = None
+    moving: Callable[[int], Selection] | None = None
 
     @property
     def label(self) -> str:
@@ -47,15 +48,15 @@ class PlannedFault:
         return f"{self.fault.kind}-{self.number}"
 
     def acts_at(self, time_ns: int) -> bool:
-        """Whether it acts at this instant."""
+        """Return whether the fault acts at this instant."""
         return self.start_ns <= time_ns < self.end_ns
 
     def acts_between(self, start_ns: int, end_ns: int) -> bool:
-        """Whether it acts at any instant in [start, end)."""
+        """Return whether the fault acts at any instant in [start, end)."""
         return max(self.start_ns, start_ns) < min(self.end_ns, end_ns)
 
     def placed(self, time_ns: int) -> PlannedFault:
-        """The fault with those on whom it acts at this instant."""
+        """Return the fault with the nodes and links on which it acts at this instant."""
         if self.moving is None:
             return self
         nodes, links = self.moving(time_ns)
@@ -63,9 +64,9 @@ class PlannedFault:
 
 
 class FaultPlan:
-    """All faults of a run, those that have been and those to come. Raises ScenarioError if one does not fit.
+    """All faults of a run, past and future. Raises ScenarioError if one does not fit.
 
-    `nodes_at` tells where the nodes are in a period, if they move; else they are where `nodes` says.
+    `nodes_at` returns the nodes in a period, if they move; else they stay as in `nodes`.
     """
 
     def __init__(self, scenario: Scenario, nodes: Nodes, nodes_at: Callable[[int], Nodes] | None = None) -> None:
@@ -80,7 +81,7 @@ class FaultPlan:
             self.add(fault)
 
     def add(self, fault: Fault) -> PlannedFault:
-        """Plan one more fault; it is cut short where the network must be at rest. Raises ScenarioError."""
+        """Plan one more fault; it ends by the time the network must be at rest. Raises ScenarioError."""
         number = len(self.faults)
         start_ns = round(fault.at_s * NS_PER_S)
         if start_ns >= self._healed_ns:
@@ -89,10 +90,10 @@ class FaultPlan:
         end_ns = min(start_ns + round(fault.duration_s * NS_PER_S), self._healed_ns)
         moving = None
         try:
-            if self._nodes_at is None or not _chooses_by_place(fault):
-                nodes, links = _places(fault, self._nodes, stream(self._seed, number, "select"))
+            if self._nodes_at is None or not _selects_by_position(fault):
+                nodes, links = _selection(fault, self._nodes, stream(self._seed, number, "select"))
             else:
-                moving = _MovingPlaces(fault, self._nodes_at, self._period_ns, self._seed, number)
+                moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, number)
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
@@ -104,7 +105,7 @@ class FaultPlan:
         return planned
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
-        """Nodes of one process live, pause and die together."""
+        """Raise ScenarioError for a fault of some nodes of a process: they start, pause and die together."""
         if not isinstance(planned.fault, ProcessFault):
             return
         for start in range(0, len(planned.nodes), self._groups):
@@ -119,7 +120,7 @@ class FaultPlan:
                 )
 
     def heal(self, label: str, time_ns: int) -> PlannedFault:
-        """End a fault at `time_ns` at the latest; healing twice is harmless. Raises ScenarioError for no such."""
+        """End a fault at `time_ns` at the latest; healing twice is harmless. Raises ScenarioError if unknown."""
         for number, planned in enumerate(self.faults):
             if planned.label == label:
                 healed = replace(planned, end_ns=max(planned.start_ns, min(planned.end_ns, time_ns)))
@@ -130,11 +131,11 @@ class FaultPlan:
 
     @property
     def last_end_ns(self) -> int:
-        """By when all faults of the plan, as they are written, have healed."""
+        """Time at which all faults of the plan have healed, in ns."""
         return max((max(planned.end_ns, planned.start_ns + 1) for planned in self.faults), default=0)
 
     def next_change_ns(self, after_ns: int) -> int | None:
-        """When next, after this instant, a fault starts or ends, or may act on others than before."""
+        """Return the next instant at which a fault starts, ends, or may act on other nodes than before."""
         changes = [t for planned in self.faults for t in _changes(planned, self._seed) if t > after_ns]
         period_ns = (after_ns // self._period_ns + 1) * self._period_ns
         if any(planned.moving and planned.start_ns < period_ns < planned.end_ns for planned in self.faults):
@@ -142,30 +143,30 @@ class FaultPlan:
         return min(changes, default=None)
 
     def active(self, time_ns: int) -> list[PlannedFault]:
-        """Those that act at this instant, and on whom, in the order of their numbers."""
+        """Return the faults that act at this instant, with their nodes and links, by number."""
         return [planned.placed(time_ns) for planned in self.faults if planned.acts_at(time_ns)]
 
     def as_written(self) -> tuple[Fault, ...]:
-        """The faults as a scenario states them, with the times at which they began and ended."""
+        """Return the faults as a scenario states them, with their actual times."""
         return tuple(map(_as_written, self.faults))
 
 
 def _as_written(planned: PlannedFault) -> Fault:
-    lasting_ns = planned.end_ns - planned.start_ns or NO_DURATION_NS  # healed before it began: it keeps its number
+    lasting_ns = planned.end_ns - planned.start_ns or MIN_DURATION_NS  # healed before it began: it keeps its number
     update = {"at_s": planned.start_ns / NS_PER_S, "duration_s": lasting_ns / NS_PER_S}
     if isinstance(planned.fault, Swizzle):
         update["over_s"] = planned.fault.over_s or planned.fault.duration_s
     return planned.fault.model_copy(update=update)
 
 
-def _chooses_by_place(fault: Fault) -> bool:
-    """Whether it matters to a fault where nodes are."""
+def _selects_by_position(fault: Fault) -> bool:
+    """Return whether a selector of the fault depends on positions."""
     selectors = (getattr(fault, name, None) for name in ("nodes", "senders", "receivers"))
-    return any(selector is not None and selector.by_place for selector in selectors)
+    return any(selector is not None and selector.by_position for selector in selectors)
 
 
-class _MovingPlaces:
-    """On whom a fault acts at each instant; the last answer is kept, as all of a period ask for the same."""
+class _MovingSelection:
+    """The nodes and links of a fault at each instant; the last answer is kept, as it holds for a whole period."""
 
     def __init__(
         self, fault: Fault, nodes_at: Callable[[int], Nodes], period_ns: int, seed: int, number: int
@@ -175,17 +176,17 @@ class _MovingPlaces:
         self._period_ns = period_ns
         self._seed = seed
         self._number = number
-        self._last: tuple[int, Places] | None = None
+        self._last: tuple[int, Selection] | None = None
 
-    def __call__(self, time_ns: int) -> Places:
+    def __call__(self, time_ns: int) -> Selection:
         period = time_ns // self._period_ns
         if self._last is None or self._last[0] != period:
             rng = stream(self._seed, self._number, "select")
-            self._last = period, _places(self._fault, self._nodes_at(period), rng)
+            self._last = period, _selection(self._fault, self._nodes_at(period), rng)
         return self._last[1]
 
 
-def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Places:
+def _selection(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Selection:
     if isinstance(fault, Partition):
         severed = partitioned_links(fault, nodes, rng)
         return _ends(severed), severed
@@ -208,7 +209,7 @@ def stream(seed: int, number: int, what: str) -> np.random.Generator:
 
 
 def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, int]]:
-    """(node, cut off at, back at) of each node of a swizzle: off in the first half, back in the second."""
+    """Return (node, cut off at, back at) of each node of a swizzle: off in the first half, back in the second."""
     assert isinstance(planned.fault, Swizzle)
     chosen = np.flatnonzero(planned.nodes)
     rng = stream(seed, planned.number, "swizzle")
@@ -216,8 +217,8 @@ def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, i
     step_ns = half_ns // max(1, len(chosen))
     back = dict(zip(rng.permutation(chosen).tolist(), range(len(chosen)), strict=True))
     return [
-        (node, planned.start_ns + place * step_ns, planned.start_ns + half_ns + (back[node] + 1) * step_ns)
-        for place, node in enumerate(rng.permutation(chosen).tolist())
+        (node, planned.start_ns + index * step_ns, planned.start_ns + half_ns + (back[node] + 1) * step_ns)
+        for index, node in enumerate(rng.permutation(chosen).tolist())
     ]
 
 

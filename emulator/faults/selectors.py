@@ -1,4 +1,4 @@
-"""Which nodes and links a fault acts on, from where the vehicles are and the run's seed."""
+"""The nodes and links on which a fault acts, from the positions of the vehicles and the run's seed."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vnet.types import Array, Mask
 
 @dataclass(frozen=True)
 class Nodes:
-    """What selectors look at: ids, positions (N, 2) in metres, and how many others each has in range (N,).
+    """The input of selectors: ids, positions (N, 2) in metres, and the number of others in range (N,).
 
-    Of a vehicle that is not there the position is NaN, and the degree negative.
+    A vehicle that is not in the network has position NaN and a negative degree.
     """
 
     ids: Sequence[str]
@@ -26,7 +26,7 @@ class Nodes:
     degree: NDArray[np.intp]
 
     def numbers(self, ids: Sequence[str]) -> list[int]:
-        """The numbers of nodes. Raises ScenarioError for an id that no node has."""
+        """Return the numbers of nodes. Raises ScenarioError for an id that no node has."""
         for node in ids:
             if node not in self.ids:
                 raise ScenarioError(f"{node!r} is no vehicle of the network; they are {first_names(self.ids)}")
@@ -34,7 +34,7 @@ class Nodes:
 
 
 def select(selector: Selector, nodes: Nodes, rng: np.random.Generator) -> Mask:
-    """The nodes that `selector` means, as (N,); `rng` draws where it leaves a choice. Raises ScenarioError."""
+    """Return the selected nodes (N,); `rng` draws what the selector leaves open. Raises ScenarioError."""
     count = len(nodes.ids)
     chosen = np.zeros(count, dtype=bool)
     if selector.ids is not None:
@@ -56,7 +56,7 @@ def select(selector: Selector, nodes: Nodes, rng: np.random.Generator) -> Mask:
 
 
 def _inside(corner_m: Array, point_m: Array) -> Mask:
-    """Which points (N, 2) lie in a polygon (C, 2): a ray to the right crosses its sides an odd number of times."""
+    """Mask of the points (N, 2) in a polygon (C, 2): a ray to the right crosses an odd number of its sides."""
     odd = np.zeros(len(point_m), dtype=bool)
     x, y = point_m.T
     for (x1, y1), (x2, y2) in zip(corner_m, np.roll(corner_m, -1, axis=0), strict=True):
@@ -67,14 +67,14 @@ def _inside(corner_m: Array, point_m: Array) -> Mask:
 
 
 def links_of(fault: LinkFault, nodes: Nodes, rng: np.random.Generator) -> Mask:
-    """The links (N, N), rows are senders, that a fault of links acts on. Raises ScenarioError."""
+    """Return the links (N, N), rows are senders, on which a fault of links acts. Raises ScenarioError."""
     end = select(fault.nodes, nodes, rng)
     sender, receiver = select(fault.senders, nodes, rng), select(fault.receivers, nodes, rng)
     return (end[:, None] | end[None, :]) & sender[:, None] & receiver[None, :]
 
 
 def partitioned_links(fault: Partition, nodes: Nodes, rng: np.random.Generator) -> Mask:
-    """The links (N, N), rows are senders, that a partition cuts. Raises ScenarioError."""
+    """Return the links (N, N), rows are senders, that a partition cuts. Raises ScenarioError."""
     count = len(nodes.ids)
     if fault.groups == "ring":
         return _outside_majority(rng.permutation(count))
@@ -92,8 +92,8 @@ def partitioned_links(fault: Partition, nodes: Nodes, rng: np.random.Generator) 
 def _outside_majority(order: NDArray[np.int64]) -> Mask:
     """Links to nodes from those outside their majority: themselves and the nearest on a ring in this `order`."""
     count = len(order)
-    place = np.empty(count, dtype=int)
-    place[order] = np.arange(count)
-    ahead = (place[:, None] - place[None, :]) % count
+    index = np.empty(count, dtype=int)
+    index[order] = np.arange(count)
+    ahead = (index[:, None] - index[None, :]) % count
     others = count // 2  # of a majority, without the node itself: half of them on either side, or one more ahead
     return np.asarray((ahead > (others + 1) // 2) & (count - ahead > others // 2))

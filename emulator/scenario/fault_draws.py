@@ -1,4 +1,4 @@
-"""How a campaign draws a fault: the choices to be made, and the bounds of a parameter beside its declaration."""
+"""The drawing of faults in campaigns: a source of choices, and the bounds of a parameter."""
 
 from __future__ import annotations
 

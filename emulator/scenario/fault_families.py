@@ -51,8 +51,8 @@ class Selector(Section):
     """The nodes with this many others in range: least and most."""
 
     @property
-    def by_place(self) -> bool:
-        """Whether the choice depends on the positions of vehicles."""
+    def by_position(self) -> bool:
+        """True if the choice depends on the positions of vehicles."""
         return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
 
     @model_validator(mode="before")
@@ -79,7 +79,7 @@ class Fault(Section):
     """The classes of all kinds by their names."""
     chapter: ClassVar[str] = "The network"
     """The heading of the kind's family in docs/reference/faults.md."""
-    acts_on: ClassVar[str] = "the whole"
+    acts_on: ClassVar[str] = "the network"
     """What the reference page says that the kind acts on."""
     campaign_weight: ClassVar[int] = 1
     """How often campaigns draw the kind, relative to others."""
@@ -177,7 +177,7 @@ class ProcessFault(NodeFault):
 
     @classmethod
     def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
-        """Draw up to half of the processes: the nodes of one process share its fate."""
+        """Draw up to half of the processes: the nodes of one process start, pause and die together."""
         chosen = choose.subset(processes, half(len(processes)))
         return {"nodes": {"ids": [node for process in chosen for node in process]}}
 

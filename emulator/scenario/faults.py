@@ -55,7 +55,7 @@ class Kill(ProcessFault):
 
 
 class Restart(ProcessFault):
-    """As `kill`, but the programs are ended in order: their `finally` blocks run."""
+    """The programs are ended in order, so that their `finally` blocks run; else as `kill`."""
 
     ends: ClassVar[bool] = True
 
@@ -354,7 +354,7 @@ class RandomPos(GnssFault):
 
 
 class DataReplay(SenderFault):
-    """With each frame the nodes send an old one of their own again, one of those since the fault began."""
+    """The nodes send an old frame of their own with each new one, if there is one since the fault began."""
 
     kind: Literal["DataReplay"]
     age_s: Annotated[float, Drawn(1, 30, per=10)] = Field(1.0, gt=0, le=60)
@@ -362,7 +362,7 @@ class DataReplay(SenderFault):
 
 
 class StaleMessages(SenderFault):
-    """In place of each frame the nodes send an old one of their own, once there is one since the fault began."""
+    """The nodes send an old frame of their own instead of each new one, once there is one since the fault began."""
 
     kind: Literal["StaleMessages"]
     age_s: Annotated[float, Drawn(1, 30, per=10)] = Field(1.0, gt=0, le=60)

@@ -1,6 +1,6 @@
 """The sections of a physical radio: `[radio.path_loss]`, `shadowing`, `fading`, `receiver`, `mac`, `congestion`.
 
-Each is a stage of the channel, and left out it is no stage: without any of them the radio is the disc of
+Each section adds a stage to the channel: without any of them the radio is the disc of
 `radio.range_m`. docs/radio.md has the formulas and where the defaults come from.
 """
 
@@ -18,7 +18,7 @@ RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
 
 
 class _PathLoss(Section):
-    """What all path losses have."""
+    """The keys of every path loss."""
 
     tx_power_dbm: float = Field(20.0, ge=-100, le=100)
     """What all send with, antennas included."""
@@ -47,7 +47,7 @@ class LogDistance(_PathLoss):
 
 
 class DualSlope(_PathLoss):
-    """As `log_distance` up to `break_m`, and with `far_exponent` beyond it."""
+    """Path loss as `log_distance` up to `break_m`, and with `far_exponent` beyond it."""
 
     kind: Literal["dual_slope"]
     """This model."""
@@ -127,12 +127,12 @@ class Mac(Section):
 
 class EtsiReactive(Section):
     """The reactive table of ETSI TS 102 687. Each 100 ms a sender goes one state up or down, towards the one whose
-    busy ratio it has."""
+    channel busy ratio it has."""
 
     kind: Literal["etsi"]
     """This control."""
     busy: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.3, 0.4, 0.5, 0.65)
-    """The busy ratios at which the second state begins, the third, …"""
+    """The channel busy ratios at which the second state begins, the third, …"""
     pause_ms: tuple[Annotated[float, Field(ge=0, le=60_000)], ...] = (50.0, 100.0, 200.0, 250.0, 1000.0)
     """By state, the least time from one frame of a sender to the next."""
     waiting: int = Field(1, ge=1, le=1_000_000)
@@ -158,7 +158,7 @@ class Limeric(Section):
     beta: float = Field(0.0012, gt=0, lt=1)
     """How fast the share follows."""
     target: float = Field(0.68, gt=0, lt=1)
-    """The busy ratio that is aimed at."""
+    """Target channel busy ratio."""
     most_up: float = Field(0.0005, gt=0, lt=1)
     """The share grows by no more at a time because the medium is free."""
     most_down: float = Field(0.00025, gt=0, lt=1)

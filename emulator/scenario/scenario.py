@@ -40,22 +40,22 @@ NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then
 
 
 class Run(Section):
-    """`[run]`: what the run is called, how long it takes and how patient it is."""
+    """`[run]`: name, length and time limits of the run."""
 
     name: str = Field("run", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
     """Names the run's folder, and its keys on Zenoh."""
     seed: int = Field(1, ge=0, lt=2**63)
-    """All that is drawn in the run comes from it: the same seed, the same run."""
+    """Seed of all random draws: the same seed, the same run."""
     duration_s: float = Field(30.0, gt=0, le=DAY_S)
     """Length of the run, in emulated time."""
     settle_s: float = Field(5.0, ge=0, le=DAY_S)
-    """All faults have healed so long before the end (emulated time), so that the network is judged at rest."""
+    """Time without faults before the end (emulated time), so that the network is judged at rest."""
     pacing: Literal["lockstep", "realtime"] = "lockstep"
     """`lockstep` is virtual time, `realtime` the wall clock."""
     nodes_per_process: int = Field(1, ge=1, le=1000)
-    """How many vehicles share an agent process; they start, pause and die together."""
+    """Vehicles that share an agent process; they start, pause and die together."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
-    """How long the emulator waits for its agents to join, or to come back after a fault (wall clock)."""
+    """Time for agents to join, or to come back after a fault (wall clock)."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
     """A process that does not yield for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
@@ -99,7 +99,7 @@ class Network(Section):
 
     @property
     def moves(self) -> bool:
-        """Whether vehicles drive, enter and leave."""
+        """True if vehicles drive, enter and leave."""
         return self.kind in ("trips", "sumo", "city")
 
     @model_validator(mode="after")
@@ -216,7 +216,7 @@ class Radio(Section):
 
     @property
     def is_physical(self) -> bool:
-        """Whether signals have a power, and frames the air time of 802.11p."""
+        """True if signals have a power, and frames the airtime of 802.11p."""
         return self.path_loss is not None or self.mac is not None
 
     @model_validator(mode="after")
@@ -271,14 +271,14 @@ class ProgramException(OneProgram):
     """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
 
     nodes: tuple[str, ...] = Field(min_length=1)
-    """Their ids."""
+    """Ids of the vehicles."""
 
 
 class Program(OneProgram):
-    """`[program]`: what every vehicle runs, but for the `exceptions`."""
+    """`[program]`: the program of every vehicle, except the `exceptions`."""
 
     exceptions: tuple[ProgramException, ...] = ()
-    """Those that run something else."""
+    """Vehicles that run another program."""
 
     @model_validator(mode="after")
     def _one_program_a_node(self) -> Program:
@@ -288,7 +288,7 @@ class Program(OneProgram):
         return self
 
     def of(self, node: str) -> OneProgram:
-        """What `node` runs."""
+        """Return the program of `node`."""
         return next((exception for exception in self.exceptions if node in exception.nodes), self)
 
 
@@ -323,7 +323,7 @@ class Scenario(Section):
 
     @property
     def healed_s(self) -> float:
-        """When all faults have healed, in emulated seconds."""
+        """Time at which all faults have healed, in emulated seconds."""
         return self.run.duration_s - self.run.settle_s
 
     @property
@@ -369,7 +369,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
 
 
 def _instead(path: Path) -> str:
-    """What may have been meant by a path that is no file."""
+    """Return a hint at the file that may have been meant by a path."""
     try:
         inside = sorted(each.name for each in path.glob("*.toml"))
         if inside:

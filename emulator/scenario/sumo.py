@@ -1,4 +1,4 @@
-"""What a SUMO configuration (`.sumocfg`) says of itself: its input files, and when it begins."""
+"""The input files and the start time of a SUMO configuration (`.sumocfg`)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def read_begin_s(path: Path) -> float:
 
 
 def _values(path: Path) -> dict[str, str]:
-    """Each option's value in a configuration; output files are left out."""
+    """Return each option's value in a configuration, without output files."""
     values: dict[str, str] = {}
     sections: list[str] = []
     parser = expat.ParserCreate()

@@ -56,7 +56,7 @@ def check_plain(value: Any, key: str = "", depth: int = 0) -> None:
 
 
 def _problem(value: Any) -> str:
-    """What is wrong with a value that is no table or array, or nothing."""
+    """Return the problem of a value that is no table or array; None if it has none."""
     if isinstance(value, bool):
         return ""
     if isinstance(value, int):

@@ -1,7 +1,7 @@
-"""A campaign: many runs of one scenario under random faults; whatever fails is shrunk and kept.
+"""A campaign: many runs of one scenario under random faults; failures are shrunk and kept.
 
-Run number i has the seed of the campaign plus i: it draws the network (of a generated one), the run and the
-schedule, so that a failure is had again by its seed alone. No failure stops a campaign; Ctrl-C keeps what is there.
+Run number i has the seed of the campaign plus i. The seed draws the network (if it is generated), the run and the
+schedule, so that it alone reproduces a failure. No failure stops a campaign; Ctrl-C keeps all finished runs.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be run. `shrink_steps` bounds the runs that shrink a failure, `limit_s` each one's wall clock."""
+    """The runs of a campaign. `shrink_steps` bounds the runs that shrink a failure, `limit_s` each run's time."""
 
     scenario: Scenario
     runs: int
@@ -124,7 +124,7 @@ class Outcome:
         return schedule_toml((self.shrunk or self.scenario).fault)
 
     def texts(self) -> dict[str, str]:
-        """What the failed checks say, of the shrunk run if there is one."""
+        """Return the texts of the failed checks, of the shrunk run if there is one."""
         trial = self.again if self.again is not None and self.again.failed else self.trial
         texts = {name: trial.texts[name] for name in trial.failed}
         if self.again is not None and self.again.verdicts and not self.again.failed:
@@ -169,7 +169,7 @@ def _lines(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
 
 
 class Campaign:
-    """The course of a campaign. `folder` is its own, and new."""
+    """A campaign as it runs, in a new folder of its own."""
 
     def __init__(self, plan: Plan, folder: Path, progress: Progress) -> None:
         self._plan = plan
@@ -208,7 +208,7 @@ class Campaign:
             self.write()
 
     def _take_left(self, futures: Sequence[Future[Outcome]]) -> None:
-        """What was over, or given up half shrunk, when the campaign was interrupted."""
+        """Take the runs that were over, or half shrunk, when the campaign was interrupted."""
         taken = {outcome.seed for outcome in self.outcomes}
         for future in futures:
             if future.cancelled() or future.exception() is not None:
@@ -248,7 +248,7 @@ class Campaign:
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
 
     def write(self) -> None:
-        """campaign.json and campaign.html, of what is there."""
+        """Write campaign.json and campaign.html of the runs so far."""
         rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.seed)]
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
         write_atomically(self._folder / "campaign.json", json.dumps(head | {"results": rows}, indent=1) + "\n")
@@ -312,7 +312,7 @@ def _interrupted_once() -> Iterator[None]:
 
 
 def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
-    """Run a campaign, and say what came of it; returns the exit status. Raises VnetError.
+    """Run a campaign, print its result and return the exit status. Raises VnetError.
 
     0 if no run failed, 1 if one did, 130 if it was interrupted.
     """

@@ -16,10 +16,10 @@ T = TypeVar("T")
 
 
 class _Drawn:
-    """A Chooser whose choices hypothesis makes, and shrinks.
+    """A Chooser whose choices hypothesis draws and shrinks.
 
-    Whatever there are several of is drawn number first (and not with `st.lists`): hypothesis then learns to leave
-    out any of them, however large.
+    Whatever there are several of is drawn number first (and not with `st.lists`): hypothesis then learns to drop
+    any of them, however large.
     """
 
     def __init__(self, draw: st.DrawFn) -> None:

@@ -1,4 +1,4 @@
-"""What cooperating vehicles believe is judged: the lost, means that are none, agreement that does not return."""
+"""Checks of estimates: divergent vehicles, means that are none, agreement that does not return."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -81,7 +81,7 @@ def not_valid(recorded: RecordedRun) -> dict[str, Verdict]:
 
 
 def shifted(recorded: RecordedRun, seconds: float) -> RecordedRun:
-    """The same files, as if its fault had been planned at another time."""
+    """Return the same files, as if their fault had been planned at another time."""
     first = recorded.scenario.fault[0]
     moved = first.model_copy(update={"at_s": first.at_s + seconds})
     return replace(recorded, scenario=recorded.scenario.model_copy(update={"fault": (moved,)}))

@@ -142,7 +142,7 @@ def test_too_much_fading_is_seen(faded: RecordedRun) -> None:
 
 
 def test_another_law_than_the_scenarios_is_seen(faded: RecordedRun) -> None:
-    """The same trace, but a scenario in which senders are 2 dB stronger, or in which nothing is in the way."""
+    """Judge the same trace by a scenario in which senders are 2 dB stronger, or in which nothing is in the way."""
     for update in ({"path_loss": {**LOG_DISTANCE, "tx_power_dbm": 35.0}}, {"shadowing": None}):
         data = faded.scenario.model_dump()
         data["radio"] = {**data["radio"], **update}

@@ -23,7 +23,7 @@ from vnet.node import Node
 
 
 async def throws_dice(node: Node) -> None:
-    """From the third fix on, one vehicle says what no seed decides."""
+    """Send random bytes that no seed decides, from one vehicle and the third fix on."""
     async for fix in node.gnss:
         dice = node.id == "v02" and fix.time_ns >= 300_000_000
         await node.radio.broadcast(os.urandom(8) if dice else b"nothing")
