@@ -13,6 +13,7 @@ import typer
 
 from emulator.cli.access import access
 from emulator.cli.check import check
+from emulator.cli.conformance import conformance
 from emulator.cli.experiment import app as experiment_app
 from emulator.cli.export import export, radio
 from emulator.cli.fault import app as fault_app
@@ -41,7 +42,7 @@ COMMANDS = {
     Panel.AFTER: (check, report, view, render, play, compare, radio, export),
     Panel.LIVE: (status,),
     Panel.STUDIES: (analyze, campaign),
-    Panel.APART: (access, record),
+    Panel.APART: (access, record, conformance),
 }
 GROUPS = {
     "fault": (Panel.LIVE, fault_app),

@@ -39,6 +39,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
 from emulator.drivers.router import SeparateRouter
+from emulator.drivers.signals import signals_ignored
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
@@ -221,8 +222,10 @@ def _run_live(
             progress.state(first_of_all)
         if sinks is not None and sinks.serve is not None:
             progress.state(sinks.serve.announcement())
-        wall_s, interrupted = asyncio.run(run_live(emulation, options, progress.state, on_missing=progress.awaits))
-        _finish(emulation, progress, wall_s, interrupted, "run", asked)
+        with signals_ignored():  # a second Ctrl-C must not lose the records
+            running = run_live(emulation, options, progress.state, on_missing=progress.awaits)
+            wall_s, interrupted = asyncio.run(running)
+            _finish(emulation, progress, wall_s, interrupted, "run", asked)
 
 
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:

@@ -6,7 +6,6 @@ scenarios are what others wrote.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,8 +16,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from emulator.pages.palette import PAGE, PALETTE
 from emulator.pages.text import as_text, cell
+from emulator.records.atomic import write_atomically
 from emulator.records.verdicts import Verdict
-from vnet.errors import VnetError
 
 SIGNS = {Verdict.VALID: "✓", Verdict.INVALID: "✗", Verdict.UNKNOWN: "?"}
 """Signs of the verdicts, as colour alone says nothing to some."""
@@ -71,12 +70,6 @@ def table(rows: Sequence[Mapping[str, Any]], caption: str = "", decimals: int | 
 
 
 def put_page(path: Path, text: str) -> Path:
-    """Put a page in place in one step. Raises VnetError where the disk does not play along."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(text.encode("utf-8", "replace"))
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
+    """Put a page in place in one step. Raises VnetError where the disk refuses."""
+    write_atomically(path, text)
     return path

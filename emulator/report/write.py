@@ -22,12 +22,11 @@ from emulator.report.figures import draw
 from emulator.report.index import write_index
 from emulator.report.radio import radio_section
 from emulator.report.source import Source, maybe, why_not
-from vnet.errors import VnetError
+from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
 MOST_SCENARIO = 50_000
 """Characters of a scenario that are shown; one with a matrix of links may have millions."""
-MOST_NAMED = 8
 MOST_ROWS = 50
 """Rows of a check's figures that are shown."""
 MOST_TEXTS = 3
@@ -216,8 +215,7 @@ def _event(event: Event) -> dict[str, Any]:
 def _listed(value: Any) -> str:
     if not isinstance(value, list):
         return str(value)
-    more = f", … ({len(value)})" if len(value) > MOST_NAMED else ""
-    return ", ".join(map(str, value[:MOST_NAMED])) + more
+    return first_names(value, with_total=True)
 
 
 def _scenario(source: Source) -> dict[str, Any]:

@@ -8,16 +8,21 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from emulator.viewer.sinks import is_closed
+from tests.support.paths import ROOT
 from tests.support.processes import has_ended
 from tests.support.recordings import descendants, listening_addresses, read_back, rrd
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S, VNET
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
-LONG = {"run": {"duration_s": 60.0, "name": "watched"}, "program": {"entry": "agents.beacon:main"}}
+LONG: dict[str, dict[str, Any]] = {
+    "run": {"duration_s": 60.0, "name": "watched"},
+    "program": {"entry": "agents.beacon:main"},
+}
 
 
 def observer_of(folder: Path) -> int:

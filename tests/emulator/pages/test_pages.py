@@ -103,7 +103,10 @@ def test_as_text() -> None:
 
 
 def test_tables_drop_empty_columns_and_align_numbers() -> None:
-    rows = [{"name": "a", "none": None, "value": 1.25}, {"name": "b", "none": "", "value": None, "more": 3}]
+    rows: list[dict[str, object]] = [
+        {"name": "a", "none": None, "value": 1.25},
+        {"name": "b", "none": "", "value": None, "more": 3},
+    ]
     assert table(rows) == Table(
         "", ["name", "value", "more"], [False, True, True], [["a", "1.25", ""], ["b", "", "3"]]
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -123,11 +124,11 @@ def test_people_drive_on_their_side_of_the_road_and_park_there(tmp_path: Path, s
 
 
 def test_where_nobody_drives_it_is_said(city: Roads) -> None:
-    with pytest.raises(ScenarioError, match="the city: nobody drives there within 0 s"):
+    with pytest.raises(ScenarioError, match="the city: no vehicle is present within 0 s"):
         drives(city, vehicles=3, periods=1)
 
 
-def write_graph(path: Path, node_m: list[tuple[float, float]], edges: list[tuple[int, int]]) -> Roads:
+def write_graph(path: Path, node_m: Sequence[tuple[float, float]], edges: list[tuple[int, int]]) -> Roads:
     x, y = np.array(node_m).T
     np.savez(path, node_x_m=x, node_y_m=y, edges=np.array(edges))
     return read_roads(path)

@@ -154,13 +154,13 @@ HEADER = "id,time_s,x_m,y_m\n"
         (HEADER + "a,0,1,2\n,1,1,2\n", "row 3: id = ''"),
         (HEADER + "a,0,1,2\na b,1,1,2\n", "row 3: id = 'a b'"),
         (HEADER + "a,5,1,2\nb,0,1,2\na,4,1,2\n", "row 4: a: time_s = 4 after 5"),
-        (HEADER + "a,5,1,2\nb,0,1,2\na,5,1,3\n", "row 4: a is in two places at time_s = 5"),
-        (HEADER + "a,0,1,2\n", "no vehicle is there"),
+        (HEADER + "a,5,1,2\nb,0,1,2\na,5,1,3\n", "row 4: a has two positions at time_s = 5"),
+        (HEADER + "a,0,1,2\n", "no vehicle is present"),
         (HEADER + "a,0,-83.70,42.1\na,9,-83.71,42.2\nb,0,-83.72,42.2\nb,9,-83.7,42.3\n", "are these degrees?"),
         ("id,time_s,lat_deg,lon_deg\na,0,4682000,271000\n", "row 2: lat_deg = 4.682e+06"),
         (
             "id,time_s,lat_deg,lon_deg\na,0,-83.7,42.3\nb,0,42.3,-83.7\n",
-            "are latitudes and longitudes what they should be",
+            "check latitudes and longitudes",
         ),
         (HEADER + "a,0," + "1" * 5_000_000 + ",2\n", "not a CSV file of trips"),
         (b"\xff\xfe" * 50, "not a CSV file"),
@@ -176,7 +176,7 @@ def test_a_wrong_csv_file_is_refused_with_its_row(tmp_path: Path, text: str | by
     [
         (("<fcd-export", "<routes"), "line 2: element 'routes'"),
         (('time="1.00"', 'time="-1"'), "line 7: a: time_s = -1 after 0"),
-        (('time="1.00"', 'time="0"'), "line 7: a is in two places"),
+        (('time="1.00"', 'time="0"'), "line 7: a has two positions"),
         (('time="1.00"', 'time="soon"'), "line 6: time = 'soon'"),
         (('x="10.0"', 'x="nan"'), "line 7: x_m = nan"),
         ((' x="10.0"', ""), "line 7: no x"),
@@ -209,7 +209,7 @@ def test_a_wrong_matrix_is_refused_with_its_array(tmp_path: Path) -> None:
         ({"id": np.array(["a", "b/c"])}, "row 2: id = 'b/c'"),
         ({"x_m": np.full((2, 3), np.nan), "y_m": np.full((2, 3), np.nan)}, "no samples"),
     ):
-        arrays = {name: value for name, value in {**good, **change}.items() if value is not None}
+        arrays: dict[str, Any] = {name: value for name, value in {**good, **change}.items() if value is not None}
         np.savez(path, **arrays)
         assert named in refusal(path), change
     pickled = np.array([[{"a": 1}]], dtype=object)

@@ -3,12 +3,13 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from emulator.world.trips.clean import Rules, clean
-from emulator.world.trips.motion import Frame, Motion, motion_of
+from emulator.world.trips.motion import Motion, Selection, motion_of
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 
@@ -16,7 +17,9 @@ RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0)
 TENTH_NS = 100_000_000
 
 
-def trip(time_s: object, x_m: object, y_m: object = 0.0, name: str = "a", **known: np.ndarray) -> Trip:
+def trip(
+    time_s: npt.ArrayLike, x_m: npt.ArrayLike, y_m: npt.ArrayLike = 0.0, name: str = "a", **known: np.ndarray
+) -> Trip:
     time = np.asarray(time_s, dtype=float)
     position_m = np.column_stack([np.broadcast_to(x_m, time.shape), np.broadcast_to(y_m, time.shape)])
     return Trip(name, time, position_m.astype(float), **known)
@@ -24,7 +27,7 @@ def trip(time_s: object, x_m: object, y_m: object = 0.0, name: str = "a", **know
 
 def drive(*trips: Trip, seconds: float = 10.0, start_s: float = 0.0, **frame: object) -> Motion:
     periods = round(seconds * 10) + 1
-    return motion_of(list(trips), Frame(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
+    return motion_of(list(trips), Selection(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
 
 
 def x_of(course: Motion, vehicle: int = 0) -> np.ndarray:
@@ -108,7 +111,7 @@ def test_a_jump_too_far_for_the_longest_gap_is_leaving_and_entering() -> None:
 
 def test_what_is_mostly_jumps_is_no_trip() -> None:
     rng = np.random.default_rng(1)
-    with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: wrong units"):
+    with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: check units"):
         drive(trip(np.arange(100) / 10, rng.uniform(0, 1e4, 100)))
 
 
@@ -118,7 +121,9 @@ def test_what_is_mostly_jumps_is_no_trip() -> None:
     st.floats(5, 100),
     st.floats(0.5, 20),
 )
-def test_what_is_believed_has_no_jump_and_no_gap(steps: list, fastest_mps: float, gap_s: float) -> None:
+def test_what_is_believed_has_no_jump_and_no_gap(
+    steps: list[tuple[float, float]], fastest_mps: float, gap_s: float
+) -> None:
     rules = Rules(fastest_mps, gap_s)
     time_s, x_m = np.cumsum(np.array(steps), axis=0).T
     one = trip(time_s, x_m)
@@ -160,9 +165,9 @@ def test_the_run_begins_where_it_is_told_to() -> None:
 def test_who_is_there_for_less_than_a_second_takes_no_part() -> None:
     course = drive(trip([0, 10], [0, 10]), trip([4, 4.8], [0, 1], name="b"), trip([9.5, 20], [0, 9], name="c"))
     assert course.node_ids == ("a",)
-    with pytest.raises(ScenarioError, match="no vehicle is there for 1 s of 10 s from 0 s"):
+    with pytest.raises(ScenarioError, match="no vehicle is present for 1 s of the 10 s from 0 s"):
         drive(trip([4, 4.8], [0, 1]))
-    with pytest.raises(ScenarioError, match="no vehicle is there"):
+    with pytest.raises(ScenarioError, match="no vehicle is present"):
         drive(trip([50, 60], [0, 1]))
     assert drive(trip([0, 10], [0, 10]), seconds=0.4).node_ids == ("a",), "a short run is as long as it is"
 
@@ -174,7 +179,7 @@ def test_a_disc_is_entered_and_left_and_short_excursions_do_not_count() -> None:
     time_s = np.arange(0, 40.1, 0.1)
     out_and_back = trip(time_s, np.where(np.abs(time_s - 20) < 4, 110.0 - np.abs(time_s - 20) * 5, 90.0))
     assert there(drive(out_and_back, seconds=40, disc=(0.0, 0.0, 100.0))) == (0.0, 40.0)
-    with pytest.raises(ScenarioError, match="no vehicle is there within the disc"):
+    with pytest.raises(ScenarioError, match="no vehicle is present within the disc"):
         drive(through, seconds=40, disc=(0.0, 900.0, 100.0))
 
 
@@ -217,9 +222,9 @@ def test_given_headings_are_taken_and_go_the_short_way_round() -> None:
 
 def test_a_given_speed_says_who_stands() -> None:
     time_s = np.arange(0, 10, 0.1)
-    crawling = {"x_m": 0.4 * time_s, "y_m": 0.0 * time_s}
-    stands = drive(trip(time_s, **crawling), seconds=9.9).heading_rad[:99, 0]
-    drives = drive(trip(time_s, **crawling, speed_mps=np.full(100, 0.6)), seconds=9.9).heading_rad[:99, 0]
+    x_m, y_m = 0.4 * time_s, 0.0 * time_s
+    stands = drive(trip(time_s, x_m, y_m), seconds=9.9).heading_rad[:99, 0]
+    drives = drive(trip(time_s, x_m, y_m, speed_mps=np.full(100, 0.6)), seconds=9.9).heading_rad[:99, 0]
     assert np.isnan(stands).all() and drives == pytest.approx(np.zeros(99))
 
 
