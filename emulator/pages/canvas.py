@@ -102,7 +102,7 @@ def canvas(
     end_s: float = 0.0,
     plot_px: float = PLOT_PX,
 ) -> Canvas:
-    """Empty axes; with `spans`, faults are shaded on an axis of time until `end_s`, and named above it."""
+    """Make empty axes; with `spans`, faults are shaded on an axis of time until `end_s`, and named above it."""
     lanes = _in_lanes(spans, end_s)
     height_px = _TOP_PX + legend_rows * _LEGEND_ROW_PX + len(lanes) * _LANE_PX + plot_px + _BOTTOM_PX
     figure = Figure(figsize=(WIDTH_PX / 72, height_px / 72), dpi=72)
@@ -123,14 +123,14 @@ def canvas(
 
 
 def _reach(span: Span, end_s: float) -> tuple[float, float]:
-    """From where to where a span and its label reach in seconds; a label stays left of the right edge."""
+    """Return the start and end in seconds of a span with its label; a label stays left of the right edge."""
     label_s = (_LETTER_PX * len(span.label) + 8) * end_s / (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
     start_s = min(span.start_s, end_s - label_s)
     return start_s, max(span.end_s, start_s + label_s)
 
 
 def _in_lanes(spans: Sequence[Span], end_s: float) -> list[list[Span]]:
-    """Spans in as few rows as hold them and their labels side by side; those beyond the last row are left out."""
+    """Arrange spans in as few rows as hold them and their labels; those beyond the last row are dropped."""
     lanes: list[list[Span]] = []
     for span in sorted(spans, key=lambda span: (span.start_s, span.end_s)):
         start_s, _ = _reach(span, end_s)
@@ -155,7 +155,7 @@ def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[Span]], end_s: float) -> N
 
 
 def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = 3) -> None:
-    """The legend of these, or of all that has a label, above the figure."""
+    """Put a legend of these handles, or of all that have labels, above the figure."""
     of.figure.legend(
         handles=of.axes.get_legend_handles_labels()[0] if handles is None else list(handles),
         loc="upper left",
@@ -171,14 +171,14 @@ def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = 3
 
 
 def from_zero(axes: Axes) -> None:
-    """A linear axis of y from zero, with few ticks."""
+    """Make the y axis linear from zero, with few ticks."""
     top = axes.get_ylim()[1]
     axes.set_ylim(0, top if top > 0 else 1)
     axes.yaxis.set_major_locator(MaxNLocator(5))
 
 
 def logarithmic(axes: Axes) -> None:
-    """A logarithmic axis of y with plain numbers; where it has few powers of ten, with 2 and 5 between them."""
+    """Make the y axis logarithmic, with plain numbers; over few powers of ten with 2 and 5 between them."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     between = (1, 2, 5) if high < 200 * low else (1,)
@@ -188,13 +188,13 @@ def logarithmic(axes: Axes) -> None:
 
 
 def whole_numbers(axes: Axes) -> None:
-    """Counts: ticks at whole numbers only, with commas at the thousands."""
+    """Put the y axis' ticks at integers, with commas at the thousands."""
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 
 
 def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
-    """A line of at most `MOST_POINTS` points: of every stretch the least and the most. NaN are gaps, and stay."""
+    """Thin a line to `MOST_POINTS` points: minimum and maximum of each stretch. NaN are gaps, and stay."""
     if len(time_s) <= MOST_POINTS:
         return time_s, value
     kept: list[int] = []
@@ -208,7 +208,7 @@ def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
 
 
 def to_svg(figure: Figure, key: str, label: str) -> Markup:
-    """The figure as an `<svg>` element for a page; `key` makes its ids its own, `label` says what it shows."""
+    """Return the figure as an `<svg>` element; `key` makes its ids unique on a page, `label` describes it."""
     file = io.BytesIO()
     figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     root = ElementTree.fromstring(file.getvalue())
@@ -229,13 +229,13 @@ _HREF = "{http://www.w3.org/1999/xlink}href"
 
 
 def _references(element: ElementTree.Element) -> list[str]:
-    """The ids that an element refers to."""
+    """Return the ids that an element refers to."""
     href = element.get(_HREF)
     return [href[1:]] if href else _REFERENCE.findall(element.get("clip-path", ""))
 
 
 def _make_plain(element: ElementTree.Element, names: dict[str, str]) -> None:
-    """Take away what a page does not need, and put its variables in place of colours."""
+    """Remove what a page does not need, and put the page's variables in place of colours."""
     element.tag = element.tag.partition("}")[2] or element.tag
     if element.tag != "text":
         element.text = None

@@ -1,12 +1,14 @@
 """Reports, the index and comparisons: what stands in the pages, and what must not."""
 
 import json
+import os
 import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -16,7 +18,7 @@ from emulator.cli import report as report_cli
 from emulator.cli.commands import app
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
-from emulator.report.compare_page import comparison_page
+from emulator.report.compare_page import _delivered, comparison_page
 from emulator.report.comparison import Comparison
 from emulator.report.index import write_index
 from emulator.report.write import key_figures, write_report
@@ -148,6 +150,13 @@ def test_what_others_wrote_is_text(beacon: Path) -> None:
     assert "the first offending rows" in page.text
 
 
+def test_a_folder_whose_name_is_no_text_is_listed(beacon: Path) -> None:
+    beacon.rename(beacon.with_name(os.fsdecode(b"\xff & more")))
+    page = Page(write_index(beacon.parent).read_text())
+    assert "\\udcff & more" in page.text
+    assert "./%FF%20%26%20more/" in page.references
+
+
 @pytest.mark.parametrize(
     "lost", ["trace.parquet", "states.parquet", "metrics.parquet", "verdict.json", "events.jsonl"]
 )
@@ -252,6 +261,14 @@ def test_compare_says_which_keys_differ_and_by_how_much(cooperative: Path, tmp_p
     assert comparison.figures[0]["B − A"] == "+0.250"
     page = Page(comparison_page(comparison))
     assert "RMSE of the common error (m)" in page.text and "run.seed 1 5" in page.text
+
+
+def test_compare_draws_the_delivery_ratio_of_short_runs_without_gaps(beacon_run: Path) -> None:
+    drawing = _delivered(Comparison.of(beacon_run, beacon_run))
+    first, second = drawing.canvas.axes.get_lines()
+    ratio = np.asarray(first.get_ydata(), dtype=float)
+    assert len(ratio) >= 20 and np.isfinite(ratio).all(), "2 s are 20 periods"
+    assert 80 < ratio.mean() < 100 and np.array_equal(ratio, np.asarray(second.get_ydata()))
 
 
 def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> None:

@@ -9,11 +9,8 @@ import pytest
 from rich.console import Console
 
 from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
-from emulator.radio.outcomes import Outcome
 from emulator.records.run_folder import Event
-from emulator.report import radio_figures as report_figures
-from emulator.terminal.dashboard import BAD_EVENTS, OUTCOMES, Dashboard, describe, is_bad, sparkline
-from emulator.viewer import drawing
+from emulator.terminal.dashboard import BAD_EVENTS, Dashboard, describe, is_bad, sparkline
 
 SIZES = [(200, 60), (100, 30), (90, 24), (80, 24), (60, 15), (60, 12), (40, 8), (20, 5), (8, 3), (1, 2)]
 FAULTS = (
@@ -302,12 +299,3 @@ def test_a_sparkline_of_odd_values() -> None:
 def test_events_in_words(event: Event, said: str) -> None:
     assert describe(event) == said
     assert is_bad(event) is (event.kind in BAD_EVENTS)
-
-
-def test_every_outcome_of_a_pair_in_range_has_its_colour_and_its_sign_everywhere() -> None:
-    names = {outcome.name for outcome in Outcome} - {"pending", "out_of_range"}
-    assert set(OUTCOMES) == set(report_figures.OUTCOME_COLOURS) == names
-    assert {outcome.name for outcome in drawing.OUTCOME_COLOURS} == names
-    assert len({sign for _, sign in OUTCOMES.values()}) == len(names)
-    for colours in (OUTCOMES, report_figures.OUTCOME_COLOURS, drawing.OUTCOME_COLOURS):
-        assert len({str(colour) for colour in colours.values()}) == len(names)

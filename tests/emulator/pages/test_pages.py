@@ -1,0 +1,135 @@
+"""Pages escape, cut and make printable what others wrote, and their templates are shipped."""
+
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from jinja2 import UndefinedError
+from markupsafe import Markup
+
+from emulator.pages.canvas import canvas, styled, to_svg
+from emulator.pages.page import Table, render, table
+from emulator.pages.text import LONGEST_TEXT, as_text, cell
+from emulator.records.verdicts import Verdict
+from emulator.report.drawing import Chart
+from emulator.testing.matrix import page as campaign_page
+from tests.support.paths import ROOT
+
+TEMPLATES = ROOT / "emulator" / "pages" / "templates"
+MARKUP = "<script>alert(1)</script>"
+ATTRIBUTE = '"><img src=x onerror="alert(1)'
+CONTROLS = "a\x00b\x1b[31mc\u202ed\u2028e\udcff\r"
+LONG = "<b>" * 350_000
+HOSTILE = [MARKUP, ATTRIBUTE, "' onmouseover='alert(1)", "{{ 7 * 7 }}{% include 'style.css' %}", "</style></title>",
+           "&lt;&amp;", CONTROLS, LONG]  # fmt: skip
+
+
+class Elements(HTMLParser):
+    """How often a page has each element, its attributes, and its text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: Counter[str] = Counter()
+        self.attributes: Counter[str] = Counter()
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        self.attributes.update(name for name, _ in attrs)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def campaign(text: str) -> str:
+    """A campaign's page with a text wherever others may have written it."""
+    failure = dict.fromkeys(("number", "seed", "schedule", "command", "folder"), text) | {"checks": {text: text}}
+    return campaign_page(text, [text], {text: {text: Counter({Verdict.INVALID: 1})}}, [failure])
+
+
+@styled
+def drawing(label: str) -> Markup:
+    """A picture without anything in it."""
+    return to_svg(canvas("x", "y").figure, "key", label)
+
+
+def comparison(text: str) -> str:
+    """A comparison with a text wherever others may have written it."""
+    run = {"letter": "A", "name": text, "folder": Path(text), "verdict": Verdict.VALID}
+    rows = table([{text: text, "number": 1.0}], text)
+    return render(
+        "comparison.html.j2",
+        runs=[run, run],
+        difference=text,
+        difference_rows=rows,
+        scenario=rows,
+        key_figures=rows,
+        outcomes=rows,
+        checks=rows,
+        charts=[Chart("key", text, drawing(text), text)],
+        missing={text: [text, text]},
+    )
+
+
+@pytest.mark.parametrize("make", [campaign, comparison])
+@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+def test_hostile_text_adds_no_element_no_attribute_and_no_control(make: Callable[[str], str], text: str) -> None:
+    plain, page = Elements(make("plain")), make(text)
+    hostile = Elements(page)
+    assert hostile.tags == plain.tags
+    assert hostile.attributes == plain.attributes
+    assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f\u202e\u2028\ud800-\udfff]", page)
+    assert len(page) < 100 * LONGEST_TEXT, "some twenty texts, cut, and longer as markup"
+
+
+def test_text_that_others_wrote_is_read_as_they_wrote_it() -> None:
+    page = Elements(campaign(MARKUP))
+    assert page.text.count(MARKUP) >= 8
+    assert "a\\x00b\\x1b[31mc\\u202ed\\u2028e\\udcff\\r" in Elements(campaign(CONTROLS)).text
+
+
+def test_as_text() -> None:
+    assert as_text("a\tb\nc") == "a\tb\nc"
+    assert as_text(None) == "" and as_text(0) == "0" and as_text(1.5) == "1.5"
+    assert len(as_text(LONG)) == LONGEST_TEXT and as_text(LONG).endswith("…")
+    assert as_text("abcdef", 4) == "abc…" and as_text("abcd", 4) == "abcd"
+    assert as_text(Markup("<b>") * 20_000) == "<b>" * 20_000, "a page's own markup is whole"
+    assert cell(0.123456789) == "0.123457" and cell(None) == "" and cell("x") == "x"
+
+
+def test_tables_drop_empty_columns_and_align_numbers() -> None:
+    rows: list[dict[str, object]] = [
+        {"name": "a", "none": None, "value": 1.25},
+        {"name": "b", "none": "", "value": None, "more": 3},
+    ]
+    assert table(rows) == Table(
+        "", ["name", "value", "more"], [False, True, True], [["a", "1.25", ""], ["b", "", "3"]]
+    )
+    assert table(rows, decimals=1).rows[0] == ["a", "1.2", ""]
+
+
+def test_a_value_that_is_missing_is_an_error_and_not_an_empty_page() -> None:
+    with pytest.raises(UndefinedError):
+        render("campaign.html.j2", title="t", facts=[], columns=[], kinds={})
+
+
+def test_templates_mark_nothing_as_safe_and_load_nothing() -> None:
+    for path in TEMPLATES.iterdir():
+        text = path.read_text()
+        assert not re.search(r"\|\s*safe\b|autoescape|Markup|xmlattr", text), path.name
+        assert not re.search(r"https?:|//[a-z]|@import|url\(", text), path.name
+
+
+def test_every_file_of_the_packages_is_shipped() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    data = project["tool"]["setuptools"]["package-data"]
+    patterns = [(ROOT / Path(*package.split(".")), glob) for package, globs in data.items() for glob in globs]
+    shipped = {path for folder, pattern in patterns for path in folder.glob(pattern)}
+    files = (path for name in ("vnet", "agents", "emulator") for path in (ROOT / name).rglob("*"))
+    others = {path for path in files if path.is_file() and path.suffix not in (".py", ".pyc")}
+    assert others and others <= shipped
