@@ -32,8 +32,9 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
+from vnet.cmm.common_error import systematic
 from vnet.cmm.map_matching import candidate_lanes, log_on_lane
-from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
+from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 

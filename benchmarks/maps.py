@@ -23,7 +23,7 @@ def city(seed: int = 0) -> Roads:
         for cells in ([(k, street) for k in range(steps)], [(street, k) for k in range(steps)]):
             points = [(cell, tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for cell in cells]
             builder.add(f"street {street}", points, NUMBER["residential"], (1, 1), 3.0)
-    return builder.build(builder.places(), None)
+    return builder.build(builder.coordinates(), None)
 
 
 def measure(roads: Roads | None = None) -> dict[str, float]:

@@ -1,25 +1,25 @@
-"""The errors a caller of vnet can meet, rooted at `VnetError`.
+"""The errors that vnet raises for its callers, rooted at `VnetError`.
 
-Each message is one line that names the thing, the value and what is allowed. Mistakes of vnet's own are
+Each message is one line that names the subject, the value and what is allowed. Errors in vnet itself are
 assertions, not members of this family.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 LONGEST_MESSAGE = 2000
-"""Characters of a whole message."""
+"""Characters of a message."""
 LONGEST_SHOWN = 100
 """Characters of a wrong value in a message."""
 
 
 class VnetError(Exception):
-    """Anything that vnet refuses or cannot do, said in one line.
+    """An input that vnet refuses, or an action that it cannot do, described in one line.
 
-    A message may quote what others wrote, and it ends in terminals and logs: what is not printable is escaped, and
-    what is too long is cut.
+    A message may quote untrusted text, and is shown in terminals and logs: unprintable characters are escaped, and
+    long messages are truncated.
     """
 
     def __init__(self, message: str) -> None:
@@ -27,27 +27,33 @@ class VnetError(Exception):
 
 
 def printable(text: str, longest: int = LONGEST_SHOWN) -> str:
-    """`text` in one line of at most `longest` characters, with escapes for what is not printable."""
+    """Return `text` in one line of at most `longest` characters, with unprintable characters escaped."""
     if not text.isprintable():
         text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[:longest])
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
 def shown(value: object) -> str:
-    """A wrong value as a message quotes it, whatever it is."""
+    """Return any wrong value as a message quotes it."""
     try:
         return printable(repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits; a value nested too deeply
         return f"({type(value).__name__})"
 
 
+def first_names(names: Sequence[object], most: int = 8, with_total: bool = False) -> str:
+    """Return the first `most` names; an ellipsis, with the total if wanted, ends a longer list."""
+    total = f" ({len(names)})" if with_total else ""
+    return ", ".join(map(str, names[:most])) + (f", …{total}" if len(names) > most else "")
+
+
 def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """What a misspelt word may have been meant to be, as ` (did you mean …?)`; empty if it is like none."""
-    if not isinstance(word, str) or len(word) > LONGEST_SHOWN:  # comparing takes time in the square of its length
+    """Return ` (did you mean …?)` with the known word closest to a misspelt one; empty if none is close."""
+    if not isinstance(word, str) or len(word) > LONGEST_SHOWN:  # the comparison takes time quadratic in its length
         return ""
-    by_small_letters = {name.lower(): name for name in known}
-    close = get_close_matches(word.lower(), by_small_letters, n=1, cutoff=0.7)
-    return f" (did you mean {by_small_letters[close[0]]}?)" if close else ""
+    by_lower_case = {name.lower(): name for name in known}
+    close = get_close_matches(word.lower(), by_lower_case, n=1, cutoff=0.7)
+    return f" (did you mean {by_lower_case[close[0]]}?)" if close else ""
 
 
 class ScenarioError(VnetError):
@@ -63,7 +69,7 @@ class TransportError(VnetError):
 
 
 class PayloadTooLargeError(VnetError):
-    """A broadcast above the radio's limit."""
+    """A broadcast larger than `radio.max_payload_bytes`."""
 
     def __init__(self, size_bytes: int, max_payload_bytes: int) -> None:
         super().__init__(f"payload of {size_bytes} bytes exceeds radio.max_payload_bytes = {max_payload_bytes}")
@@ -72,8 +78,8 @@ class PayloadTooLargeError(VnetError):
 
 
 class VirtualTimeError(VnetError):
-    """Something that a program may not do in lockstep, because it would wait on the real world."""
+    """An operation that a program may not use in lockstep, because it waits for the real world."""
 
 
 class ProgramError(VnetError):
-    """A vehicle program that cannot be imported or has the wrong shape."""
+    """A vehicle program that cannot be imported, or whose entry is not a coroutine function of one node."""

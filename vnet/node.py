@@ -1,8 +1,8 @@
-"""Node: all that a vehicle program sees of its vehicle and its network.
+"""Node: everything that a vehicle program sees of its vehicle and its network.
 
-A program is `async def main(node: Node) -> None`. It hears the radio, its own GNSS receiver and its clock,
-and reports what it believes. Where the packets come from (lockstep, real time, one process or fifty) is the
-business of the `NodeTransport` behind it; the program cannot tell.
+A program is `async def main(node: Node) -> None`. It has a radio, a GNSS receiver and a clock, and reports its
+estimates. The source of the packets (lockstep or real time, one process or fifty) is hidden behind the
+`NodeTransport`: the program is the same in all.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vnet.types import Array
 T = TypeVar("T")
 
 INBOX_LIMIT = 4096
-"""Packets (or fixes) that a node keeps for a program that does not read them; the oldest go first."""
+"""Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Packet:
 class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 
-    The covariance is that of the receiver's own noise; the error common to the area is not in it.
+    The covariance is that of the receiver's own noise, without the common error of all receivers.
     """
 
     time_ns: int
@@ -52,7 +52,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """What a program believes at one instant; see `Node.report`."""
+    """A program's estimates at one time; see `Node.report`."""
 
     time_ns: int
     node: str
@@ -62,27 +62,27 @@ class Report:
 
 
 class NodeTransport(Protocol):
-    """What a node needs of the process that hosts it."""
+    """Interface of a node to the process that hosts it."""
 
     def now_ns(self, node: str) -> int:
-        """Emulated time in nanoseconds, by the clock of `node`."""
+        """Return the emulated time in nanoseconds by the clock of `node`."""
         ...
 
     def send_frame(self, node: str, payload: bytes) -> None:
-        """Hand a frame to the emulated radio at this instant."""
+        """Enqueue a frame at the emulated radio, at the present time."""
         ...
 
     def send_report(self, report: Report) -> None:
-        """Hand a report to the emulator's metrics."""
+        """Send a report to the emulator's metrics."""
         ...
 
 
 class Mailbox(Generic[T]):
-    """A bounded queue with one side for the link (`deliver`) and one for the program.
+    """A bounded queue with one side for the transport (`deliver`) and one for the program.
 
-    `waiting` tells the link whether a task of the program is waiting here: only then is a node woken by
-    what arrives; otherwise it finds it at its next wake-up. `refill` is called before the program looks, so that
-    a link may leave what nobody waits for where it is (real time).
+    `waiting` tells the transport that a task of the program waits here: only then does an arrival wake the node;
+    otherwise the program finds the item when it next runs. `refill` is called before the program reads, so that a
+    transport may leave items in its own buffer until then (real time).
     """
 
     def __init__(self) -> None:
@@ -92,36 +92,36 @@ class Mailbox(Generic[T]):
 
     @property
     def awaited(self) -> bool:
-        """Whether a task may be waiting here; safe to ask from another thread."""
+        """True if a task may be waiting here; may be read from another thread."""
         return bool(self._waiters)
 
     @property
     def waiting(self) -> bool:
-        """Whether a task waits for the next item."""
+        """True if a task waits for the next item."""
         return any(not waiter.done() for waiter in self._waiters)
 
     def deliver(self, items: Sequence[T]) -> None:
-        """Append items and wake those who wait."""
+        """Append items and wake the waiting tasks."""
         self._items.extend(items)
         for waiter in self._waiters:
             if not waiter.done():
                 waiter.set_result(None)
 
     async def get(self) -> T:
-        """The oldest item; waits for one if there is none. Safe to cancel: nothing is lost."""
+        """Remove and return the oldest item; wait for one if there is none. Cancelling it loses no item."""
         self.refill()
         while not self._items:
             waiter = asyncio.get_running_loop().create_future()
             self._waiters.append(waiter)
             try:
-                self.refill()  # once more: what came before the waiter could be seen has woken nobody
+                self.refill()  # again: an item that came before the waiter was visible woke no task
                 await waiter
             finally:
                 self._waiters.remove(waiter)
         return self._items.popleft()
 
     def drain(self) -> list[T]:
-        """All items, oldest first, without waiting."""
+        """Remove and return all items, oldest first, without waiting."""
         self.refill()
         items = list(self._items)
         self._items.clear()
@@ -129,10 +129,10 @@ class Mailbox(Generic[T]):
 
 
 class Radio:
-    """The vehicle's radio: broadcast to whoever is in range, hear whoever was.
+    """The vehicle's radio: sends broadcasts to all nodes in range, and receives theirs.
 
     Attributes:
-        max_payload: the most bytes of a frame.
+        max_payload: largest payload of a frame in bytes.
     """
 
     def __init__(self, node_id: str, transport: NodeTransport, max_payload: int) -> None:
@@ -142,17 +142,17 @@ class Radio:
         self._transport = transport
 
     async def broadcast(self, payload: bytes) -> None:
-        """Send one frame to all in range. Raises `PayloadTooLargeError` above `max_payload` bytes."""
+        """Send one frame to all nodes in range. Raise `PayloadTooLargeError` above `max_payload` bytes."""
         if len(payload) > self.max_payload:
             raise PayloadTooLargeError(len(payload), self.max_payload)
         self._transport.send_frame(self._node_id, bytes(payload))
 
     def drain(self) -> list[Packet]:
-        """All packets heard since the last look, oldest first, without waiting."""
+        """Return all packets received since the last call, oldest first, without waiting."""
         return self.inbox.drain()
 
     async def receive(self) -> Packet:
-        """The next packet; waits for one if there is none."""
+        """Return the next packet; wait for one if there is none."""
         return await self.inbox.get()
 
     def __aiter__(self) -> Radio:
@@ -169,11 +169,11 @@ class GnssReceiver:
         self.inbox: Mailbox[Fix] = Mailbox()
 
     def drain(self) -> list[Fix]:
-        """All fixes since the last look, oldest first, without waiting."""
+        """Return all fixes since the last call, oldest first, without waiting."""
         return self.inbox.drain()
 
     async def receive(self) -> Fix:
-        """The next fix; waits for one if there is none."""
+        """Return the next fix; wait for one if there is none."""
         return await self.inbox.get()
 
     def __aiter__(self) -> GnssReceiver:
@@ -188,14 +188,14 @@ class Node:
 
     Attributes:
         id: the node's name.
-        radio: broadcast, receive, drain.
-        gnss: the fixes of the vehicle's own receiver.
-        map: the lanes of the area, unlabelled.
-        rng: a generator from a seed of this node's own (and of this incarnation), which says nothing about
-            the world's; the only source of randomness that replays.
+        radio: the vehicle's radio.
+        gnss: the vehicle's GNSS receiver.
+        map: the lanes of the area; it does not say which lane the vehicle is on.
+        rng: a generator with a seed of this node and incarnation, independent of the world's seed. It is the only
+            source of randomness that is reproducible.
         options: the scenario's `[program.options]`.
-        period_ns: time between two fixes.
-        incarnation: 0, and one more after each restart.
+        period_ns: time between two fixes in nanoseconds.
+        incarnation: number of restarts of the program so far.
     """
 
     def __init__(
@@ -222,11 +222,11 @@ class Node:
 
     @property
     def now_ns(self) -> int:
-        """Emulated nanoseconds since the start of the run, by the vehicle's own clock."""
+        """Emulated time in nanoseconds since the start of the run, by the vehicle's own clock."""
         return self._transport.now_ns(self.id)
 
     def disconnect(self) -> None:
-        """Cut what is left of the program off from the world: the vehicle's process is gone."""
+        """Disconnect the rest of the program from the world, after the vehicle's process has ended."""
         self._transport = self.radio._transport = _Disconnected(self.now_ns)
 
     def report(
@@ -235,30 +235,31 @@ class Node:
         covariance_m2: ArrayLike | None = None,
         **values: ArrayLike,
     ) -> None:
-        """Say what the program believes now: its position (2,) in m, covariance (2, 2) in m², and more.
+        """Report the present estimates: position (2,) in m, its covariance (2, 2) in m², and further values.
 
-        Any further keyword is a number or an array of numbers; the emulator's metrics know
-        `common_error_m` (2,), `common_error_covariance_m2` (2, 2), `mean_m` (2,) (the consensus),
-        `stacked_common_error_m` (2,) and `cloud_m` (n, 2); `heard` is how many packets came since the last report,
-        which is held against the trace. Raises ValueError on a wrong shape or on something
-        that is not a number.
+        Each further keyword is a number or an array of numbers. The emulator's metrics know `common_error_m` (2,),
+        `common_error_covariance_m2` (2, 2), `mean_m` (2,) (of the consensus), `stacked_common_error_m` (2,) (after
+        fusion) and `cloud_m` (n, 2); `heard` is the number of packets received since the last report, which is
+        checked against the trace. Raise ValueError for a wrong shape or a value that is not a number.
         """
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
         covariance = None if covariance_m2 is None else _floats("covariance_m2", covariance_m2, 4)
         named = {name: _value(name, value) for name, value in values.items()}
         self._transport.send_report(
             Report(
-                self.now_ns,
-                self.id,
-                None if estimate is None else (estimate[0], estimate[1]),
-                None if covariance is None else (covariance[0], covariance[1], covariance[2], covariance[3]),
-                named,
+                time_ns=self.now_ns,
+                node=self.id,
+                estimate_m=None if estimate is None else (estimate[0], estimate[1]),
+                covariance_m2=(
+                    None if covariance is None else (covariance[0], covariance[1], covariance[2], covariance[3])
+                ),
+                values=named,
             )
         )
 
 
 class _Disconnected:
-    """The link of a node whose process is gone: nothing that it still does reaches anybody."""
+    """The transport of a node whose process has ended: it discards all frames and reports."""
 
     def __init__(self, now_ns: int) -> None:
         self._now_ns = now_ns

@@ -13,7 +13,7 @@ from scipy.special import gammainccinv
 from scipy.stats import chi2
 
 from emulator.checks.channel import nothing_seen, received_twice
-from emulator.radio.csma import times_ns
+from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import DETECTION_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import Stage, decided_at
@@ -42,7 +42,7 @@ def check_fading(recorded: RecordedRun) -> Finding:
     name = "fading"
     radio = recorded.scenario.radio
     if not radio.is_physical:
-        return NotExercised(name, "signals have no power: a frame fades nowhere within the range")
+        return NotExercised(name, "unit-disc radio: no fading")
     drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
         return nothing_seen(name, recorded, "no pair came as far as the receiver")
@@ -174,7 +174,7 @@ def check_medium(recorded: RecordedRun) -> Finding:
     """
     name = "medium"
     if not recorded.shares_air:
-        return NotExercised(name, "senders share no medium")
+        return NotExercised(name, "no MAC configured ([radio.mac])")
     if not len(recorded.trace):
         return nothing_seen(name, recorded, "no frame was sent")
     air = _Air.of(recorded)
@@ -224,7 +224,9 @@ def _without_pause(air: _Air) -> NDArray[np.intp]:
     order = np.argsort(air.sender, kind="stable")
     same = air.sender[order[1:]] == air.sender[order[:-1]]
     begin_ns, end_ns = air.begin_ns[order], air.end_ns[order]
-    early = (begin_ns[1:] < end_ns[:-1] + times_ns(radio.mac).aifs) | (begin_ns[1:] < begin_ns[:-1] + least_ns)
+    early = (begin_ns[1:] < end_ns[:-1] + edca_parameters(radio.mac).aifs_ns) | (
+        begin_ns[1:] < begin_ns[:-1] + least_ns
+    )
     return np.asarray(air.rows[order[1:][same & early]])
 
 
@@ -237,7 +239,7 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
     if radio.fading is not None:
         return np.zeros(0, np.intp)
     assert radio.mac is not None
-    earlier, later = air.near(times_ns(radio.mac).aifs)
+    earlier, later = air.near(edca_parameters(radio.mac).aifs_ns)
     noticed = air.begin_ns[later] >= air.begin_ns[earlier] + DETECTION_NS
     earlier, later = earlier[noticed], later[noticed]
     sent_ns = recorded.sent_ns[air.rows[earlier]]

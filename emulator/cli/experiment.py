@@ -13,6 +13,7 @@ from rich.markdown import Markdown
 
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.experiments import paper
+from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
 from vnet.runtime.host import fix_hash_seed
@@ -42,7 +43,7 @@ def table1(
     seeds: SeedsOption = 20, out: OutOption = None, only: OnlyOption = None, live: LiveOption = False
 ) -> None:
     """Table I: four vehicles on a directed ring, constant α against optimized weights."""
-    from emulator.experiments import figures, reports
+    from emulator.experiments import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "table1")
@@ -50,7 +51,7 @@ def table1(
         cells = paper.table1_cells(range(1, seeds + 1), folder / "crossing.csv")
         results = _run(cells, folder, "table1", only, live)
         if only is None:
-            figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
+            result_figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
             _show(reports.table1(results), folder / "table1.md")
 
 
@@ -83,14 +84,14 @@ def default(
     live: LiveOption = False,
 ) -> None:
     """vnet's own profile on the same networks, against the limit of any cooperation. Takes hours for all."""
-    from emulator.experiments import figures, reports
+    from emulator.experiments import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "default")
         cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
         results = _run(cells, folder, "default", only, live)
         if any(row["mechanism"] == "limit" for row in results):
-            figures.ratio_bars(results, folder / "default")
+            result_figures.ratio_bars(results, folder / "default")
             _show(reports.default_profile(results), folder / "default.md")
 
 
@@ -170,13 +171,17 @@ def draw_figures(
     / "table2",
 ) -> None:
     """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
-    from emulator.experiments import figures
+    from emulator.experiments import network_figures
 
     with one_line_errors():
         folder = _folder(out, "figures")
         sections = paper.network_sections(networks)
         found = {name.upper(): paper.load_positions(section) for name, section in sections.items()}
-        for draw in (figures.degree_histogram, figures.road_angle_histogram, figures.graphs):
+        for draw in (
+            network_figures.degree_histogram,
+            network_figures.road_angle_histogram,
+            network_figures.graphs,
+        ):
             print(draw(found, folder / draw.__name__))
         cells = paper.table2_cells({n: sections[n] for n in ("n2", "n3")}, range(1, seeds + 1), sides=(1,))
         run_cells(cells, cells_from, title="figures")
@@ -247,13 +252,13 @@ def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
 
 
 def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
-    from emulator.experiments import figures, reports
+    from emulator.experiments import result_figures
 
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
-        references = {f"the paper's {m}": rmse[network] for m, rmse in reports.PAPER_TABLE2.items()}
+        references = {f"the paper's {m}": rmse[network] for m, rmse in PAPER_RMSE_M.items()}
         series = _series(cells, cells_from, network)
-        print(figures.against_time(series, folder / f"{network}_against_time", title, references))
+        print(result_figures.against_time(series, folder / f"{network}_against_time", title, references))
 
 
 def _series(cells: Sequence[Cell], folder: Path, network: str) -> dict[str, list[pa.Table]]:

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emulator.experiments.figures import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
+from emulator.experiments.style import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
 from emulator.radio.dot11p import airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome

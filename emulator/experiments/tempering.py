@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from emulator.cells.cells import Cell
-from emulator.experiments.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
 from emulator.experiments.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
 from emulator.experiments.tables import in_seeds, markdown_table, mean_and_error, mean_and_standard_error
 from emulator.records.metrics import anees_band
 

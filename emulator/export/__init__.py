@@ -1,1 +1,1 @@
-"""Runs in formats that other tools read: pcapng for Wireshark, MCAP for Foxglove and Rerun, CSV for the rest."""
+"""Export of runs to other tools' formats: pcapng for Wireshark, MCAP for Foxglove and Rerun, CSV for others."""

@@ -1,9 +1,9 @@
-"""A run as MCAP with JSON messages, for Foxglove and Rerun.
+"""Export of a run as MCAP with JSON messages, for Foxglove and Rerun.
 
-Topics, each with its JSON schema: `/tf` the true place of each vehicle (foxglove.FrameTransforms, so that they
-appear with their names), `/vehicles/fix` and `/vehicles/estimate` (foxglove.PosesInFrame), `/states` all that is
-known of a period, `/metrics` its figures, `/frames` each frame with what became of it, `/events`. Times count from
-the start of the run, in nanoseconds. The scenario is an attachment.
+Topics, each with its JSON schema: `/tf` the true pose of each vehicle (foxglove.FrameTransforms, which viewers show
+with names), `/vehicles/fix` and `/vehicles/estimate` (foxglove.PosesInFrame), `/states` the truth, fixes and
+reports of a period, `/metrics` its figures, `/frames` each frame with its receivers by outcome, `/events`. Times
+are nanoseconds from the start of the run. The scenario is an attachment.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from emulator.scenario.scenario import dump_scenario
 from vnet.errors import VnetError
 
 Message = tuple[int, str, dict[str, Any]]
-"""When (ns), on which topic, and what."""
+"""Time in ns, topic and content."""
 
 NUMBER: dict[str, Any] = {"type": "number"}
 TEXT: dict[str, Any] = {"type": "string"}
-WHOLE: dict[str, Any] = {"type": "integer"}
+INTEGER: dict[str, Any] = {"type": "integer"}
 
 
 def _object(**properties: dict[str, Any]) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def _list(items: dict[str, Any]) -> dict[str, Any]:
     return {"type": "array", "items": items}
 
 
-_TIME = _object(sec=WHOLE, nsec=WHOLE)
+_TIME = _object(sec=INTEGER, nsec=INTEGER)
 _VECTOR = _object(x=NUMBER, y=NUMBER, z=NUMBER)
 _QUATERNION = _object(x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
 _POSES = _object(timestamp=_TIME, frame_id=TEXT, poses=_list(_object(position=_VECTOR, orientation=_QUATERNION)))
@@ -56,9 +56,9 @@ _STATE = _object(
 )
 _FRAME = _object(
     sender=TEXT,
-    seq=WHOLE,
-    copy=WHOLE,
-    size_bytes=WHOLE,
+    seq=INTEGER,
+    copy=INTEGER,
+    size_bytes=INTEGER,
     payload_digest=TEXT,
     cause=TEXT,
     outcomes={"type": "object", "additionalProperties": _list(TEXT)},
@@ -67,17 +67,18 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "/tf": ("foxglove.FrameTransforms", _object(transforms=_list(_TRANSFORM))),
     "/vehicles/fix": ("foxglove.PosesInFrame", _POSES),
     "/vehicles/estimate": ("foxglove.PosesInFrame", _POSES),
-    "/states": ("vnet.States", _object(period=WHOLE, common_error_m=_list(NUMBER), vehicles=_list(_STATE))),
+    "/states": ("vnet.States", _object(period=INTEGER, common_error_m=_list(NUMBER), vehicles=_list(_STATE))),
     "/metrics": ("vnet.PeriodFigures", {"type": "object"}),
     "/frames": ("vnet.Frame", _FRAME),
     "/events": ("vnet.Event", _object(kind=TEXT, node=TEXT, details={"type": "object"})),
 }
-"""Of each topic the name of its schema, and the schema."""
-_KEPT = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
+"""Name and content of each topic's schema."""
+_STATE_COLUMNS = ("position_m", "heading_rad", "fix_m", "estimate_m", "covariance_m2", "common_error_estimate_m")
+"""Columns of `states.parquet` in `/states`."""
 
 
 def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
-    """Write a run; returns how many messages these are. Raises VnetError where the package mcap is missing."""
+    """Write a run; return the number of messages. Raise VnetError if the package mcap is missing."""
     try:
         from mcap.writer import Writer
     except ImportError:
@@ -103,7 +104,7 @@ def write_mcap(recorded: RecordedRun, file: BinaryIO) -> int:
 
 
 def _streams(recorded: RecordedRun) -> list[Iterator[Message]]:
-    """Messages, each stream in the order of their times."""
+    """Return the streams of messages, each in the order of time."""
     return [_periods(recorded), _metrics(recorded), _frames(recorded), _events(recorded)]
 
 
@@ -112,9 +113,9 @@ def _periods(recorded: RecordedRun) -> Iterator[Message]:
     for start in range(0, len(recorded.states), max(count, 1)):
         rows = recorded.states.slice(start, count).to_pylist()
         time_ns = rows[0]["time_ns"]
-        yield time_ns, "/tf", {"transforms": [_transform(row) for row in rows if _there(row["position_m"])]}
+        yield time_ns, "/tf", {"transforms": [_transform(row) for row in rows if _is_point(row["position_m"])]}
         for topic, name in (("/vehicles/fix", "fix_m"), ("/vehicles/estimate", "estimate_m")):
-            poses = [_pose(row[name]) for row in rows if _there(row[name])]
+            poses = [_pose(row[name]) for row in rows if _is_point(row[name])]
             yield time_ns, topic, {"timestamp": _stamp(time_ns), "frame_id": "map", "poses": poses}
         yield (
             time_ns,
@@ -122,27 +123,27 @@ def _periods(recorded: RecordedRun) -> Iterator[Message]:
             {
                 "period": rows[0]["period"],
                 "common_error_m": _finite(rows[0]["common_error_m"]),
-                "vehicles": [_state(row) for row in rows if _there(row["position_m"])],
+                "vehicles": [_state(row) for row in rows if _is_point(row["position_m"])],
             },
         )
 
 
 def _state(row: dict[str, Any]) -> dict[str, Any]:
-    told = {name: _finite(row[name]) for name in _KEPT}
+    columns = {name: _finite(row[name]) for name in _STATE_COLUMNS}
     values = {name: _finite(value) for name, value in row["values"] or ()}
     return {
         "node": row["node"],
-        **{name: value for name, value in told.items() if value is not None},
+        **{name: value for name, value in columns.items() if value is not None},
         "values": values,
     }
 
 
-def _there(point: list[float] | None) -> bool:
+def _is_point(point: list[float] | None) -> bool:
     return point is not None and all(map(math.isfinite, point))
 
 
 def _finite(value: Any) -> Any:
-    """A number, or a list of some, as JSON can say it: null for NaN and infinity."""
+    """Return a number, or a list of numbers, with null for NaN and infinity, which JSON lacks."""
     if isinstance(value, list):
         return [_finite(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

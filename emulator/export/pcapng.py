@@ -1,13 +1,13 @@
-"""The frames of a run as pcapng: what a capture on every vehicle's radio would have seen.
+"""Export of a run's frames as pcapng, as a capture on every vehicle's radio would have recorded them.
 
-Each vehicle is an interface, with the frames that it sent (outbound, when it handed them over or, where senders
-share a medium, when they went on air) and those that reached it (inbound, when they arrived). A packet is radiotap,
-a QoS data frame of 802.11 outside every BSS (as 802.11p sends), LLC and SNAP with the ethertype for local
-experiments 0x88B5, and then the payload, which a run does not keep: it is cut off (captured length < length), and
-its digest is in the packet's comment. Frames that had nobody in range have no trace and are not in it. Times count
-from the start of the run, in nanoseconds.
+Each vehicle is an interface, with the frames that it sent (outbound, at the time they were enqueued or, with
+`[radio.mac]`, went on air) and those delivered to it (inbound, at their arrival). A packet consists of radiotap, a
+QoS data frame of 802.11 outside a BSS (as in 802.11p), LLC and SNAP with the ethertype 0x88B5 for local
+experiments, and the payload. A run does not keep payloads: they are truncated (captured length < length), and their
+digest is in the packet's comment. Frames without a node in range have no rows in the trace and are missing. Times
+are nanoseconds from the start of the run.
 
-The format: draft-ietf-opsawg-pcapng. Radiotap: radiotap.org. Interface type 127 is 802.11 with radiotap.
+Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with radiotap.
 """
 
 from __future__ import annotations
@@ -24,22 +24,28 @@ from numpy.typing import NDArray
 from emulator.records.recorded_run import RecordedRun
 
 LINKTYPE_RADIOTAP = 127
+"""Link type of the interfaces: 802.11 with radiotap."""
 ETHERTYPE = 0x88B5
+"""Ethertype for local experiments."""
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
+"""Types of blocks."""
 _COMMENT, _NAME, _DESCRIPTION, _APPLICATION, _RESOLUTION, _FLAGS = 1, 2, 3, 4, 9, 2
+"""Codes of options."""
 _INBOUND, _OUTBOUND = 1, 2
+"""Directions of packets."""
 _CHANNEL_MHZ = 5900
 """Control channel of ITS-G5."""
 _CHANNEL_FLAGS = 0x0040 | 0x0100 | 0x4000
 """OFDM, 5 GHz, half rate: 10 MHz wide."""
-_FASTEST_MBPS = 127.5
-"""What radiotap's field of the rate can say."""
+_MAX_RATE_MBPS = 127.5
+"""Greatest rate in radiotap's field."""
 _BROADCAST = b"\xff" * 6
+"""Address of all stations, also used as BSSID outside a BSS."""
 
 
 @dataclass(frozen=True)
 class _Packet:
-    """One packet of the capture: on whose interface, when, which way, and which row of the trace tells of it."""
+    """A packet of the capture: interface (number of a vehicle), time, direction, and its row of the trace."""
 
     interface: int
     time_ns: int
@@ -48,35 +54,35 @@ class _Packet:
 
 
 def write_pcapng(recorded: RecordedRun, file: BinaryIO) -> int:
-    """Write a run's frames; returns how many packets these are."""
+    """Write a run's frames; return the number of packets."""
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
     for node in recorded.node_ids:
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
         body = struct.pack("<HHI", LINKTYPE_RADIOTAP, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
     radiotap = _radiotap(recorded.scenario.radio.bitrate_mbps)
-    fates = _Fates(recorded)
+    comments = _Comments(recorded)
     columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
     for packet in _packets(recorded):
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
         header = radiotap + _frame_header(sender, seq)
-        file.write(_packet_block(packet, header, size_bytes, fates.comment(packet)))
+        file.write(_packet_block(packet, header, size_bytes, comments.of(packet)))
         count += 1
     return count
 
 
 def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
-    """All packets in the order of their times."""
+    """Yield all packets in the order of their times."""
     sent = np.unique(recorded.emission, return_index=True)[1]
-    # What arrives once more on its way to one receiver was sent once.
+    # A frame that a fault duplicates at a receiver was sent only once.
     sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
-    heard = np.flatnonzero(recorded.outcome_is("delivered"))
-    row = np.concatenate([sent, heard])
-    interface = np.concatenate([recorded.sender[sent], recorded.receiver[heard]])
+    delivered = np.flatnonzero(recorded.outcome_is("delivered"))
+    row = np.concatenate([sent, delivered])
+    interface = np.concatenate([recorded.sender[sent], recorded.receiver[delivered]])
     left_ns = recorded.sent_ns[sent] if recorded.scenario.radio.mac is None else _on_air_ns(recorded, sent)
-    time_ns = np.concatenate([left_ns, recorded.arrival_ns[heard]])
-    direction = np.repeat([_OUTBOUND, _INBOUND], [len(sent), len(heard)])
+    time_ns = np.concatenate([left_ns, recorded.arrival_ns[delivered]])
+    direction = np.repeat([_OUTBOUND, _INBOUND], [len(sent), len(delivered)])
     order = np.argsort(time_ns, kind="stable")
     columns = (column[order].tolist() for column in (interface, time_ns, direction, row))
     for fields in zip(*columns, strict=True):
@@ -84,33 +90,33 @@ def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
 
 
 def _on_air_ns(recorded: RecordedRun, rows: NDArray[np.intp]) -> NDArray[np.int64]:
-    """When these frames went on the air that all share; those that never did, when they were handed over."""
+    """Return the times (n,) at which frames went on air; for those that never did, the times they were enqueued."""
     on_air_ns = recorded.column("on_air_ns")[rows]
     return np.where(on_air_ns < 0, recorded.sent_ns[rows], on_air_ns)
 
 
-class _Fates:
-    """What is said of packets in their comments."""
+class _Comments:
+    """The comments of packets: the frame, and the outcomes of its receptions."""
 
     def __init__(self, recorded: RecordedRun) -> None:
-        self._evidence = recorded
+        self._recorded = recorded
         self._outcome = _decoded(recorded.trace["outcome"])
         self._cause = recorded.trace["cause"].cast(pa.string()).to_pylist()
         order = np.argsort(recorded.emission, kind="stable")
         self._order = order
         self._emission = recorded.emission[order]
 
-    def comment(self, packet: _Packet) -> str:
-        """Whose frame it is and, for one that is sent, what became of it."""
-        recorded, row = self._evidence, packet.row
+    def of(self, packet: _Packet) -> str:
+        """Return a packet's sender, frame number and digest and, if it is outbound, its outcomes."""
+        recorded, row = self._recorded, packet.row
         copy = int(recorded.copy[row])
         name = recorded.node_ids[int(recorded.sender[row])]
         text = f"{name} frame {int(recorded.seq[row])}{f', copy {copy}' if copy else ''}"
         text += f"; payload {int(recorded.digest[row]):016x}"
         text += f"; {self._cause[row]}" if self._cause[row] else ""
-        return text if packet.direction == _INBOUND else f"{text}; {self._became(int(recorded.emission[row]))}"
+        return text if packet.direction == _INBOUND else f"{text}; {self._outcomes(int(recorded.emission[row]))}"
 
-    def _became(self, emission: int) -> str:
+    def _outcomes(self, emission: int) -> str:
         first, end = np.searchsorted(self._emission, (emission, emission + 1))
         outcomes, counts = np.unique(self._outcome[self._order[first:end]], return_counts=True)
         return ", ".join(f"{outcome} {count}" for outcome, count in zip(outcomes, counts.tolist(), strict=True))
@@ -121,8 +127,8 @@ def _decoded(column: pa.ChunkedArray) -> NDArray[np.str_]:
 
 
 def _radiotap(bitrate_mbps: float) -> bytes:
-    """The header that says how the frame was sent: flags, rate if it can be said, channel."""
-    has_rate = 0.5 <= bitrate_mbps <= _FASTEST_MBPS
+    """Return the radiotap header: flags, rate (if its field can hold it) and channel."""
+    has_rate = 0.5 <= bitrate_mbps <= _MAX_RATE_MBPS
     present = 1 << 1 | has_rate << 2 | 1 << 3
     rate = struct.pack("<BB", 0, round(2 * bitrate_mbps)) if has_rate else struct.pack("<Bx", 0)
     fields = rate + struct.pack("<HH", _CHANNEL_MHZ, _CHANNEL_FLAGS)
@@ -130,7 +136,7 @@ def _radiotap(bitrate_mbps: float) -> bytes:
 
 
 def _frame_header(sender: int, seq: int) -> bytes:
-    """QoS data from `sender` to all, outside every BSS, without acknowledgement; LLC and SNAP."""
+    """Return a QoS data header from `sender` to all stations, outside a BSS, without acknowledgement; LLC, SNAP."""
     address = b"\x02\x00" + struct.pack(">I", sender + 1)  # locally administered
     control = struct.pack("<HH", 0x0088, 0)
     mac = control + _BROADCAST + address + _BROADCAST + struct.pack("<HH", (seq & 0xFFF) << 4, 0x0020)
@@ -145,7 +151,7 @@ def _packet_block(packet: _Packet, header: bytes, size_bytes: int, comment: str)
 
 
 def _block(kind: int, body: bytes) -> bytes:
-    """A block: its kind, its length, what is in it and its length again. Options end with an empty one."""
+    """Return a block: its type, length, body, an option that ends the options, and the length again."""
     body += b"\0\0\0\0"
     length = struct.pack("<I", len(body) + 12)
     return struct.pack("<I", kind) + length + body + length

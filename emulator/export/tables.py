@@ -1,4 +1,4 @@
-"""All tables of a run as CSV files: points in two columns, matrices in four, all else that is no number as JSON."""
+"""Export of all tables of a run as CSV: points in two columns, matrices in four, other nested values as JSON."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 
 AXES = {2: ("x", "y"), 4: ("xx", "xy", "yx", "yy")}
-"""What the columns of a list of so many numbers are called."""
+"""Suffixes of the columns of a list by its length."""
 
 
 def write_csv(recorded: RecordedRun, folder: Path) -> list[str]:
-    """Write all tables into a folder; returns the files' names. Raises OSError."""
+    """Write all tables into a folder; return the files' names. Raise OSError if one cannot be written."""
     events = [
         {"time_ns": e.time_ns, "kind": e.kind, "node": e.node, "details": json.dumps(e.details)}
         for e in recorded.events
@@ -41,7 +41,7 @@ def write_csv(recorded: RecordedRun, folder: Path) -> list[str]:
 
 
 def flat(table: pa.Table) -> pa.Table:
-    """A table in which every column is of numbers or text."""
+    """Return a table whose columns all hold numbers or text."""
     return pa.table(dict(_flat_columns(table)))
 
 
@@ -52,8 +52,8 @@ def _flat_columns(table: pa.Table) -> Iterator[tuple[str, pa.Array]]:
         if pa.types.is_dictionary(kind):
             yield name, column.cast(pa.string())
         elif pa.types.is_fixed_size_list(kind) and kind.list_size in AXES:
-            for place, axis in enumerate(AXES[kind.list_size]):
-                yield f"{name}_{axis}", pc.list_element(column, place)
+            for index, axis in enumerate(AXES[kind.list_size]):
+                yield f"{name}_{axis}", pc.list_element(column, index)
         elif pa.types.is_nested(kind):
             texts = (None if entry is None else json.dumps(_plain(entry)) for entry in column.to_pylist())
             yield name, pa.array(texts, pa.string())
@@ -62,7 +62,7 @@ def _flat_columns(table: pa.Table) -> Iterator[tuple[str, pa.Array]]:
 
 
 def _plain(entry: object) -> object:
-    """A list or map as JSON has it."""
+    """Return a list as it is, and a map (a list of tuples) as a dictionary."""
     if isinstance(entry, list) and entry and all(isinstance(pair, tuple) for pair in entry):
         return dict(entry)
     return entry

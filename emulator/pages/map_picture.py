@@ -1,4 +1,4 @@
-"""A map as a picture: roads by class, and close up their lanes."""
+"""Pictures of maps: roads by class, and the lanes of small areas."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from emulator.world.maps.classes import NAMES
 from emulator.world.maps.roads import Roads
 from vnet.types import Array
 
-CLOSE_M = 800.0
-"""Pictures of no more than this show lanes."""
+LANES_SHOWN_M = 800.0
+"""Largest extent of a picture that shows lanes."""
 
-# Classes that look alike are not told apart by more than their width.
+# Colour and line width in points of each class.
 _STYLES = {
     "motorway": (PALETTE["red"].light, 2.6),
     "trunk": (PALETTE["red"].light, 2.2),
@@ -32,13 +32,16 @@ _STYLES = {
     "road": (PALETTE["blue"].light, 0.7),
     "crossing": ("0.6", 0.6),
 }
-_SIDE_INCHES, _DPI = 9.0, 140
+_SIDE_INCHES = 9.0
+"""Length of the picture's longer side."""
+_DPI = 140
+"""Pixels an inch."""
 
 
 def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] | None = None) -> None:
-    """Write a PNG; of what is in `window`, its south-western and north-eastern corner, if one is given.
+    """Write a picture of a map, or of the part between the corners `window` (south-west and north-east, in metres).
 
-    Raises OSError, and ValueError for a kind of picture that matplotlib does not know.
+    Raise OSError if it cannot be written, and ValueError for a file format that matplotlib does not know.
     """
     low, high = window or (roads.node_m.min(axis=0), roads.node_m.max(axis=0))
     margin_m = 0.0 if window else 0.02 * float((high - low).max()) + 5.0
@@ -47,7 +50,7 @@ def draw_map(roads: Roads, path: Path, title: str, window: tuple[Array, Array] |
     width, height = np.maximum((high - low) / span_m, 0.3) * _SIDE_INCHES
     figure = Figure(figsize=(width, height))
     axes = figure.add_subplot()
-    if span_m <= CLOSE_M:
+    if span_m <= LANES_SHOWN_M:
         _draw_lanes(axes, roads)
     _draw_roads(axes, roads, 0.6 if span_m > 6000 else 1.0)
     axes.set(xlabel="east (m)", ylabel="north (m)", aspect="equal")
@@ -62,13 +65,13 @@ def _style(kind: int) -> tuple[str, float]:
 
 
 def _draw_roads(axes: Axes, roads: Roads, scale: float) -> None:
-    place = roads.node_m[roads.node]
+    point_m = roads.node_m[roads.node]
     handles = {}
     kinds = np.unique(roads.kind)
     for kind in kinds[np.argsort([_style(k)[1] for k in kinds.tolist()], kind="stable")].tolist():
         segment = roads.segment[roads.kind[roads.road_of[roads.segment]] == kind]
         colour, width = _style(kind)
-        lines = np.stack([place[segment], place[segment + 1]], axis=1)
+        lines = np.stack([point_m[segment], point_m[segment + 1]], axis=1)
         axes.add_collection(LineCollection(list(lines), colors=colour, linewidths=width * scale, capstyle="round"))
         name = NAMES[kind].removesuffix("_link").replace("_", " ")
         handles[name] = Line2D([], [], color=colour, linewidth=width + 0.6, label=name)
@@ -78,7 +81,7 @@ def _draw_roads(axes: Axes, roads: Roads, scale: float) -> None:
 
 
 def _draw_lanes(axes: Axes, roads: Roads) -> None:
-    """Strips in which a vehicle's centre may be, with an arrow on each longer segment."""
+    """Draw the strips in which a vehicle's centre may be, with an arrow on each longer segment."""
     lanes = roads.lane_map()
     start = lanes.point_m
     end = start + lanes.length_m[:, None] * lanes.direction

@@ -1,1 +1,1 @@
-"""The emulated radio: the engine, and the stages that decide every reception's outcome."""
+"""The emulated radio: the engine, and the stages that decide the outcome of every reception."""

@@ -1,7 +1,7 @@
-"""Congestion control: how long a sender must pause between its frames, by how busy it finds the channel.
+"""Congestion control: the least time between two frames of a sender, as a function of its channel busy ratio (CBR).
 
-Both are those of ETSI TS 102 687 V1.2.1: the reactive one of its table, and the adaptive one, which is LIMERIC
-(Bansal, Kenney and Rohrs 2013). They act between what programs hand over and the access to the medium.
+Two algorithms of ETSI TS 102 687 V1.2.1: the reactive approach (a table), and the adaptive approach, which is
+LIMERIC (Bansal, Kenney and Rohrs 2013). They act between the frames that programs enqueue and the MAC.
 """
 
 from __future__ import annotations
@@ -17,32 +17,33 @@ from emulator.scenario.radio import EtsiReactive, Limeric
 from emulator.scenario.random_streams import Draws
 from vnet.units import NS_PER_MS
 
-LEAST_PAUSE_NS, MOST_PAUSE_NS = 25 * NS_PER_MS, 1000 * NS_PER_MS
-"""Of the adaptive approach (TS 102 687 V1.2.1, 5.4)."""
-
-
+MIN_PAUSE_NS = 25 * NS_PER_MS
+"""Lower bound of the adaptive approach's pause between two frames (TS 102 687 V1.2.1, 5.4)."""
+MAX_PAUSE_NS = 1000 * NS_PER_MS
+"""Upper bound of the adaptive approach's pause between two frames (TS 102 687 V1.2.1, 5.4)."""
 SLICES = WINDOW_NS // SLICE_NS
+"""Slices in one measurement window of the channel busy ratio."""
 
 
 class CongestionControl(Protocol):
-    """Lets frames of each sender through, or holds them back. `waiting` frames of each may wait, the newest."""
+    """Decides when each sender's next frame may go to the MAC; of those held back the newest `waiting` are kept."""
 
     waiting: int
 
     def observe(self, number: int, busy_ns: NDArray[np.int64]) -> None:
-        """The medium was busy for so long (N,) in slice `number` of the time."""
+        """Record that the medium was busy for `busy_ns` (N,) in slice `number` of the run."""
 
     def next_poll_ns(self, node: int, now_ns: int) -> int:
-        """`now_ns` if a frame of `node` may go; else when to ask again."""
+        """Return `now_ns` if a frame of `node` may go now, else the time at which to ask again."""
 
-    def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
-        """A frame of `node` goes on air for so long."""
+    def record_transmission(self, node: int, now_ns: int, airtime_ns: int) -> None:
+        """Record that `node` starts to transmit a frame of this airtime."""
 
 
 def congestion_control_of(
     congestion: EtsiReactive | Limeric | None, count: int, seed: int
 ) -> CongestionControl | None:
-    """The gate that a scenario chooses, for `count` senders."""
+    """Return the congestion control that a scenario configures for `count` senders, or None."""
     match congestion:
         case EtsiReactive():
             return ReactiveControl(congestion, BusyRatioMeter(count, seed))
@@ -53,10 +54,10 @@ def congestion_control_of(
 
 
 class BusyRatioMeter:
-    """How busy each of `count` senders finds the medium, in windows that begin at an instant of its own.
+    """Channel busy ratio at each of `count` senders, in windows whose phase is random for each sender.
 
-    Stations measure each on its own clock. If all measured and acted at once, all would hold back at once, and
-    come again at once (Rostami, Cheng, Bansal and Kenney 2016).
+    Stations measure asynchronously. If all measured and acted at the same instants, all would pause at once and
+    resume at once (Rostami, Cheng, Bansal and Kenney 2016).
     """
 
     def __init__(self, count: int, seed: int) -> None:
@@ -66,13 +67,13 @@ class BusyRatioMeter:
         self._last: deque[NDArray[np.int64]] = deque(maxlen=SLICES)
         self._sum_ns = np.zeros(count, np.int64)
         self.busy_ratio = np.zeros(count)
-        """(N,) of the last window of each."""
+        """Channel busy ratio (N,) of each sender's last complete window."""
 
     def __len__(self) -> int:
         return len(self._phase_ns)
 
     def observe(self, number: int, busy_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Take one more slice; returns whose window is over with it."""
+        """Add a slice; return a mask (N,) of the senders whose window ends with it."""
         if len(self._last) == SLICES:
             self._sum_ns -= self._last[0]
         self._last.append(busy_ns)
@@ -82,15 +83,18 @@ class BusyRatioMeter:
         return np.asarray(over)
 
     def next_poll_ns(self, node: int, open_ns: int, now_ns: int) -> int:
-        """When to ask if the gate opens at `open_ns` as things stand: after the next window they may be better."""
+        """Return the next time to poll: `open_ns`, or the end of the node's next window if that is earlier.
+
+        `open_ns` is when the pause ends at the present busy ratio; a lower one in the next window may shorten it.
+        """
         if open_ns <= now_ns:
             return now_ns
-        look_ns = self._phase_ns[node] + SLICE_NS  # the slice is over for sure
-        return min(open_ns, ((now_ns - look_ns) // WINDOW_NS + 1) * WINDOW_NS + look_ns)
+        offset_ns = self._phase_ns[node] + SLICE_NS  # by then the window's last slice has ended
+        return min(open_ns, ((now_ns - offset_ns) // WINDOW_NS + 1) * WINDOW_NS + offset_ns)
 
 
 class ReactiveControl:
-    """A state for each sender, which goes one up or down with each window; each state has its pause."""
+    """Reactive approach: a state for each sender moves at most one step per window; each state has its pause."""
 
     def __init__(self, congestion: EtsiReactive, meter: BusyRatioMeter) -> None:
         self.waiting = congestion.waiting
@@ -113,22 +117,22 @@ class ReactiveControl:
         open_ns = self._last_ns[node] + self._pause_ns[int(self._state[node])]
         return self._meter.next_poll_ns(node, open_ns, now_ns)
 
-    def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
+    def record_transmission(self, node: int, now_ns: int, airtime_ns: int) -> None:
         """See `CongestionControl`."""
         self._last_ns[node] = now_ns
 
 
 class LimericControl:
-    """Each sender's share of the time, which every second window moves towards one that fits the target."""
+    """Adaptive approach: every second window each sender's duty cycle moves towards the target busy ratio."""
 
     def __init__(self, congestion: Limeric, meter: BusyRatioMeter) -> None:
         self.waiting = congestion.waiting
         self._meter = meter
         self._parameters = congestion
         self.share = np.full(len(meter), (congestion.least + congestion.most) / 2)
-        """(N,), the part of the time that each may send; at first half of the most."""
-        self._before = np.zeros(len(meter))
-        self._smooth = np.zeros(len(meter))
+        """Duty cycle δ (N,): the share of time that each sender may transmit; initially the middle of its range."""
+        self._previous_ratio = np.zeros(len(meter))
+        self._smoothed_ratio = np.zeros(len(meter))
         self._last: dict[int, tuple[int, int]] = {}
 
     def observe(self, number: int, busy_ns: NDArray[np.int64]) -> None:
@@ -136,13 +140,14 @@ class LimericControl:
         over = self._meter.observe(number, busy_ns)
         if number // SLICES % 2:
             self._adapt(over)
-        self._before[over] = self._meter.busy_ratio[over]
+        self._previous_ratio[over] = self._meter.busy_ratio[over]
 
     def _adapt(self, over: NDArray[np.bool_]) -> None:
-        """Steps 1 to 5 of TS 102 687 V1.2.1, 5.4, for some of the senders."""
+        """Apply steps 1 to 5 of TS 102 687 V1.2.1, 5.4, to the senders of the mask `over` (N,)."""
         parameters = self._parameters
-        self._smooth[over] = 0.5 * self._smooth[over] + 0.25 * (self._before[over] + self._meter.busy_ratio[over])
-        step = parameters.beta * (parameters.target - self._smooth[over])
+        both_ratios = self._previous_ratio[over] + self._meter.busy_ratio[over]
+        self._smoothed_ratio[over] = 0.5 * self._smoothed_ratio[over] + 0.25 * both_ratios
+        step = parameters.beta * (parameters.target - self._smoothed_ratio[over])
         step = np.clip(step, -parameters.most_down, parameters.most_up)
         share = (1 - parameters.alpha) * self.share[over] + step
         self.share[over] = np.clip(share, parameters.least, parameters.most)
@@ -152,9 +157,9 @@ class LimericControl:
         if node not in self._last:
             return now_ns
         began_ns, airtime_ns = self._last[node]
-        pause_ns = min(max(round(airtime_ns / self.share[node]), LEAST_PAUSE_NS), MOST_PAUSE_NS)
+        pause_ns = min(max(round(airtime_ns / self.share[node]), MIN_PAUSE_NS), MAX_PAUSE_NS)
         return self._meter.next_poll_ns(node, began_ns + pause_ns, now_ns)
 
-    def sends(self, node: int, now_ns: int, airtime_ns: int) -> None:
+    def record_transmission(self, node: int, now_ns: int, airtime_ns: int) -> None:
         """See `CongestionControl`."""
         self._last[node] = now_ns, airtime_ns

@@ -1,4 +1,4 @@
-"""Who is in range of whom: by the disc, by a matrix, or by the power with which signals arrive on average."""
+"""Connectivity: the nodes in range of each other, by distance, by a matrix, or by the mean received power."""
 
 from __future__ import annotations
 
@@ -12,30 +12,33 @@ from vnet.types import Array, Mask
 
 
 class Connectivity(Protocol):
-    """A law of who is in range of whom; rows are senders, and nobody is in range of itself."""
+    """A model of the nodes in range of each other; rows are senders, and no node is in range of itself.
+
+    `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them.
+    """
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
-        """(N, N), for positions (N, 2) and the distances (N, N) between them."""
+        """Return the mask (N, N) of receivers (columns) in range of each sender (rows)."""
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
-        """(N, N), the mean power of signals, 0 out of range; on the diagonal what a sender sends with."""
+        """Return the mean received power (N, N) in mW, 0 out of range; the diagonal is the transmit power."""
 
 
 def connectivity_of(radio: Radio, seed: int, links: Mask | None) -> Connectivity:
-    """The law that a scenario chooses; `links` (N, N) is `radio.links` as loaded, whose rows are receivers."""
+    """Return the model that a scenario configures; `links` (N, N) is `radio.links` as loaded (rows: receivers)."""
     if radio.path_loss is not None:
         return AboveFloor(MeanPower(radio.path_loss, radio.shadowing, seed), radio.path_loss.floor_dbm)
     return Disc(radio.range_m) if links is None else Matrix(links)
 
 
 def distances_m(position_m: Array) -> Array:
-    """(N, N) between positions (N, 2)."""
+    """Return the distances (N, N) between positions (N, 2), in metres."""
     offset_m = position_m[:, None, :] - position_m[None, :, :]
     return np.asarray(np.hypot(offset_m[..., 0], offset_m[..., 1]))
 
 
-class _Equal:
-    """Without a path loss all signals in range are equally strong: wherever two of them meet, neither arrives."""
+class _EqualPower:
+    """Connectivity without a path loss: all signals in range are equally strong, so overlapping frames are lost."""
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""
@@ -48,8 +51,8 @@ class _Equal:
         return power_mw
 
 
-class Disc(_Equal):
-    """Everybody within `range_m`, and nobody else."""
+class Disc(_EqualPower):
+    """Unit disc: all nodes within `range_m`, and no others."""
 
     def __init__(self, range_m: float) -> None:
         self._range_m = range_m
@@ -59,8 +62,8 @@ class Disc(_Equal):
         return _without_itself(distance_m <= self._range_m)
 
 
-class Matrix(_Equal):
-    """Whom a matrix lets hear, wherever they are."""
+class Matrix(_EqualPower):
+    """Links given by a matrix, independent of positions."""
 
     def __init__(self, links: Mask) -> None:
         self._links = links
@@ -71,7 +74,7 @@ class Matrix(_Equal):
 
 
 class AboveFloor:
-    """Everybody at whom a signal arrives, on average, with at least `floor_dbm`."""
+    """All nodes whose mean received power is at least `floor_dbm`."""
 
     def __init__(self, mean: MeanPower, floor_dbm: float) -> None:
         self.mean = mean
@@ -85,8 +88,8 @@ class AboveFloor:
         """See `Connectivity`."""
         power_dbm = self.mean.dbm(position_m, distance_m)
         itself = np.eye(len(power_dbm), dtype=bool)
-        heard = (power_dbm >= self._floor_dbm) | itself
-        return np.asarray(np.where(heard, 10 ** (np.where(heard, power_dbm, 0.0) / 10), 0.0))
+        above = (power_dbm >= self._floor_dbm) | itself
+        return np.asarray(np.where(above, 10 ** (np.where(above, power_dbm, 0.0) / 10), 0.0))
 
 
 def _without_itself(in_range: Mask) -> Mask:

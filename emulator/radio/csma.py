@@ -1,27 +1,30 @@
-"""Listen before talking: when frames get on air if all senders share it (EDCA of 802.11p, broadcasts only).
+"""CSMA/CA: channel access of senders that share one medium (EDCA of 802.11p, broadcasts only).
 
-**The engine's time.** When a frame ends, and at whom it then arrives, depends on what others send before that. So
-this module has instants of its own, at which no program is woken: a frame is ready, a backoff is over, a frame
-ends. They stand in one heap, ordered by time, then by kind, then by the sender's number, and never by when they
-were put there. Three rules make the result depend only on what was handed over when:
+**Events inside the engine.** The end of a frame, and the receivers that it reaches, depend on what others transmit
+before that. So this module has events of its own, at which no program runs: a frame is ready, a backoff ends, a
+frame ends. One heap orders them by time, then by kind, then by the sender's number, and never by the order of
+insertion. Three rules make the result depend only on which frames were enqueued at which time:
 
-1. `run(t)` does what lies strictly before t. A program that acts at t may hand over a frame at t, whoever is asked
-   first; what is due at t is done only when all of them have.
-2. Whatever is handed over at t makes instants at t or later, and no arrival earlier than a microsecond after a
-   frame's end. So an arrival at t is known once all before t is done, and nothing handed over at t can change it.
-3. A frame keeps what it met when it was handed over (`TopologySnapshot`, `LinkEffects`), and its draws depend on it
-   alone. So it does not matter at which of their calls the drivers move vehicles, as long as they do so between
-   handing over what was sent before and what is sent after.
+1. `run(t)` processes the events strictly before t. A program that runs at t may enqueue a frame at t, in whatever
+   order programs run; the events at t are processed only after all of them have.
+2. A frame enqueued at t causes events at t or later, and no arrival earlier than a microsecond after a frame's end.
+   So the arrivals at t are known once all events before t are processed, and a frame enqueued at t cannot change
+   them.
+3. A frame keeps the state of the network at the time it was enqueued (`TopologySnapshot`, `LinkEffects`), and its
+   draws depend on the frame alone. So drivers may move vehicles at any of their calls, as long as it is after the
+   frames sent before the move are enqueued, and before those sent after it.
 
-Lockstep wants to know whom to wake next: it lets this run up to the earliest instant at which a program acts for
-another reason, but no further than the first arrival at one that waits for it (`Engine.look_ahead`).
+Lockstep asks for the next arrival that wakes a program. `Engine.look_ahead` therefore processes events up to the
+earliest time at which a program runs for another reason, but not beyond the first arrival at a node that waits.
 
-**The rules of access** are those of 802.11-2020, 10.23.2. A frame that is ready while the medium is idle goes on
-air at the next boundary of a slot, counted from AIFS after the medium became idle; one that finds it busy draws a
-backoff, and so does every sender after each of its frames. Backoffs count down one for each slot that begins idle,
-and stand still while the medium is busy. A busy medium is noticed only after 4 µs: who starts within them collides.
-What is left out: broadcasts are not acknowledged, so that there are no further attempts and no longer windows, and
-the longer wait after a frame that could not be read (EIFS).
+**The access rules** are those of 802.11-2020, 10.23.2. A frame that is ready while the medium is idle is
+transmitted at the next slot boundary, counted from AIFS after the medium became idle. A frame that finds the medium
+busy draws a backoff, and so does every sender after each of its frames. A backoff counts down by one for each slot
+that begins idle, and is frozen while the medium is busy. A busy medium is detected after 4 µs: senders that start
+within this time collide.
+
+Not modelled: acknowledgements, and with them retries and growing contention windows (broadcasts have none); and
+EIFS, the longer wait after a frame that could not be decoded.
 """
 
 from __future__ import annotations
@@ -46,18 +49,19 @@ from vnet.units import NS_PER_MS
 
 END, READY, SLOWLY_READY, ACCESS = range(4)
 
-_Instant = tuple[int, int, int, int, Frame | None]
-"""Something that happens: when, which kind, at which sender, which of its plans, and with which frame."""
+_Event = tuple[int, int, int, int, Frame | None]
+"""An event: its time in ns, kind, sender, number among the sender's events, and frame."""
 
 
 @dataclass(slots=True, eq=False)
 class _Station:
-    """A sender: the frames that wait, and how its backoff stands.
+    """A sender: its waiting frames and the state of its backoff.
 
-    `queue` are the frames that are ready, and `coming` is how many more will be; `held` is true while congestion
-    control, which is asked again at `next_poll_ns`, holds them back. `wants` is true while a frame waits for the
-    medium and for nothing else. `slots` are left of its backoff, which counts from `from_ns` while the medium
-    is idle, and pauses while it is `busy` there. `plans` counts planned accesses: of these only `access` happens.
+    `queue` holds the frames that are ready, `coming` counts those that will be; `ready_ns` is when the last of them
+    is. `held` is true while congestion control holds them back; it is polled next at `next_poll_ns`. `contends` is
+    true while a frame waits for nothing but the medium. `slots` remain of the backoff, which counts from `from_ns`
+    while the medium is idle and is frozen while it is `busy` at this sender. `planned` counts the planned events;
+    of the planned accesses only the one numbered `access` is valid.
     """
 
     node: int
@@ -67,37 +71,37 @@ class _Station:
     held: bool = False
     next_poll_ns: int = -1
     on_air: bool = False
-    wants: bool = False
+    contends: bool = False
     slots: int = 0
     from_ns: int = 0
     busy: bool = False
-    plans: int = 0
+    planned: int = 0
     access: int = 0
 
     @property
     def access_ns(self) -> int:
-        """When the backoff is over if the medium stays idle."""
+        """Time in ns at which the backoff ends if the medium stays idle."""
         return self.from_ns + self.slots * SLOT_NS
 
 
-class Times(NamedTuple):
-    """Of an access category: how long the medium must be idle (ns), and the largest backoff (slots)."""
+class EdcaParameters(NamedTuple):
+    """Parameters of an access category: the interframe space AIFS in ns, and the largest backoff in slots."""
 
-    aifs: int
+    aifs_ns: int
     window: int
 
 
-def times_ns(mac: Mac) -> Times:
-    """The times of the access category that a scenario chooses."""
+def edca_parameters(mac: Mac) -> EdcaParameters:
+    """Return the parameters of the access category that a scenario configures."""
     aifsn, window = AIFSN_AND_CW[mac.access_category]
-    return Times(SIFS_NS + aifsn * SLOT_NS, window)
+    return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window)
 
 
 class Csma:
-    """Access to one medium that all `count` vehicles share; see the module's text."""
+    """MAC of `count` vehicles that share one medium; see the module's docstring."""
 
     def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int, seed: int) -> None:
-        self._aifs_ns, self._window = times_ns(mac)
+        self._aifs_ns, self._window = edca_parameters(mac)
         self._signals = signals
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._bitrate_mbps = radio.bitrate_mbps
@@ -108,19 +112,19 @@ class Csma:
         if self._congestion is not None:
             self.medium.listen(self._congestion.observe)
         self._throttle = Throttle()
-        self._instants: list[_Instant] = []
+        self._events: list[_Event] = []
         self._stations: dict[int, _Station] = {}
         self._counting: dict[int, _Station] = {}
-        """The stations whose backoff is not over, as far as anybody knows."""
+        """Stations that count down or hold a backoff."""
         self._now_ns = 0
         self.sent: list[Frame] = []
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """From now on frames of these senders come to the medium at these bitrates, and no others are slowed."""
+        """Throttle exactly these senders from now on: their frames reach the MAC at these bitrates."""
         self._throttle.set(bitrate_mbps)
 
     def enqueue(self, frame: Frame) -> None:
-        """Take a frame; it is ready after its jitter, and not before those that were handed over earlier."""
+        """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
         station = self._stations.get(frame.sender)
         if station is None:
             station = self._stations[frame.sender] = _Station(frame.sender)
@@ -146,41 +150,41 @@ class Csma:
         return station.coming + len(station.queue) >= self._limit
 
     def _is_quiet(self, time_ns: int) -> bool:
-        """Whether nothing else has to happen before a frame is ready at this instant.
+        """Return true if no event has to be processed before a frame that is ready at `time_ns`.
 
-        None goes on air at the instant at which it is ready, so that those of one instant do not meet.
+        No frame goes on air at the time at which it is ready, so frames that are ready at one time do not interact.
         """
-        return self._now_ns <= time_ns and (not self._instants or self._instants[0][:2] > (time_ns, READY))
+        return self._now_ns <= time_ns and (not self._events or self._events[0][:2] > (time_ns, READY))
 
     def _leave(self, frame: Frame, sender_outcome: Outcome, time_ns: int) -> None:
         frame.sender_outcome, frame.end_ns = sender_outcome, time_ns
         self.sent.append(frame)
 
     def _plan(self, time_ns: int, kind: int, station: _Station, frame: Frame | None = None) -> None:
-        station.plans += 1
+        station.planned += 1
         if kind == ACCESS:
-            station.access = station.plans
-        if time_ns < self._now_ns:  # what was sent over a network may come a little after its time
+            station.access = station.planned
+        if time_ns < self._now_ns:  # in real time a frame may reach the emulator a little after its time
             time_ns = self._now_ns
-        heappush(self._instants, (time_ns, kind, station.node, station.plans, frame))
+        heappush(self._events, (time_ns, kind, station.node, station.planned, frame))
 
     def next_ns(self) -> int | None:
-        """When something happens next."""
-        return self._instants[0][0] if self._instants else None
+        """Return the time of the next event, or None."""
+        return self._events[0][0] if self._events else None
 
     def run(self, time_ns: int | None) -> None:
-        """Do all that happens before `time_ns`, or all there is to do."""
-        instants = self._instants
-        while instants and (time_ns is None or instants[0][0] < time_ns):
-            self._happen(*heappop(instants))
+        """Process all events before `time_ns`, or all events if it is None."""
+        events = self._events
+        while events and (time_ns is None or events[0][0] < time_ns):
+            self._process(*heappop(events))
         if time_ns is not None and time_ns > self._now_ns:
             self._now_ns = time_ns
 
     def step(self) -> None:
-        """Do what happens next."""
-        self._happen(*heappop(self._instants))
+        """Process the next event."""
+        self._process(*heappop(self._events))
 
-    def _happen(self, now_ns: int, kind: int, node: int, plan: int, frame: Frame | None) -> None:
+    def _process(self, now_ns: int, kind: int, node: int, plan: int, frame: Frame | None) -> None:
         self._now_ns = now_ns
         station = self._stations[node]
         if kind == ACCESS:
@@ -197,17 +201,17 @@ class Csma:
             self._ready(station, frame, now_ns)
 
     def _ready(self, station: _Station, frame: Frame | None, now_ns: int) -> None:
-        """A frame is ready, or the sender's congestion control is to be asked again."""
+        """Process a frame that is ready, or (None) poll the sender's congestion control again."""
         if frame is not None:
             station.queue.append(frame)
-        if station.queue and not station.wants and not station.on_air:
-            self._want(station, now_ns)
+        if station.queue and not station.contends and not station.on_air:
+            self._contend(station, now_ns)
 
-    def _is_let_through(self, station: _Station, congestion: CongestionControl, now_ns: int) -> bool:
-        """Whether congestion control lets a station's next frame go; those that are too many never will.
+    def _passes_congestion_control(self, station: _Station, congestion: CongestionControl, now_ns: int) -> bool:
+        """Return true if congestion control lets a station's next frame go; drop the frames beyond `waiting`.
 
-        A frame that was held back gets to the medium with its jitter, like any other: else those that collided once
-        would come, after the same pause, at the same instant again.
+        A frame that was held back waits for its access jitter before it reaches the MAC, like any other. Otherwise
+        frames that collided once would be ready, after equal pauses, at the same time again.
         """
         self.medium.count(now_ns)
         next_poll_ns = congestion.next_poll_ns(station.node, now_ns)
@@ -226,11 +230,12 @@ class Csma:
             self._leave(station.queue.popleft(), Outcome.held_back, now_ns)
         return False
 
-    def _want(self, station: _Station, now_ns: int) -> None:
-        """Let the first frame of a station go on air as soon as it may."""
-        if self._congestion is not None and not self._is_let_through(station, self._congestion, now_ns):
+    def _contend(self, station: _Station, now_ns: int) -> None:
+        """Plan the transmission of a station's first frame as early as the access rules allow."""
+        congestion = self._congestion
+        if congestion is not None and not self._passes_congestion_control(station, congestion, now_ns):
             return
-        station.wants = True
+        station.contends = True
         node = station.node
         if node in self._counting and (station.busy or station.access_ns > now_ns):
             if not station.busy:
@@ -252,53 +257,53 @@ class Csma:
         return int(sender_draw(frame, which) * (self._window + 1))
 
     def _begin(self, station: _Station, now_ns: int) -> None:
-        """A frame goes on air."""
+        """Start to transmit a station's first frame."""
         frame = station.queue.popleft()
-        station.wants, station.on_air = False, True
+        station.contends, station.on_air = False, True
         self._counting.pop(station.node, None)
         frame.on_air_ns = now_ns
         airtime = airtime_ns(frame.size_bytes, self._bitrate_mbps)
         if self._congestion is not None:
-            self._congestion.sends(station.node, now_ns, airtime)
+            self._congestion.record_transmission(station.node, now_ns, airtime)
         self.medium.begin(frame, now_ns)
         self._plan(now_ns + airtime, END, station, frame)
-        self._look(now_ns)
+        self._update_backoffs(now_ns)
 
     def _end(self, station: _Station, frame: Frame, now_ns: int) -> None:
-        """A frame has been sent; its sender backs off before the next."""
+        """End a transmission; its sender draws a backoff before its next frame."""
         station.on_air = False
         self.medium.end(frame, now_ns)
         self._leave(frame, Outcome.pending, now_ns)
         station.slots = self._draw(frame, NEXT_BACKOFF)
         station.busy, station.from_ns = self.medium.is_sensed(station.node), now_ns + self._aifs_ns
         self._counting[station.node] = station
-        self._look(now_ns)
+        self._update_backoffs(now_ns)
         if station.queue:
-            self._want(station, now_ns)
+            self._contend(station, now_ns)
 
-    def _look(self, now_ns: int) -> None:
-        """Every station whose backoff counts looks whether the medium is still what it was."""
+    def _update_backoffs(self, now_ns: int) -> None:
+        """Update every backoff after the medium changed: freeze, resume or end it."""
         over = []
         sensed = self.medium.sensed
         for station in self._counting.values():
             busy = sensed is not None and bool(sensed[station.node])
             if busy == station.busy:
-                if not busy and not station.wants and station.from_ns + station.slots * SLOT_NS <= now_ns:
+                if not busy and not station.contends and station.from_ns + station.slots * SLOT_NS <= now_ns:
                     over.append(station.node)
                 continue
             station.busy = busy
             if not busy:
                 station.from_ns = now_ns + self._aifs_ns
-                if station.wants:
+                if station.contends:
                     self._plan(station.access_ns, ACCESS, station)
                 continue
             noticed_ns = now_ns + DETECTION_NS
             if station.access_ns >= noticed_ns:
-                # A slot that has begun idle counts, though it did not stay so.
+                # A slot that began idle counts, even if the medium became busy within it.
                 begun = max(0, (noticed_ns - station.from_ns) // SLOT_NS + 1)
                 station.slots -= min(begun, station.slots)
                 station.access = 0
-            elif not station.wants:
+            elif not station.contends:
                 over.append(station.node)
         for node in over:
             del self._counting[node]

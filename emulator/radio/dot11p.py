@@ -1,4 +1,4 @@
-"""802.11p in 10 MHz: how long a frame is on air, how it gets there, and how often it arrives (802.11-2020)."""
+"""802.11p in 10 MHz: airtimes, timing of channel access, and error model (IEEE 802.11-2020)."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ from emulator.scenario.scenario import Radio
 from vnet.types import Array
 
 PREAMBLE_NS = 40_000
-"""Training sequences (32 µs) and the field SIGNAL (8 µs)."""
+"""Duration of the training sequences (32 µs) and the SIGNAL field (8 µs)."""
 SYMBOL_NS = 8_000
+"""Duration of an OFDM symbol."""
 SERVICE_AND_TAIL_BITS = 22
+"""Bits of a frame beside its bytes: SERVICE (16) and tail (6)."""
 SLOT_NS = 13_000
+"""Slot time."""
 SIFS_NS = 32_000
+"""Short interframe space."""
 DETECTION_NS = 4_000
-"""How long a signal must be there before it is noticed: 802.11 allows 8 µs in 10 MHz, ns-3 takes 4."""
+"""Time until a signal is detected: 802.11 allows 8 µs in 10 MHz, ns-3 uses 4."""
 AIFSN_AND_CW = {"VO": (2, 3), "VI": (3, 7), "BE": (6, 15), "BK": (9, 15)}
-"""Access categories outside a basic service set (802.11-2020, table 9-156); broadcasts are never sent again, so
-that only the least contention window counts."""
+"""AIFSN and CWmin of the access categories outside a basic service set (802.11-2020, table 9-156). Broadcasts are
+never retried, so the contention window never grows."""
 
-# Bits a subcarrier, and numerator and denominator of the code rate (table 17-4).
+# Bit rate in Mbit/s: bits a subcarrier, numerator and denominator of the code rate (table 17-4).
 _MODES = {
     3.0: (1, 1, 2),
     4.5: (1, 3, 4),
@@ -36,8 +40,9 @@ _MODES = {
 }
 _CARRIERS = 48
 
-# Weights of error events by distance, from the free distance on, as in Pei and Henderson 2010 (the "NIST" model of
-# ns-3) after Frenger, Orten and Ottosson 1999. Rate 1/2 has only even distances.
+# Code rate: free distance, step between distances, and weights of the error events by distance, as in Pei and
+# Henderson 2010 (the "NIST" model of ns-3) after Frenger, Orten and Ottosson 1999. Rate 1/2 has only even
+# distances.
 _EVENTS: dict[tuple[int, int], tuple[int, int, tuple[float, ...]]] = {
     (1, 2): (10, 2, (36, 211, 1404, 11633, 77433, 502690, 3322763, 21292910, 134365911)),
     (2, 3): (6, 1, (3, 70, 285, 1276, 6160, 27128, 117019, 498860, 2103891, 8784123)),
@@ -45,44 +50,45 @@ _EVENTS: dict[tuple[int, int], tuple[int, int, tuple[float, ...]]] = {
 }
 
 COST_STEPS = 1 << 40
-"""Costs are whole numbers of 2⁻⁴⁰ nepers, so that a sum does not depend on how the time was cut."""
-DEAD_PER_NS = 0.04
-"""A microsecond at this cost, in nepers a nanosecond, is the end of any frame; and the longest frame's time at it
-is still less than 2⁶³ steps."""
+"""Costs are integer multiples of 2⁻⁴⁰ nepers, so that their sum does not depend on how a frame's time is
+divided."""
+MAX_COST_PER_NS = 0.04
+"""Upper bound of the cost in nepers a nanosecond: a microsecond of it destroys any frame, and the longest frame
+at this cost still sums to less than 2⁶³ steps."""
 
 
 @lru_cache(maxsize=4096)
 def airtime_ns(size_bytes: int, bitrate_mbps: float) -> int:
-    """How long a frame of this many bytes in all is on air: 40 µs + 8 µs · ⌈(22 + 8 L) / bits a symbol⌉."""
+    """Airtime in ns of a frame of L bytes, headers included: 40 µs + 8 µs · ⌈(22 + 8 L) / bits a symbol⌉."""
     bits, numerator, denominator = _MODES[bitrate_mbps]
     per_symbol = _CARRIERS * bits * numerator // denominator
     return PREAMBLE_NS + SYMBOL_NS * -(-(SERVICE_AND_TAIL_BITS + 8 * size_bytes) // per_symbol)
 
 
 def airtimes_ns(radio: Radio, size_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How long frames of these sizes are on air by a scenario: without a physical radio, bits by bit rate."""
+    """Airtimes in ns (any shape) of frames of these sizes; without a physical radio, their bits / bitrate."""
     if not radio.is_physical:
         return np.rint(size_bytes * 8_000 / radio.bitrate_mbps).astype(np.int64)
-    sizes, place = np.unique(size_bytes, return_inverse=True)
-    return np.array([airtime_ns(size, radio.bitrate_mbps) for size in sizes.tolist()], np.int64)[place]
+    sizes, index = np.unique(size_bytes, return_inverse=True)
+    return np.array([airtime_ns(size, radio.bitrate_mbps) for size in sizes.tolist()], np.int64)[index]
 
 
 def cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:
-    """What a nanosecond of a frame's payload costs at these signal-to-noise ratios (linear, any shape).
+    """Cost of a nanosecond of payload at these signal-to-noise ratios (linear, any shape), in `COST_STEPS`.
 
-    A frame arrives with probability exp(-cost · time). The bit error rates are those of the NIST model (Pei and
+    A frame is received with probability exp(-cost · time). The bit error rates are those of the NIST model (Pei and
     Henderson 2010): union bounds of the Viterbi decoder with hard decisions.
     """
     costs = np.zeros(snr.shape, np.int64)
-    costly = snr < _free_snr(bitrate_mbps)
+    costly = snr < _error_free_snr(bitrate_mbps)
     if costly.any():
         costs[costly] = _cost(snr[costly], bitrate_mbps)
     return costs
 
 
 @lru_cache
-def _free_snr(bitrate_mbps: float) -> float:
-    """From which ratio on a nanosecond costs nothing, in whole steps."""
+def _error_free_snr(bitrate_mbps: float) -> float:
+    """Return the least signal-to-noise ratio (linear, on a grid of 1/8 dB) at which the cost rounds to 0 steps."""
     ratios = 10 ** (np.arange(-10, 60, 0.125) / 10)
     return float(ratios[np.flatnonzero(_cost(ratios, bitrate_mbps))[-1] + 1])
 
@@ -98,11 +104,11 @@ def _cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:
         error = error * base + weight
     error = np.minimum(error * base ** (first // step) / (2 * numerator), 1 - 1e-12)
     nepers_per_ns = -np.log1p(-error) * (bitrate_mbps * 1e-3)
-    return np.asarray(np.minimum(nepers_per_ns, DEAD_PER_NS) * COST_STEPS).astype(np.int64)
+    return np.asarray(np.minimum(nepers_per_ns, MAX_COST_PER_NS) * COST_STEPS).astype(np.int64)
 
 
 def _raw_error_rate(snr: Array, bits: int) -> Array:
-    """Before decoding: BPSK, QPSK and square QAM of so many bits a subcarrier."""
+    """Bit error rate before decoding: BPSK, QPSK or square QAM of `bits` a subcarrier."""
     if bits <= 2:
         return np.asarray(0.5 * erfc(np.sqrt(snr / bits)))
     side = 2 ** (bits // 2)
@@ -110,6 +116,6 @@ def _raw_error_rate(snr: Array, bits: int) -> Array:
 
 
 def arrival_probability(snr: Array, on_air_ns: int, bitrate_mbps: float) -> Array:
-    """The probability that a frame arrives that was detected and is on air so long, without interference."""
+    """Probability that a detected frame of this airtime is received, without interference."""
     payload_ns = on_air_ns - PREAMBLE_NS
     return np.asarray(np.exp(-cost(snr, bitrate_mbps) * (payload_ns / COST_STEPS)))

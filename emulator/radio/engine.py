@@ -1,12 +1,12 @@
 """The engine: frames in, deliveries out, in virtual time.
 
-It knows no Zenoh, no asyncio and no wall clock. Drivers `transmit` what nodes send, ask when something arrives
-next, and `advance` to an instant. Every (frame, receiver) pair gets exactly one outcome, final at the instant of
-its arrival; pairs in range are rows of the trace, pairs out of range are counted.
+It knows no Zenoh, no asyncio and no wall clock. Drivers `transmit` the nodes' frames, ask for the time of the next
+arrival, and `advance` to a time. Every reception (a frame at a receiver) gets exactly one outcome, which is final
+at the time of its arrival. Receptions in range are rows of the trace; those out of range are only counted.
 
-A frame passes three places: it is handed over, it waits for the air and is on it, and it has been sent. How things
-stand (positions, who is up, faults) is kept with the frame when it is handed over. Only then do the stages run,
-over all frames at once that have been sent since anybody last asked.
+A frame passes three steps: it is enqueued, it waits for the medium and is on air, and it has been sent. The state
+of the network (positions, nodes that are up, faults) is kept with the frame when it is enqueued. The stages run
+after it has been sent, over all frames at once that have been sent since the last query.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from emulator.faults.plan import PlannedFault
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
 from emulator.radio.frames import Frame, Receptions, Stage
-from emulator.radio.in_flight import NEVER_NS, Deliveries, Delivery, InFlight
+from emulator.radio.in_flight import NO_ARRIVAL_NS, Deliveries, Delivery, InFlight
 from emulator.radio.link_faults import LinkFaults
 from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
@@ -50,14 +50,14 @@ __all__ = ["Deliveries", "Delivery", "Engine"]
 
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
 _OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
-"""What a frame has for these columns of the trace."""
+"""Returns a frame's values of `_COLUMNS` of the trace."""
 
 
 class Engine:
-    """The state of the emulated radio. Nodes are known by their numbers, 0 … N-1, in the order of `node_ids`.
+    """The state of the emulated radio. Nodes have the numbers 0 … N-1 in the order of `node_ids`.
 
-    `position_m` (N, 2); `links` (N, N) is `radio.links` as loaded, whether i (row) hears j (column), or None where
-    `radio.range_m` decides.
+    `position_m` (N, 2) are positions in metres. `links` (N, N) is `radio.links` as loaded: entry (i, j) is true if
+    i receives j. It is None if range or path loss decide.
     """
 
     def __init__(
@@ -98,31 +98,31 @@ class Engine:
 
     @property
     def trace(self) -> Trace:
-        """One row for each frame that has been sent and receiver in range."""
+        """The trace: one row for each reception in range of the frames that have been sent."""
         self._settle()
         return self._trace
 
     @property
     def counts(self) -> dict[Outcome, int]:
-        """How many pairs have which outcome so far."""
+        """Number of receptions by outcome so far."""
         self._settle()
         return self._counts
 
     def set_positions(self, position_m: NDArray[np.float64]) -> None:
-        """Move the vehicles: (N, 2) in metres. Frames handed over before keep what they met."""
+        """Move the vehicles to (N, 2) in metres. Frames that were enqueued before are not affected."""
         self._topology.move(position_m)
 
     @property
     def in_range(self) -> NDArray[np.bool_]:
-        """(N, N), rows are senders: who is in range of whom, where the vehicles are now."""
+        """Mask (N, N) of the receivers (columns) in range of each sender (rows) at the present positions."""
         return self._topology.now.in_range
 
     def set_up(self, node: int, up: bool) -> None:
-        """A node that is down sends nothing, and what arrives at it is `receiver_down`."""
+        """Set a node up or down. A node that is down sends nothing; what arrives there is `receiver_down`."""
         self._topology.set_up(node, up)
 
     def set_faults(self, active: Sequence[PlannedFault], time_ns: int) -> None:
-        """From now on, at `time_ns`, these faults act on frames and no others. What is in flight stays decided."""
+        """Let exactly these faults act from `time_ns` on. Receptions in flight are not affected."""
         for planned in active:
             self._trace.name_cause(planned.number, planned.label)
         self._links.update(active, time_ns)
@@ -132,10 +132,10 @@ class Engine:
         self._copies[sender, seq] += 1
         return self._copies[sender, seq]
 
-    # Handing over.
+    # Enqueueing.
 
     def transmit(self, time_ns: int, node: int, payloads: Sequence[bytes]) -> None:
-        """Frames that `node` broadcasts at `time_ns`, in order. Those of a node that is down are discarded."""
+        """Enqueue frames that `node` broadcasts at `time_ns`, in order. A node that is down sends nothing."""
         if not self._topology.is_up(node):
             return
         self._mac.run(time_ns)
@@ -143,38 +143,38 @@ class Engine:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
             if not self._senders.misbehave:
-                self._hand_over(time_ns, node, Outgoing(payload, seq))
+                self._enqueue(time_ns, node, Outgoing(payload, seq))
                 continue
-            self._settle()  # copies that arrive of frames sent before are numbered before new ones are sent
+            self._settle()  # duplicates of frames sent before are numbered before the copies sent now
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
-                self._hand_over(time_ns, node, outgoing)
+                self._enqueue(time_ns, node, outgoing)
 
-    def _hand_over(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
+    def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
         frame = Frame(
-            node,
-            outgoing.seq,
-            time_ns,
-            len(outgoing.payload),
-            self._topology.now,
-            self._links.effects,
-            outgoing.copy,
-            outgoing.draw,
-            outgoing.payload,
-            outgoing.alias or self._node_ids[node],
-            outgoing.cause,
+            sender=node,
+            seq=outgoing.seq,
+            sent_ns=time_ns,
+            size_bytes=len(outgoing.payload),
+            topology=self._topology.now,
+            effects=self._links.effects,
+            copy=outgoing.copy,
+            draw=outgoing.draw,
+            payload=outgoing.payload,
+            name=outgoing.alias or self._node_ids[node],
+            cause=outgoing.cause,
         )
-        if frame.size_bytes > self._max_payload_bytes:  # never gets as far as the queue
+        if frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
             frame.sender_outcome, frame.end_ns = Outcome.oversize, time_ns
             self._mac.sent.append(frame)
         else:
             self._mac.enqueue(frame)
-        if frame.effects.copy:  # its copies are numbered before the next frame's
+        if frame.effects.copy:  # its duplicates are numbered before those of the next frame
             self._settle()
 
-    # What has been sent.
+    # Frames that have been sent.
 
     def _settle(self) -> None:
-        """Let the stages decide on the frames that have been sent."""
+        """Run the stages over the frames that have been sent."""
         if frames := self._mac.sent:
             self._mac.sent = []
             receptions = Receptions.of(frames, len(self._node_ids))
@@ -183,16 +183,16 @@ class Engine:
             self._book(frames, receptions)
 
     def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
-        """Write the rows of pairs in range, and put those that arrive where they are awaited."""
+        """Append the receptions in range to the trace, and put the pending ones in flight."""
         for (number, node), flips in receptions.flips.items():
             frames[number].altered[node] = _flipped(frames[number].payload, flips)
         count = len(self._node_ids)
-        which = receptions.outcome != OUT_OF_RANGE
-        each = np.count_nonzero(which, axis=1)
-        receiver = np.broadcast_to(np.arange(count), which.shape)[which]
+        near = receptions.outcome != OUT_OF_RANGE
+        each = np.count_nonzero(near, axis=1)
+        receiver = np.broadcast_to(np.arange(count), near.shape)[near]
         self._counts[Outcome.out_of_range] += len(frames) * (count - 1) - len(receiver)
         self._enter(
-            frames, each, receiver, receptions.outcome[which], receptions.arrival_ns[which], receptions.cause[which]
+            frames, each, receiver, receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
         )
         for number, copied, later_ns, cause in receptions.copies:
             again = np.flatnonzero(copied & (receptions.outcome[number] == PENDING))
@@ -212,42 +212,46 @@ class Engine:
         arrival_ns: NDArray[np.int64],
         cause: NDArray[np.int16] | np.int16,
     ) -> None:
-        """Pairs as rows of the trace, and perhaps in flight: of `each` frame so many, one after the other."""
+        """Append receptions to the trace, and put the pending ones in flight.
+
+        `each` (K,) is the number of receptions of each frame; the other arrays (n,) hold those of the first frame,
+        then those of the second, and so on.
+        """
         columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
         digests = np.array([_digest(frame.payload) for frame in frames], np.uint64)
         first = self._trace.append(
             {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns
         )
-        place = np.repeat(np.arange(len(frames)), each)
+        frame_index = np.repeat(np.arange(len(frames)), each)
         for number, frame in enumerate(frames):
             for node, payload in frame.altered.items():
-                for row in np.flatnonzero((place == number) & (receiver == node)).tolist():
+                for row in np.flatnonzero((frame_index == number) & (receiver == node)).tolist():
                     self._trace.alter(first + row, _digest(payload))
         for kind, number in enumerate(np.bincount(outcome).tolist()):
             if number:
                 self._counts[Outcome(kind)] += number
         flying = np.flatnonzero(outcome == PENDING)
-        self._in_flight.add(frames, place[flying], receiver[flying], first + flying, arrival_ns[flying])
+        self._in_flight.add(frames, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying])
 
-    # Arriving.
+    # Arrivals.
 
     def next_arrival_ns(self, node: int) -> int | None:
-        """When the next frame that has been sent arrives at `node`."""
+        """Return the time of the next arrival at `node` among the frames that have been sent, or None."""
         self._settle()
         return self._in_flight.next_ns(node)
 
     def next_time(self) -> int | None:
-        """When `advance` must be called next: something arrives, or happens on the air."""
+        """Return the time of the next arrival or MAC event, at which `advance` must be called, or None."""
         self._settle()
-        # What happens on the air at an instant happens right after it.
+        # The events of the MAC at a time are processed when time has passed beyond it.
         air_ns = self._mac.next_ns()
         times_ns = (self._in_flight.soonest_ns(), None if air_ns is None else air_ns + 1)
         return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
     def look_ahead(self, time_ns: int, nodes: Sequence[int]) -> None:
-        """Let what happens on the air come as far as `time_ns`, or the first arrival at one of these nodes.
+        """Process the events of the MAC up to `time_ns`, or up to the first arrival at one of these nodes.
 
-        The caller promises that nobody hands over anything before that.
+        The caller guarantees that no frame is enqueued before that.
         """
         if self._csma is None:
             return
@@ -258,17 +262,17 @@ class Engine:
                 until_ns = self._first_ns(time_ns, nodes)
 
     def _first_ns(self, time_ns: int, nodes: Sequence[int]) -> int:
-        """`time_ns`, or the first arrival at one of these nodes if that is earlier."""
+        """Return `time_ns`, or the first arrival at one of these nodes if that is earlier."""
         arrivals_ns = [self.next_arrival_ns(node) for node in nodes]
         return min([time_ns, *(arrival_ns for arrival_ns in arrivals_ns if arrival_ns is not None)])
 
     def pending_rows(self) -> list[int]:
-        """The rows of the trace whose frames are on their way."""
+        """Return the row numbers of the trace whose receptions are in flight."""
         self._settle()
         return self._in_flight.rows()
 
     def advance(self, time_ns: int) -> Deliveries:
-        """All that arrives up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
+        """Return all packets that arrive up to `time_ns`, ordered by (arrival, sender, seq, receiver)."""
         self._mac.run(time_ns)
         if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._mac.sent):
             self._settle()
@@ -280,16 +284,16 @@ class Engine:
         up = self._topology.up[receiver]
         self._trace.decide(row[up], Outcome.delivered)
         self._trace.decide(row[~up], Outcome.receiver_down)
-        heard = int(up.sum())
-        self._counts[Outcome.delivered] += heard
-        self._counts[Outcome.receiver_down] += len(row) - heard
+        delivered = int(up.sum())
+        self._counts[Outcome.delivered] += delivered
+        self._counts[Outcome.receiver_down] += len(row) - delivered
         self._counts[Outcome.pending] -= len(row)
         return self._in_flight.deliveries(table[:, up], self._trace)
 
     def busy_ratios(self, time_ns: int) -> list[NDArray[np.float64]]:
-        """How busy each vehicle found the medium, (N,) each, in all windows that are over by `time_ns`.
+        """Return the channel busy ratios (N,) of every window that ends by `time_ns`; none without `[radio.mac]`.
 
-        Nothing handed over from now on may be sent before that. None where senders share no medium.
+        No frame may be enqueued before `time_ns` after this call.
         """
         if self._csma is None:
             return []
@@ -298,16 +302,16 @@ class Engine:
         return self._csma.medium.windows[: time_ns // WINDOW_NS]
 
     def lose(self, delivery: Delivery) -> None:
-        """A delivery that never reached its process (real time only); once for each."""
+        """Change a delivery that never reached its process (real time only) to `transport`; call once for each."""
         self._trace.decide([delivery.row], Outcome.transport)
         self._counts[Outcome.delivered] -= 1
         self._counts[Outcome.transport] += 1
 
     def drain(self) -> None:
-        """End of the run: everything in flight arrives, and nobody is woken for it."""
+        """End the run: complete every transmission and reception, without waking a program."""
         self._mac.run(None)
         self._settle()
-        self._arrive(NEVER_NS - 1)
+        self._arrive(NO_ARRIVAL_NS - 1)
 
 
 def _digest(payload: bytes) -> int:
@@ -316,6 +320,6 @@ def _digest(payload: bytes) -> int:
 
 def _flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
     changed = bytearray(payload)
-    for place, change in flips:
-        changed[place] ^= change
+    for position, mask in flips:
+        changed[position] ^= mask
     return bytes(changed)

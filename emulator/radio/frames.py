@@ -1,7 +1,7 @@
-"""What goes through the channel: frames, and the pairs of several frames with every receiver.
+"""Frames, and their receptions: one for each frame and receiver.
 
-A frame keeps how things stood when it was handed over (who could hear whom, which faults acted), so that nothing
-that happens while it waits or is on air can change its fate, in whatever pieces the engine's time passes.
+A frame keeps the state of the network at the time it was enqueued (connectivity, acting faults). So its outcomes do
+not depend on changes while it waits or is on air, nor on the steps in which the engine's time advances.
 """
 
 from __future__ import annotations
@@ -18,18 +18,21 @@ from emulator.radio.topology import TopologySnapshot
 from vnet.types import Mask
 
 NO_CAUSE = -1
+"""Number of the causing fault, if there is none."""
 NOT_ON_AIR = -1
+"""Start of the transmission of a frame that was never transmitted, or whose start is not modelled."""
 
 
 @dataclass(slots=True, eq=False)
 class Signal:
-    """A frame as it arrives at the receivers, (N,) each; at its own sender, with the power that it was sent with.
+    """A frame's signal at the receivers, (N,) each; the entry of its own sender holds the transmit power.
 
-    `random_draws` are words of 64 random bits, which give the draws that decide about it. `power_mw` is 0 out of
-    range.
+    `random_draws` are words of 64 random bits, which give the draws that decide about it. `power_mw` is the
+    received power in mW, 0 out of range.
 
-    `locked` is where a receiver has set itself on this frame, or None where nothing kept it from doing so.
-    `pieces` are the times until which the sum of all powers on air was so much (N,); none if it was alone.
+    `locked` marks the receivers that are locked on this frame; None if no other frame kept any from it. `pieces`
+    are tuples (time, total power): until this time in ns the sum of all powers on air was this (N,), in mW. They
+    are empty for a frame that was alone on air.
     """
 
     random_draws: NDArray[np.uint64]
@@ -40,15 +43,16 @@ class Signal:
 
 @dataclass(slots=True, eq=False)
 class Frame:
-    """One broadcast; `sender` is a receiver number, `seq` counts the sender's frames.
+    """One broadcast. `sender` is a node's number; `seq` counts the sender's frames.
 
-    `copy` counts the times that a frame is sent again (by a fault); such a copy has a row, and luck, of its own:
-    `draw` tells its draws from the original's, and depends only on the fault and on what it sends again. It goes
-    under `name`, and `cause` is the number of the fault that sends or changes it.
+    `copy` counts the times that a fault sends the frame again. Such a copy has rows and random draws of its own:
+    `draw` distinguishes its draws from the original's, and depends only on the fault and on the repeated frame. Its
+    sender's name is `name`, and `cause` is the number of the fault that sends or changes it.
 
-    `topology` and `effects` are those of its handing over. `sender_outcome` is what its sender decides (oversize,
-    queue_full, held_back, or pending if it was sent). It was on air from `on_air_ns`, NOT_ON_AIR if nobody knows,
-    to `end_ns`. `altered` are the payloads that arrive with other bytes, by receiver.
+    `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
+    oversize, queue_full, held_back, or pending for a frame that is sent. The frame is on air from `on_air_ns`
+    (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive with other bytes, by
+    receiver.
     """
 
     sender: int
@@ -74,39 +78,40 @@ class LinkEffects(Protocol):
 
     @property
     def lose(self) -> bool:
-        """Whether any reception may be lost."""
+        """True if any reception may be lost."""
 
     @property
     def change(self) -> bool:
-        """Whether a reception may arrive later, more than once, or with other bytes."""
+        """True if a reception may arrive later, more than once, or with other bytes."""
 
     @property
     def copy(self) -> bool:
-        """Whether a reception may arrive more than once."""
+        """True if a reception may arrive more than once."""
 
     def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
         """Yield, in the order in which faults act, a fault's number and the receivers (N,) that lose the frame."""
 
     def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
-        """Change the pending receptions of frame number `index`."""
+        """Delay, duplicate or alter the pending receptions of frame number `index`."""
 
 
 class Copied(NamedTuple):
-    """Pairs of frame number `place` that arrive once more: which (N,), how much later, and by which fault."""
+    """Duplicates of frame number `frame_index`: mask of receivers (N,), delay in ns, and number of the fault."""
 
-    place: int
-    which: NDArray[np.bool_]
+    frame_index: int
+    receivers: NDArray[np.bool_]
     later_ns: int
     cause: int
 
 
 @dataclass(slots=True)
 class Receptions:
-    """The pairs of K frames with all N nodes: arrays (K, N), whose columns are receiver numbers.
+    """The receptions of K frames at all N nodes: arrays (K, N), whose columns are receiver numbers.
 
-    `outcome` of `Outcome`; `arrival_ns` is when a frame arrives where it does; `cause` is the number of the fault
-    behind an outcome `fault`, or behind changed bytes, else NO_CAUSE. `copies` are pairs that arrive once more.
-    `flips` are bytes that change on the way, by frame and receiver: places, and what they are xored with.
+    `outcome` holds values of `Outcome`; `arrival_ns` is the arrival time of a frame that arrives; `cause` is the
+    number of the fault behind an outcome `fault` or behind altered bytes, else NO_CAUSE. `copies` are the
+    duplicates that also arrive. `flips` are the altered bytes by (frame, receiver): position in the payload, and
+    XOR mask.
     """
 
     outcome: NDArray[np.uint8]
@@ -117,7 +122,7 @@ class Receptions:
 
     @classmethod
     def of(cls, frames: Sequence[Frame], count: int) -> Receptions:
-        """The pairs of frames with `count` nodes, nothing decided."""
+        """Return the receptions of frames at `count` nodes, all pending."""
         shape = len(frames), count
         arrival_ns = np.zeros(shape, np.int64)
         arrival_ns += _column(frame.end_ns for frame in frames)
@@ -125,15 +130,15 @@ class Receptions:
         cause += _column(frame.cause for frame in frames).astype(np.int16)
         return cls(np.zeros(shape, np.uint8), arrival_ns, cause)
 
-    def decide(self, which: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
-        """Give `outcome` to those of `which`, (K, N) or what fits that shape, that are still pending."""
-        self.outcome[(self.outcome == PENDING) & which] = outcome.value
+    def decide(self, mask: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
+        """Give `outcome` to the pending receptions of a mask that broadcasts to (K, N)."""
+        self.outcome[(self.outcome == PENDING) & mask] = outcome.value
 
-    def fault(self, place: int, which: NDArray[np.bool_], cause: int) -> None:
-        """Frame `place` comes no further, by fault number `cause`, at those of `which` (N,) still pending."""
-        decided = (self.outcome[place] == PENDING) & which
-        self.outcome[place, decided] = Outcome.fault
-        self.cause[place, decided] = cause
+    def fault(self, index: int, receivers: NDArray[np.bool_], cause: int) -> None:
+        """Lose the frame at row `index` by fault number `cause` at the receivers (N,) where it is still pending."""
+        decided = (self.outcome[index] == PENDING) & receivers
+        self.outcome[index, decided] = Outcome.fault
+        self.cause[index, decided] = cause
 
 
 def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
@@ -141,4 +146,4 @@ def _column(numbers: Iterable[int]) -> NDArray[np.int64]:
 
 
 Stage = Callable[[Sequence[Frame], Receptions], None]
-"""One step of the channel: decides pairs of frames, or changes when they arrive."""
+"""One step of the channel: decides receptions, or changes when they arrive."""

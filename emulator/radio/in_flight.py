@@ -1,7 +1,7 @@
-"""What is on its way to its receivers, and what has arrived.
+"""Receptions in flight, and the packets that have arrived.
 
-All pairs in flight stand in one table, whichever their receivers are, so that nothing is done for each pair by
-itself until a program is to be handed a packet.
+All receptions in flight are in one table, whatever their receivers, so that no work is done per reception until a
+program takes a packet.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ from emulator.radio.trace import Trace
 from vnet.node import Packet
 from vnet.types import IntArray
 
-NEVER_NS = np.iinfo(np.int64).max
-FIRST_ROOM = 1 << 12
+NO_ARRIVAL_NS = np.iinfo(np.int64).max
+"""Time of the next arrival where none is in flight."""
+INITIAL_CAPACITY = 1 << 12
+"""Receptions for which the table has room at first."""
 _ARRIVAL, _RECEIVER, _ROW, _FRAME = range(4)
 
 
 @dataclass(frozen=True, slots=True)
 class Delivery:
-    """A packet that has reached `receiver` (a number); `row` is its row of the trace."""
+    """A packet that has reached the node number `receiver`; `row` is the number of its row of the trace."""
 
     receiver: int
     packet: Packet
@@ -36,33 +38,33 @@ class Delivery:
 class Deliveries(Sequence[Delivery]):
     """Packets that have reached their receivers, in the order (arrival, sender, seq, receiver, copy).
 
-    They are made one by one, and only when somebody looks.
+    The objects are built at the first access to one of them.
     """
 
     _table: IntArray
     _frames: dict[int, Frame]
     _trace: Trace
-    _made: list[Delivery] | None = field(default=None, init=False)
+    _built: list[Delivery] | None = field(default=None, init=False)
 
     def __len__(self) -> int:
         return int(self._table.shape[1])
 
     @overload
-    def __getitem__(self, place: int) -> Delivery: ...
+    def __getitem__(self, index: int) -> Delivery: ...
 
     @overload
-    def __getitem__(self, place: slice) -> list[Delivery]: ...
+    def __getitem__(self, index: slice) -> list[Delivery]: ...
 
-    def __getitem__(self, place: int | slice) -> Delivery | list[Delivery]:
-        return self._all()[place]
+    def __getitem__(self, index: int | slice) -> Delivery | list[Delivery]:
+        return self._all()[index]
 
     def __iter__(self) -> Iterator[Delivery]:
         return iter(self._all())
 
     def _all(self) -> list[Delivery]:
-        if self._made is None:
-            self._made = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
-        return self._made
+        if self._built is None:
+            self._built = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
+        return self._built
 
     def _order(self) -> NDArray[np.intp]:
         arrival, receiver, row, _ = self._table
@@ -79,38 +81,41 @@ class Deliveries(Sequence[Delivery]):
 
 
 class InFlight:
-    """The pairs in flight between `count` nodes. Rows of the table: arrival, receiver, row of the trace, frame."""
+    """The receptions in flight to `count` nodes.
+
+    Rows of the table are arrival time, receiver, row of the trace, and frame; columns are receptions.
+    """
 
     def __init__(self, count: int) -> None:
-        self._table: IntArray = np.zeros((4, FIRST_ROOM), np.int64)
+        self._table: IntArray = np.zeros((4, INITIAL_CAPACITY), np.int64)
         self._length = 0
         self._frames: dict[int, Frame] = {}
         self._frames_kept = 64
         self._next_frame = 0
-        self._by_receiver: IntArray = np.full(count, NEVER_NS)
-        self._known = True
-        self._soonest_ns = NEVER_NS
+        self._by_receiver: IntArray = np.full(count, NO_ARRIVAL_NS)
+        self._by_receiver_is_valid = True
+        self._soonest_ns = NO_ARRIVAL_NS
 
     def add(
         self,
         frames: Sequence[Frame],
-        place: NDArray[np.intp],
+        frame_index: NDArray[np.intp],
         receiver: IntArray,
         row: IntArray,
         arrival_ns: IntArray,
     ) -> None:
-        """Pairs in flight, (n,) each: of which of `frames`, to whom, which rows of the trace, arriving when."""
+        """Add receptions, arrays (n,) each; `frame_index` are indices into `frames`, `row` rows of the trace."""
         if not len(row):
             return
         self._make_room(len(row))
         new = self._table[:, self._length : self._length + len(row)]
         new[_ARRIVAL], new[_RECEIVER], new[_ROW] = arrival_ns, receiver, row
-        new[_FRAME] = place + self._next_frame
+        new[_FRAME] = frame_index + self._next_frame
         self._frames.update(enumerate(frames, self._next_frame))
         self._next_frame += len(frames)
         self._length += len(row)
         self._soonest_ns = min(self._soonest_ns, int(arrival_ns.min()))
-        if self._known:
+        if self._by_receiver_is_valid:
             np.minimum.at(self._by_receiver, receiver, arrival_ns)
 
     def _make_room(self, more: int) -> None:
@@ -120,25 +125,25 @@ class InFlight:
             self._table = grown
 
     def soonest_ns(self) -> int | None:
-        """When the next pair arrives anywhere."""
+        """Return the time of the next arrival at any node, or None."""
         return self._soonest_ns if self._length else None
 
     def next_ns(self, receiver: int) -> int | None:
-        """When the next pair arrives at `receiver`."""
-        if not self._known:
-            self._by_receiver[:] = NEVER_NS
+        """Return the time of the next arrival at `receiver`, or None."""
+        if not self._by_receiver_is_valid:
+            self._by_receiver[:] = NO_ARRIVAL_NS
             flying = self._table[:, : self._length]
             np.minimum.at(self._by_receiver, flying[_RECEIVER], flying[_ARRIVAL])
-            self._known = True
+            self._by_receiver_is_valid = True
         next_ns = int(self._by_receiver[receiver])
-        return None if next_ns == NEVER_NS else next_ns
+        return None if next_ns == NO_ARRIVAL_NS else next_ns
 
     def rows(self) -> list[int]:
-        """The rows of the trace of all pairs in flight."""
+        """Return the row numbers of the trace of all receptions in flight."""
         return [int(row) for row in self._table[_ROW, : self._length]]
 
     def take(self, time_ns: int) -> IntArray:
-        """Remove and return the table (4, n) of what arrives up to `time_ns`."""
+        """Remove and return the columns (4, n) of the receptions that arrive up to `time_ns`."""
         if self._soonest_ns > time_ns:
             return self._table[:, :0]
         flying = self._table[:, : self._length]
@@ -146,18 +151,18 @@ class InFlight:
         taken, left = flying[:, due], flying[:, ~due]
         self._length = left.shape[1]
         self._table[:, : self._length] = left
-        self._soonest_ns = int(left[_ARRIVAL].min(initial=NEVER_NS))
-        self._known = False
+        self._soonest_ns = int(left[_ARRIVAL].min(initial=NO_ARRIVAL_NS))
+        self._by_receiver_is_valid = False
         return taken
 
     def deliveries(self, table: IntArray, trace: Trace) -> Deliveries:
-        """What was taken, as packets."""
+        """Return the receptions that `take` returned as packets."""
         deliveries = Deliveries(table, self._frames, trace)
         self._forget()
         return deliveries
 
     def _forget(self) -> None:
-        """Forget the frames that no pair in flight needs; what is delivered keeps the dictionary it was given."""
+        """Forget the frames that no reception in flight needs; earlier `Deliveries` keep the old dictionary."""
         if len(self._frames) > self._frames_kept:
             needed = np.unique(self._table[_FRAME, : self._length]).tolist()
             self._frames = {number: self._frames[number] for number in needed}

@@ -1,4 +1,4 @@
-"""The plain way of getting on air: a queue of the sender's own, and nobody in anybody's way."""
+"""MAC interface, and the default MAC: a transmit queue for each sender, without a shared medium."""
 
 from __future__ import annotations
 
@@ -16,42 +16,42 @@ from vnet.units import NS_PER_MS
 
 
 class Mac(Protocol):
-    """How frames get on air, and when they have left it. `sent` are those that have, since the engine took them.
+    """Decides when frames are transmitted. `sent` holds the frames decided since the engine last took them.
 
-    What happens in between has instants of its own, which wake nobody: `run` does what lies strictly before an
-    instant, so that all that is handed over at one instant is there before anything of that instant happens.
+    A MAC may have events of its own, at which no program runs. `run` processes the events strictly before a time,
+    so that all frames enqueued at this time are there before its events are processed.
     """
 
     sent: list[Frame]
 
     def enqueue(self, frame: Frame) -> None:
-        """Take a frame that is sent at `frame.sent_ns`, and set its `sender_outcome` and `end_ns` in good time."""
+        """Take a frame sent at `frame.sent_ns`; set its `sender_outcome` and `end_ns` before it is in `sent`."""
 
     def next_ns(self) -> int | None:
-        """When something happens next."""
+        """Return the time of the next event, or None."""
 
     def run(self, time_ns: int | None) -> None:
-        """Do all that happens before `time_ns`, or all that ever happens if nothing more is handed over."""
+        """Process all events before `time_ns`, or all events if it is None."""
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """From now on these senders send at these bitrates, and no others are slowed."""
+        """Throttle exactly these senders, to these bitrates, from now on."""
 
 
 @dataclass
 class _Backlog:
-    """What a sender has still to send: when each waiting frame starts, and when the last one ends."""
+    """A sender's waiting frames: the time at which each starts, and the time at which the last one ends."""
 
     starts_ns: deque[int] = field(default_factory=deque)
     busy_until_ns: int = 0
 
     def room(self, time_ns: int, limit: int) -> bool:
-        """Whether another frame finds a place at `time_ns`."""
+        """Return true if another frame may wait at `time_ns`."""
         while self.starts_ns and self.starts_ns[0] <= time_ns:
             self.starts_ns.popleft()
         return len(self.starts_ns) < limit
 
     def take(self, ready_ns: int, airtime_ns: int) -> int:
-        """Put one more frame at the end; returns when it will have been sent."""
+        """Append a frame; return the time at which its transmission ends."""
         start_ns = max(ready_ns, self.busy_until_ns)
         self.starts_ns.append(start_ns)
         self.busy_until_ns = start_ns + airtime_ns
@@ -59,11 +59,10 @@ class _Backlog:
 
 
 class TransmitQueue:
-    """The sender's own queue: random access delay, airtime at `radio.bitrate_mbps`, at most `queue_frames` waiting.
+    """A transmit queue for each sender: random access delay, airtime, and at most `radio.queue_frames` waiting.
 
-    With a physical radio the airtime is that of 802.11p.
-
-    When a frame ends is known at once. Faults `throttle` some senders.
+    The airtime is the frame's bits at `radio.bitrate_mbps`; with a physical radio it is that of 802.11p. A frame's
+    end is known as soon as it is enqueued. Faults `throttle` some senders.
     """
 
     def __init__(self, seed: int, radio: Radio) -> None:
@@ -78,10 +77,10 @@ class TransmitQueue:
         self.sent: list[Frame] = []
 
     def throttle(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """From now on these senders send at these bitrates, and no others are slowed.
+        """Throttle exactly these senders, to these bitrates, from now on.
 
-        Who no longer is goes on as if it had never been: what waits is sent as it was decided, but nothing new
-        waits behind it, so that the fault ends with its end however slow it was.
+        A sender that is no longer throttled continues as if it had never been: waiting frames are sent at the times
+        already decided, but new frames do not wait for them. So the fault's effect ends with it.
         """
         for sender in self._throttled_mbps.keys() - bitrate_mbps.keys():
             self._backlogs[sender] = self._unthrottled.pop(sender)
@@ -91,7 +90,7 @@ class TransmitQueue:
         self._throttled_mbps = dict(bitrate_mbps)
 
     def enqueue(self, frame: Frame) -> None:
-        """Decide `queue_full`, or when the frame has left the sender."""
+        """Decide `queue_full`, or the time at which the frame's transmission ends."""
         jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
         bitrate_mbps = self._bitrate_mbps
         if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
@@ -114,30 +113,30 @@ class TransmitQueue:
         return backlog.take(frame.sent_ns + jitter_ns, airtime)
 
     def next_ns(self) -> int | None:
-        """Nothing happens between a frame's handing over and its arrival."""
+        """Return None: this MAC has no events."""
         return None
 
     def run(self, time_ns: int | None) -> None:
-        """Nothing to be done."""
+        """Do nothing: this MAC has no events."""
 
 
 class Throttle:
-    """What stands before an access whose own bitrate is fixed: throttled senders' frames come to it slowly."""
+    """A slow queue before a MAC of fixed bitrate, through which throttled senders' frames pass."""
 
     def __init__(self) -> None:
         self._slow: dict[int, tuple[float, _Backlog]] = {}
 
     def set(self, bitrate_mbps: Mapping[int, float]) -> None:
-        """From now on these senders are throttled, and no others; what waits then comes as it was decided."""
+        """Throttle exactly these senders from now on; the times of waiting frames do not change."""
         kept = {sender: backlog for sender, (_, backlog) in self._slow.items()}
         self._slow = {sender: (mbps, kept.get(sender, _Backlog())) for sender, mbps in bitrate_mbps.items()}
 
     def slows(self, sender: int) -> bool:
-        """Whether a sender is throttled now."""
+        """Return true if a sender is throttled now."""
         return sender in self._slow
 
     def put(self, frame: Frame, ready_ns: int, limit: int) -> int | None:
-        """When a frame comes to the access; None if `limit` others wait before it."""
+        """Return the time at which a frame reaches the MAC; None if `limit` others wait before it."""
         bitrate_mbps, backlog = self._slow[frame.sender]
         if not backlog.room(frame.sent_ns, limit):
             return None

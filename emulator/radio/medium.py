@@ -1,6 +1,6 @@
-"""The air: what is on it, what every vehicle senses of it, and whom each receiver listens to.
+"""The shared medium: frames on air, carrier sensing at every vehicle, and the frame each receiver is locked on.
 
-Everything here is done for all vehicles at once. It knows nothing of who may send when.
+All arrays cover all vehicles at once. The access rules are in `csma`.
 """
 
 from __future__ import annotations
@@ -16,19 +16,22 @@ from emulator.radio.reception import Threshold
 from vnet.types import Array
 
 WINDOW_NS = 100_000_000
-"""Over which time the channel busy ratio is taken (ETSI TS 102 687)."""
+"""Measurement window of the channel busy ratio (ETSI TS 102 687)."""
 SLICE_NS = WINDOW_NS // 10
-"""At such times somebody may listen to it."""
+"""Interval at which a listener gets the busy time, so that its windows may begin at any multiple of it."""
 LONG_AGO_NS = -(1 << 60)
+"""Initial time of the last change of the medium's state."""
 
 Listener = Callable[[int, NDArray[np.int64]], None]
+"""Called at the end of a slice with its number and the busy time (N,) in ns."""
 
 
 class Medium:
-    """Frames on air between `count` vehicles.
+    """The frames on air between `count` vehicles, and the state of the medium at each.
 
-    `sensed` (N,) is where the sum of all powers is at least `carrier_sense_mw`, and where somebody sends, or None
-    if nothing is on air; `idle_ns` (N,) is when it last was no longer so.
+    `sensed` (N,) marks the vehicles at which the medium is busy: those that transmit, and those at which the sum of
+    all powers is at least `carrier_sense_mw`. It is None if nothing is on air. `idle_ns` (N,) is the time at which
+    the medium last became idle.
     """
 
     def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
@@ -46,31 +49,31 @@ class Medium:
         self._window_ns = np.zeros(count, np.int64)
         self._listener: Listener | None = None
         self.windows: list[Array] = []
-        """The channel busy ratios (N,) of the windows that are over."""
+        """Channel busy ratios (N,) of the windows that have ended."""
 
     def is_sensed(self, node: int) -> bool:
-        """Whether the medium is busy at `node`."""
+        """Return true if the medium is busy at `node`."""
         return self.sensed is not None and bool(self.sensed[node])
 
     def busy_ns(self, node: int) -> int:
-        """Since when it has been busy at `node`, if it is."""
+        """Return the time since which the medium is busy at `node`; meaningful only while it is."""
         return int(self._busy_ns[node]) if self._busy_since_ns is None else self._busy_since_ns
 
-    def _know_since(self) -> None:
-        """Write down since when the first frame on air, until now alone, is sensed."""
+    def _store_busy_since(self) -> None:
+        """Store `_busy_since_ns`, common to all vehicles while one frame is alone on air, for each vehicle."""
         if self._busy_since_ns is not None:
             assert self.sensed is not None
             np.copyto(self._busy_ns, self._busy_since_ns, where=self.sensed)
             self._busy_since_ns = None
 
     def begin(self, frame: Frame, time_ns: int) -> None:
-        """A frame begins, `frame.signal` its powers."""
+        """Start the transmission of a frame, with the powers of `frame.signal`."""
         self.count(time_ns)
         signal = _signal(frame)
         before_mw, others = self._total_mw, self._frames
         if others:
             total_mw = before_mw + signal.power_mw
-            self._listen(frame, signal, total_mw)
+            self._lock(frame, signal, total_mw)
             for other in others:
                 _signal(other).pieces.append((time_ns, before_mw))
         else:
@@ -78,11 +81,11 @@ class Medium:
         others.append(frame)
         self._sense(total_mw, time_ns)
 
-    def _listen(self, frame: Frame, signal: Signal, total_mw: Array) -> None:
-        """Who sets itself on a new signal: who detects it, and does not listen to another one yet.
+    def _lock(self, frame: Frame, signal: Signal, total_mw: Array) -> None:
+        """Lock receivers on a new signal: those that detect it and are not locked on another one yet.
 
-        A signal that has not been there long enough to be detected is given up where a new one drowns it, and the
-        new one's sender listens to nobody.
+        A receiver releases a signal that began less than `DETECTION_NS` ago if, with the new one as interference,
+        it no longer detects it. The new signal's sender is locked on nothing.
         """
         taken = np.zeros(len(total_mw), dtype=bool)
         for other in self._frames:
@@ -96,7 +99,7 @@ class Medium:
         signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
 
     def end(self, frame: Frame, time_ns: int) -> None:
-        """A frame ends."""
+        """End the transmission of a frame."""
         self.count(time_ns)
         signal, before_mw = _signal(frame), self._total_mw
         self._frames.remove(frame)
@@ -116,17 +119,17 @@ class Medium:
 
     def _sense(self, total_mw: Array, time_ns: int) -> None:
         sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
-        sensed[[frame.sender for frame in self._frames]] = True  # however deaf they are
+        sensed[[frame.sender for frame in self._frames]] = True  # half duplex
         if before is None:
             self._busy_since_ns = time_ns
         else:
-            self._know_since()
+            self._store_busy_since()
             np.copyto(self._busy_ns, time_ns, where=sensed & ~before)
             np.copyto(self.idle_ns, time_ns, where=before & ~sensed)
         self._total_mw, self.sensed = total_mw, sensed
 
     def count(self, time_ns: int) -> None:
-        """Add up for how long the medium has been busy, until `time_ns`."""
+        """Accumulate the busy time up to `time_ns`."""
         while time_ns >= self._slice_ends_ns:
             self._count(self._slice_ends_ns)
             self._end_slice()
@@ -153,7 +156,7 @@ class Medium:
         self._slice_ends_ns += self._slice_ns
 
     def listen(self, listener: Listener) -> None:
-        """Tell `listener` of each slice when it is over: its number, and for how long (N,) it was busy."""
+        """Call `listener` at the end of each slice with its number and the busy time (N,) in ns."""
         self._listener, self._slice_ns, self._slice_ends_ns = listener, SLICE_NS, SLICE_NS
 
 

@@ -1,7 +1,7 @@
-"""How strong a signal arrives: path loss, shadowing and fading.
+"""Propagation: path loss, shadowing and fading.
 
-Path loss and shadowing depend on where the two ends are and on nothing else, so that a pair's mean power neither
-changes when others come nor depends on how it came there; fading is drawn for each frame and receiver.
+Path loss and shadowing are functions of the two positions alone: the mean power of a link depends neither on other
+vehicles nor on the way by which the two came there. Fading is drawn for each frame and receiver.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from emulator.scenario.random_streams import Draws
 from vnet.types import Array
 
 LIGHT_M_S = 299_792_458.0
+"""Speed of light in m/s."""
 NEAREST_M = 1.0
-"""Path losses are those at one metre up to there: nearer, antennas are in each other's near field."""
+"""Least distance of the path loss models: below it, antennas are in each other's near field."""
 WAVES = 512
+"""Plane waves whose sum is the shadowing."""
 QUANTILES = 1 << 16
+"""Equally likely values of the fading factor."""
 DIGITS = 6
-"""Mean powers are whole millionths of a decibel, so that the last bit of a sum, in which libraries may differ with
-the number of vehicles, decides nothing."""
+"""Mean powers are rounded to millionths of a decibel: the last bit of a sum, which may depend on the library and on
+the number of vehicles, then decides nothing."""
 
 
 def loss_db(model: FreeSpace | LogDistance | DualSlope | TwoRay, distance_m: Array) -> Array:
-    """The path loss over distances of any shape."""
+    """Return the path loss in dB over distances of any shape."""
     far_m = np.maximum(distance_m, NEAREST_M)
     match model:
         case FreeSpace():
@@ -43,7 +46,7 @@ def loss_db(model: FreeSpace | LogDistance | DualSlope | TwoRay, distance_m: Arr
 
 
 def _two_ray_db(model: TwoRay, distance_m: Array) -> Array:
-    """Sommer, Joerer and Dressler 2012, equations 3 to 6, with both antennas at one height."""
+    """Return the two-ray path loss (Sommer, Joerer and Dressler 2012, equations 3 to 6), antennas at one height."""
     wavelength_m = LIGHT_M_S / (model.frequency_ghz * 1e9)
     reflected_m = np.hypot(distance_m, 2 * model.antenna_m)
     phase_rad = 2 * np.pi * (distance_m - reflected_m) / wavelength_m
@@ -55,11 +58,12 @@ def _two_ray_db(model: TwoRay, distance_m: Array) -> Array:
 
 
 class ShadowField:
-    """Shadowing as a random field over the places of both ends: a sum of plane waves of random direction.
+    """Shadowing as a random field over the positions of both ends: a sum of plane waves of random direction.
 
-    Its correlation is Gudmundson's exp(-Δ / d) for either end (1991), and for both the product (Wang, Tameh and
-    Nix 2008). The wave vectors are those of the exponential covariance in the plane: Gaussian ones divided by the
-    root of a χ² of one degree of freedom. The sum of both directions makes it the same both ways.
+    Its correlation is Gudmundson's exp(-Δ / d) for either end (1991), and the product of these for both (Wang,
+    Tameh and Nix 2008). The wave vectors follow the spectrum of the exponential covariance in the plane: Gaussian
+    vectors divided by the square root of a χ² variable of one degree of freedom. Adding both directions makes the
+    field symmetric.
     """
 
     def __init__(self, shadowing: Shadowing, seed: int) -> None:
@@ -70,22 +74,22 @@ class ShadowField:
         self._phase_rad = 2 * np.pi * uniform[6]
 
     def _wave_vectors(self, uniform: Array) -> Array:
-        """(2, WAVES) from draws (3, WAVES)."""
+        """Return wave vectors (2, WAVES) in rad/m from uniform draws (3, WAVES)."""
         normal = ndtri(np.maximum(uniform, 1e-300))
         return np.asarray(normal[:2] / np.maximum(np.abs(normal[2]) * self._decorrelation_m, 1e-9))
 
     def between(self, position_m: Array, distance_m: Array) -> Array:
-        """(N, N) decibels that are lost between positions (N, 2) at these distances (N, N)."""
+        """Return the shadowing loss (N, N) in dB between positions (N, 2) at these distances (N, N), in metres."""
         here = position_m @ self._here + self._phase_rad
         there = position_m @ self._there
         one_way = np.cos(here) @ np.cos(there).T - np.sin(here) @ np.sin(there).T
-        # Near each other both directions are alike: their sum must not be stronger there.
-        alike = np.exp(-2 * distance_m / self._decorrelation_m)
-        return np.asarray(self._sigma_db * (one_way + one_way.T) / np.sqrt(WAVES * (1 + alike)))
+        # Both directions are correlated where the ends are close: the divisor keeps the variance of the sum.
+        correlation = np.exp(-2 * distance_m / self._decorrelation_m)
+        return np.asarray(self._sigma_db * (one_way + one_way.T) / np.sqrt(WAVES * (1 + correlation)))
 
 
 class MeanPower:
-    """The mean power of every pair."""
+    """Mean received power of every link: transmit power less path loss and shadowing."""
 
     def __init__(
         self, path_loss: FreeSpace | LogDistance | DualSlope | TwoRay, shadowing: Shadowing | None, seed: int
@@ -94,9 +98,9 @@ class MeanPower:
         self._shadow = ShadowField(shadowing, seed) if shadowing is not None else None
 
     def dbm(self, position_m: Array, distance_m: Array) -> Array:
-        """(N, N), rows are senders; the diagonal is the power that a sender sends with.
+        """Return the mean received power (N, N) in dBm; rows are senders, the diagonal is the transmit power.
 
-        Positions (N, 2) and the distances between them (N, N), in metres; where they are NaN, so is the power.
+        `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them; NaN gives NaN.
         """
         power_dbm = self._path_loss.tx_power_dbm - loss_db(self._path_loss, distance_m)
         if self._shadow is not None:
@@ -107,15 +111,15 @@ class MeanPower:
 
 @lru_cache(maxsize=16)
 def _quantiles(m: float) -> Array:
-    """Of the gamma distribution of shape m and mean one, at the middles of equally likely steps."""
+    """Quantiles (QUANTILES,) of the gamma distribution of shape m and mean 1, at the middles of equal steps."""
     return np.asarray(gammaincinv(m, (np.arange(QUANTILES) + 0.5) / QUANTILES) / m)
 
 
 class Nakagami:
-    """Fading: the factor that a frame's power has at a receiver is gamma distributed, of shape m and mean one.
+    """Nakagami fading: a frame's received power is multiplied by a gamma-distributed factor of mean 1.
 
-    Nakagami 1960. Factors are those of a table of quantiles, at the middles of `QUANTILES` equally likely steps, so
-    that none is above the one of a probability of 1 in 2¹⁷ (11.6 dB with m = 0.75).
+    Nakagami 1960; the shape m depends on distance. Factors come from a table of quantiles at the middles of
+    `QUANTILES` equally likely steps, so none exceeds the quantile of probability 1 - 2⁻¹⁷ (11.6 dB with m = 0.75).
     """
 
     def __init__(self, fading: Fading | None) -> None:
@@ -123,11 +127,11 @@ class Nakagami:
         self._factor = np.concatenate([_quantiles(m) for m in fading.m]) if fading is not None else np.ones(1)
 
     def shape(self, distance_m: Array) -> NDArray[np.uint64]:
-        """Which shape belongs to distances, as `factor` wants it."""
+        """Return the table offsets of the shapes at these distances (any shape), as `factor` takes them."""
         return np.searchsorted(self._until_m, distance_m).astype(np.uint64) * np.uint64(QUANTILES)
 
     def factor(self, shape: NDArray[np.uint64], step: NDArray[np.uint64]) -> Array:
-        """The factors of pairs by their shapes and the numbers of their steps."""
+        """Return the factors for table offsets from `shape` and drawn steps in [0, QUANTILES)."""
         if len(self._factor) == 1:
             return np.ones(step.shape)
         factor: Array = self._factor[step + shape]

@@ -1,4 +1,5 @@
-"""Senders that misbehave without the emulator knowing what their payloads mean: their own frames, sent again."""
+"""Sender faults: senders that misbehave by repeating their own frames, whose payloads the emulator does not
+read."""
 
 from __future__ import annotations
 
@@ -10,18 +11,19 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.radio.frames import NO_CAUSE
-from emulator.scenario.faults import DataReplay, DoS, SenderFault, StaleMessages, Sybil
+from emulator.scenario.fault_families import SenderFault
+from emulator.scenario.faults import DataReplay, DoS, StaleMessages, Sybil
 from vnet.units import NS_PER_S
 
 REMEMBERED_FRAMES = 4096
-"""Of each sender that misbehaves."""
+"""Frames kept of each affected sender, to be sent again."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """A frame on its way to the radio: the `copy`-th of frame `seq`; `alias` is another name that it goes under.
+    """A frame before it is enqueued: copy number `copy` of frame `seq`, sent under the name `alias` if it is set.
 
-    `draw` tells its draws from those of the other copies.
+    `draw` distinguishes its random draws from those of the other copies.
     """
 
     payload: bytes
@@ -33,7 +35,10 @@ class Outgoing:
 
 
 class SenderFaults:
-    """Which senders misbehave now, and what they have sent. `next_copy` numbers the copies of (sender, seq)."""
+    """The acting sender faults, and the frames that affected senders have sent.
+
+    `next_copy` numbers the copies of (sender, seq).
+    """
 
     def __init__(self, node_ids: Sequence[str], next_copy: Callable[[int, int], int]) -> None:
         self._node_ids = node_ids
@@ -43,11 +48,11 @@ class SenderFaults:
 
     @property
     def misbehave(self) -> bool:
-        """Whether any of them does."""
+        """True if any sender fault acts."""
         return bool(self._acting)
 
     def update(self, active: Sequence[PlannedFault]) -> None:
-        """From now on these act and no others."""
+        """Let exactly these faults act from now on."""
         self._acting = {}
         for planned in active:
             if isinstance(planned.fault, SenderFault):
@@ -56,7 +61,7 @@ class SenderFaults:
         self._sent = {node: self._sent.get(node, deque(maxlen=REMEMBERED_FRAMES)) for node in self._acting}
 
     def frames(self, time_ns: int, node: int, seq: int, payload: bytes) -> Iterator[Outgoing]:
-        """All that goes out when `node` hands over its frame `seq`."""
+        """Yield all frames that are sent when `node` enqueues its frame `seq`."""
         acting = self._acting.get(node)
         if not acting:
             yield Outgoing(payload, seq)
@@ -74,8 +79,8 @@ class SenderFaults:
         payload, seq = original.payload, original.seq
         match planned.fault:
             case DoS(factor=factor):
-                for place in range(1, factor):
-                    yield self._copy(planned, node, payload, seq, place)
+                for index in range(1, factor):
+                    yield self._copy(planned, node, payload, seq, index)
             case Sybil(ghosts=ghosts):
                 for ghost in range(1, ghosts + 1):
                     yield self._copy(planned, node, payload, seq, ghost, f"{self._node_ids[node]}~{ghost}")
@@ -84,13 +89,13 @@ class SenderFaults:
                     yield self._copy(planned, node, old[2], old[1], seq - old[1])
 
     def _copy(
-        self, planned: PlannedFault, node: int, payload: bytes, seq: int, place: int, alias: str | None = None
+        self, planned: PlannedFault, node: int, payload: bytes, seq: int, index: int, alias: str | None = None
     ) -> Outgoing:
-        """Another copy of frame `seq`; of those that a fault makes of it, each has another `place`."""
-        draw = (planned.number + 1 << 32) + place
+        """Return another copy of frame `seq`; `index` distinguishes the copies that one fault makes of it."""
+        draw = (planned.number + 1 << 32) + index
         return Outgoing(payload, seq, self._next_copy(node, seq), draw, planned.number, alias)
 
     def _from(self, node: int, time_ns: int, age_s: float) -> tuple[int, int, bytes] | None:
-        """The latest frame of `node` that is at least `age_s` old."""
+        """Return (time in ns, seq, payload) of the latest frame of `node` that is at least `age_s` old, or None."""
         before_ns = time_ns - round(age_s * NS_PER_S)
         return next((sent for sent in reversed(self._sent[node]) if sent[0] <= before_ns), None)

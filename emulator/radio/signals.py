@@ -1,7 +1,7 @@
-"""From a frame to the powers with which it arrives, and all the luck that it has at its receivers.
+"""Signals: the received powers of a frame, and its random draws at every receiver.
 
-A frame has one word of 64 random bits a receiver: 16 are of its fading, 16 of its latency, and 32 of the reception.
-The word at its sender, which receives nothing, is of its access to the medium.
+A frame has a word of 64 random bits for each receiver: 16 bits for its fading, 16 for its latency, and 32 for its
+reception. The word of its sender, which receives nothing, is used by the MAC.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from vnet.types import Array
 Words = NDArray[np.uint64]
 
 JITTER, BACKOFF, NEXT_BACKOFF = 0, 16, 32
-"""The lowest of the 16 bits of a sender's word each: when a frame gets to the medium, how long it backs off."""
+"""Lowest of 16 bits each in a sender's word: access jitter, backoff before the frame, backoff after it."""
 _STEPS = 1 << 16
 _LAST = np.uint64(_STEPS - 1)
 _LATENCY, _RECEPTION = np.uint64(16), np.uint64(32)
@@ -27,23 +27,23 @@ assert QUANTILES == _STEPS
 
 
 def latency_draws(random_draws: Words) -> Array:
-    """Draws in [0, 1)."""
+    """Return the latency draws in [0, 1) of words of any shape."""
     return np.asarray((random_draws >> _LATENCY & _LAST) / _STEPS)
 
 
 def reception_draws(random_draws: Words) -> Array:
-    """Draws in (0, 1)."""
+    """Return the reception draws in (0, 1) of words of any shape."""
     return np.asarray(((random_draws >> _RECEPTION) + 0.5) / (1 << 32))
 
 
-def sender_draw(frame: Frame, which: int) -> float:
-    """One of a sender's draws, in [0, 1)."""
+def sender_draw(frame: Frame, lowest_bit: int) -> float:
+    """Return a draw in [0, 1) of a frame's sender: JITTER, BACKOFF or NEXT_BACKOFF."""
     assert frame.signal is not None
-    return (int(frame.signal.random_draws[frame.sender]) >> which & _STEPS - 1) / _STEPS
+    return (int(frame.signal.random_draws[frame.sender]) >> lowest_bit & _STEPS - 1) / _STEPS
 
 
 class Signals:
-    """Makes the signals of frames to `count` receivers."""
+    """Computes the signals of frames at `count` receivers."""
 
     def __init__(self, seed: int, fading: Fading | None, count: int) -> None:
         self._draws = Draws(seed, "radio")
@@ -51,7 +51,7 @@ class Signals:
         self._count = count
 
     def of(self, frame: Frame) -> Signal:
-        """The signal of one frame."""
+        """Return the signal of a frame."""
         random_draws = self._draws.words(frame.sender, frame.seq, self._count, frame.draw)
         topology, sender = frame.topology, frame.sender
         assert topology.power_mw is not None

@@ -1,8 +1,8 @@
-"""The stages of the channel: small objects with one method over all receivers of some frames.
+"""The stages of the channel: functions or callable objects that decide the receptions of a batch of frames.
 
-Stages run in the order of the chain; each looks only at the pairs that are still pending, and the first that
-decides a pair has decided it. Whatever is random comes from `Draws`, indexed by receiver number. No stage needs
-state of two receivers, and none cares how many frames it is given at a time.
+Stages run in the order of the engine's chain. Each acts only on the receptions that are still pending, so the first
+stage that decides a reception is final. All random numbers come from `Draws`, indexed by receiver number. A
+reception does not depend on other receivers, nor on the number of frames in a batch.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from vnet.types import Array
 from vnet.units import NS_PER_MS
 
 MIN_LATENCY_NS = 1_000
-"""No exchange without time passing: every pair's latency is at least a microsecond."""
+"""Least latency of a reception: time passes in every exchange between nodes."""
 
 
 def rows(frames: Sequence[Frame], name: str) -> NDArray[Any]:
-    """(K, N): each frame's sender's row of a matrix of its surroundings."""
+    """Return (K, N): for each frame, its sender's row of the matrix `name` of its topology snapshot."""
     first = frames[0].topology
     matrix = getattr(first, name)
     if all(frame.topology is first for frame in frames):
@@ -43,40 +43,40 @@ def frame_draws(draws: Draws, frames: Sequence[Frame], count: int) -> Array:
 
 
 def in_range(frames: Sequence[Frame], receptions: Receptions) -> None:
-    """Whom a frame cannot reach is `out_of_range`."""
+    """Decide `out_of_range` for receivers that a frame cannot reach."""
     receptions.decide(~rows(frames, "in_range"), Outcome.out_of_range)
 
 
 def sender_side(frames: Sequence[Frame], receptions: Receptions) -> None:
-    """A frame that its sender did not send reaches nobody."""
-    for place, frame in enumerate(frames):
+    """Give the receptions of a frame that its sender did not send the sender's outcome."""
+    for index, frame in enumerate(frames):
         if frame.sender_outcome:
-            row = receptions.outcome[place]
+            row = receptions.outcome[index]
             row[row == PENDING] = frame.sender_outcome
 
 
 def peer_cap(frames: Sequence[Frame], receptions: Receptions) -> None:
-    """Each receiver hears its nearest `radio.max_peers` live senders in range, ties by number."""
+    """Decide `peer_cap` for senders beyond a receiver's nearest `radio.max_peers` live ones in range."""
     receptions.decide(~rows(frames, "admitted"), Outcome.peer_cap)
 
 
 def lose_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
-    """Decide `fault` where a link was cut, or a fault loses the frame."""
-    for place, frame in enumerate(frames):
+    """Decide `fault` where a fault cuts the link or loses the frame."""
+    for index, frame in enumerate(frames):
         if frame.effects.lose:
             for number, lost in frame.effects.losses(frame):
-                receptions.fault(place, lost, number)
+                receptions.fault(index, lost, number)
 
 
 def change_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
-    """After the latency: what does not lose a pair; later arrivals, copies, other bytes."""
-    for place, frame in enumerate(frames):
+    """Apply, after the latency, the faults that do not lose receptions: delays, duplicates, altered bytes."""
+    for index, frame in enumerate(frames):
         if frame.effects.change:
-            frame.effects.changes(frame, place, receptions)
+            frame.effects.changes(frame, index, receptions)
 
 
 class Loss:
-    """Every pair is lost independently with probability `radio.loss`."""
+    """Independent loss of every reception, with probability `radio.loss`."""
 
     def __init__(self, seed: int, loss: float) -> None:
         self._draws = Draws(seed, "loss")
@@ -91,7 +91,7 @@ class Loss:
 
 
 class Latency:
-    """Propagation and processing: `latency_ms` plus uniform `jitter_ms`, rounded up to the delivery tick."""
+    """Transport latency: `latency_ms` plus uniform `jitter_ms`, rounded up to the delivery tick."""
 
     def __init__(self, seed: int, radio: Radio) -> None:
         self._draws = Draws(seed, "latency")
@@ -100,7 +100,7 @@ class Latency:
         self._tick_ns = radio.delivery_tick_us * 1_000
 
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
-        """Set when each pair arrives."""
+        """Set the arrival time of each reception."""
         draws = self._draws_of(frames, receptions.outcome.shape[1])
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = receptions.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
@@ -109,8 +109,8 @@ class Latency:
         receptions.arrival_ns = arrival_ns
 
     def _draws_of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
-        """(K, count), those of the signals where frames have one."""
+        """Return the latency draws (K, count), from the frames' signals if they have any."""
         if all(frame.signal is None for frame in frames):
             return frame_draws(self._draws, frames, count)
-        nothing = np.zeros(count, np.uint64)
-        return latency_draws(np.array([nothing if f.signal is None else f.signal.random_draws for f in frames]))
+        zeros = np.zeros(count, np.uint64)
+        return latency_draws(np.array([zeros if f.signal is None else f.signal.random_draws for f in frames]))

@@ -1,4 +1,4 @@
-"""Who can hear whom, how well, and whom each receiver's peer cap admits."""
+"""Topology of the network: connectivity, link quality, and the senders that each receiver's peer cap admits."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from vnet.types import Array
 
 @dataclass(frozen=True, slots=True)
 class TopologySnapshot:
-    """How things stand between the vehicles, (N, N) each, rows are senders. Never changed once made.
+    """The links at one time: matrices (N, N) whose rows are senders; immutable.
 
-    `in_range` is who is in range of whom, and `admitted` whom the receiver's cap lets in. `power_mw` is the mean
-    power of signals and `fading` the shape of their fading, as `Nakagami` has it; None where signals have no power.
+    `in_range` marks the links in range, and `admitted` those that the receiver's peer cap admits. `power_mw` is the
+    mean received power in mW and `fading` the shape of the fading as `Nakagami.shape` returns it; both are None
+    without a physical radio.
     """
 
     distance_m: Array
@@ -28,9 +29,9 @@ class TopologySnapshot:
 
 
 class Topology:
-    """The surroundings as they are `now`, made anew when vehicles move or go up or down.
+    """The topology `now`, recomputed when vehicles move or go up or down.
 
-    Positions are (N, 2) in metres, NaN where a vehicle is not there. Powers are worked out only with `nakagami`.
+    Positions are (N, 2) in metres, NaN for an absent vehicle. Powers are computed only if `nakagami` is given.
     """
 
     def __init__(
@@ -43,30 +44,30 @@ class Topology:
         self.move(position_m)
 
     def move(self, position_m: Array) -> None:
-        """Take new positions."""
+        """Move the vehicles to `position_m` (N, 2)."""
         distance_m = distances_m(position_m)
         power_mw = fading = None
         if self._nakagami is None:
             in_range = self._connectivity.in_range(position_m, distance_m)
         else:
             power_mw = self._connectivity.power_mw(position_m, distance_m)
-            in_range = power_mw > 0  # to work the powers out takes longer than all else here: once is enough
+            in_range = power_mw > 0  # computing the powers twice would double the time of this method
             np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
         self.now = TopologySnapshot(distance_m, in_range, in_range, power_mw, fading)
         self._rank()
 
     def set_up(self, node: int, up: bool) -> None:
-        """A node that is down is nobody's peer."""
+        """Set a node up or down. A node that is down does not count towards any peer cap."""
         self.up[node] = up
         self._rank()
 
     def is_up(self, node: int) -> bool:
-        """Whether a node is up."""
+        """Return true if a node is up."""
         return bool(self.up[node])
 
     def _rank(self) -> None:
-        """`admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
+        """Set `admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
         candidate = self.now.in_range & self.up[:, None]
         far_m = np.where(candidate, self.now.distance_m, np.inf)
         order = np.argsort(far_m, axis=0, kind="stable")  # ties go to the lower number

@@ -1,7 +1,7 @@
-"""The trace of a run: one row per frame and receiver in range, and its hash.
+"""The trace of a run: one row for each reception in range, and its hash.
 
-Rows are appended as frames are sent and completed when they arrive. The hash is over the content in canonical
-order, so that neither the order of appending nor the file format can change it.
+Rows are appended as frames are sent, and completed as they arrive. The hash covers the content in canonical order,
+so it depends neither on the order of appending nor on the file format.
 """
 
 from __future__ import annotations
@@ -22,8 +22,11 @@ from emulator.radio.frames import NO_CAUSE
 from emulator.radio.outcomes import PENDING, Outcome
 
 NOT_ARRIVING = -1
-FIRST_PAIRS, FIRST_FRAMES = 1 << 22, 1 << 17
-"""Room from the start: the system hands out zeroed pages only as they are written, and growing means copying."""
+"""Arrival time of a reception that does not arrive."""
+INITIAL_RECEPTIONS = 1 << 22
+"""Initial room for receptions: growing means copying, and the system maps zeroed pages only as they are written."""
+INITIAL_FRAMES = 1 << 17
+"""Initial room for frames, for the same reason."""
 
 _FRAME = np.dtype(
     [
@@ -37,7 +40,7 @@ _FRAME = np.dtype(
         ("copy", "<i2"),
     ]
 )
-_PAIR = np.dtype(
+_RECEPTION = np.dtype(
     [
         ("frame", "<i4"),
         ("receiver", "<i4"),
@@ -67,12 +70,15 @@ _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
 def decided_ns(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """When each of these records of type `ROW` is decided: as it arrives, or else as it leaves its sender."""
+    """Return the time (n,) at which each row is decided: its arrival, or else the time it leaves its sender.
+
+    `rows` (n,) are records of type `ROW`.
+    """
     return np.asarray(np.where(rows["arrival_ns"] == NOT_ARRIVING, rows["left_ns"], rows["arrival_ns"]))
 
 
 class _Table:
-    """Records of one type, as many as are added."""
+    """A growing array of records of one type."""
 
     def __init__(self, kind: np.dtype[np.void], room: int) -> None:
         self._records = np.zeros(room, kind)
@@ -80,11 +86,11 @@ class _Table:
 
     @property
     def records(self) -> NDArray[np.void]:
-        """Those that were added."""
+        """The records added so far."""
         return self._records[: self.count]
 
     def add(self, count: int) -> NDArray[np.void]:
-        """So many more, to be written."""
+        """Add `count` records and return them, zeroed, for the caller to fill."""
         first, end = self.count, self.count + count
         if end > len(self._records):
             grown = np.zeros(max(2 * len(self._records), end), self._records.dtype)
@@ -97,20 +103,20 @@ class _Table:
 class Trace:
     """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
-    What the rows of a frame have in common is kept once. `knows_air` says that frames have times at which they went
-    on air and left it; else they leave as they are sent.
+    The columns that the rows of a frame share are stored once a frame. `knows_air` says that the MAC models when
+    frames start and end on air; without it a frame leaves its sender at the time it is sent.
     """
 
     def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
         self._node_ids = list(node_ids)
         self._knows_air = knows_air
         self._causes = [""]
-        self._pairs = _Table(_PAIR, FIRST_PAIRS)
-        self._frames = _Table(_FRAME, FIRST_FRAMES)
+        self._receptions = _Table(_RECEPTION, INITIAL_RECEPTIONS)
+        self._frames = _Table(_FRAME, INITIAL_FRAMES)
         self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
-        return self._pairs.count
+        return self._receptions.count
 
     def append(
         self,
@@ -121,19 +127,19 @@ class Trace:
         cause: ArrayLike,
         arrival_ns: ArrayLike,
     ) -> int:
-        """Add the rows of frames: of `each` (K,) of them so many, one after the other; returns the first's number.
+        """Append the rows of K frames; return the number of the first.
 
-        `frames` are the columns (K,) that are the same for all rows of a frame; the others are of the rows (n,).
-        `cause` are numbers of faults, whose names `name_cause` has told; `arrival_ns` counts only where the outcome
-        is pending.
+        `frames` are the columns (K,) that all rows of a frame share; the other columns are (n,). `each` (K,) is the
+        number of rows of each frame, in order. `cause` are numbers of faults named by `name_cause`; `arrival_ns` is
+        used only where the outcome is pending.
         """
-        first, first_frame = self._pairs.count, self._frames.count
+        first, first_frame = self._receptions.count, self._frames.count
         new = self._frames.add(len(each))
         for name, values in frames.items():
             new[name] = values
         if not self._knows_air:
             new["left_ns"] = new["sent_ns"]
-        rows = self._pairs.add(len(outcome))
+        rows = self._receptions.add(len(outcome))
         rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
         rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
         rows["cause"] -= NO_CAUSE
@@ -141,41 +147,41 @@ class Trace:
         return first
 
     def alter(self, row: int, payload_digest: int) -> None:
-        """What arrives by this row has other bytes than its frame."""
-        self._pairs.records["altered"][row] = True
+        """Set the digest of the altered payload that arrives in this row."""
+        self._receptions.records["altered"][row] = True
         self._altered[row] = payload_digest
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column of the trace so far, as numbers."""
+        """Return a column of the trace so far, as numbers."""
         return np.asarray(self.rows(slice(None))[name])
 
     def name_cause(self, number: int, name: str) -> None:
-        """Say what fault `number` is called."""
+        """Set the name of fault `number`."""
         missing = number + 2 - len(self._causes)
         self._causes += [""] * missing
         self._causes[number - NO_CAUSE] = name
 
     def decide(self, rows: Sequence[int] | NDArray[np.intp], outcome: Outcome) -> None:
-        """Give rows their outcome."""
-        self._pairs.records["outcome"][rows] = outcome.value
+        """Set the outcome of rows."""
+        self._receptions.records["outcome"][rows] = outcome.value
 
-    def rows(self, which: NDArray[np.intp] | slice) -> NDArray[np.void]:
-        """These rows as records of type `ROW`."""
-        receptions = self._pairs.records[which]
+    def rows(self, index: NDArray[np.intp] | slice) -> NDArray[np.void]:
+        """Return the rows at `index` as records of type `ROW`."""
+        receptions = self._receptions.records[index]
         frames = self._frames.records[receptions["frame"]]
         rows = np.zeros(len(receptions), ROW)
         for name in ROW.fields or ():
-            rows[name] = receptions[name] if name in (_PAIR.fields or ()) else frames[name]
-        number = range(self._pairs.count)[which] if isinstance(which, slice) else which
-        for place in np.flatnonzero(receptions["altered"]).tolist():
-            rows["payload_digest"][place] = self._altered[int(number[place])]
+            rows[name] = receptions[name] if name in (_RECEPTION.fields or ()) else frames[name]
+        number = range(self._receptions.count)[index] if isinstance(index, slice) else index
+        for i in np.flatnonzero(receptions["altered"]).tolist():
+            rows["payload_digest"][i] = self._altered[int(number[i])]
         return rows
 
     def to_table(self) -> pa.Table:
-        """The trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
+        """Return the trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
 
-        Where senders share the air there are two columns more: `on_air_ns`, when a frame's transmission began (null
-        if it never did), and `left_ns`, when it ended, or the frame was given up.
+        With `[radio.mac]` there are two more columns: `on_air_ns`, the start of a frame's transmission (null if it
+        never started), and `left_ns`, the time at which it ended or the frame was dropped.
         """
         rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -206,21 +212,21 @@ class Trace:
         )
 
     def sha256(self) -> str:
-        """The hash of the content; see `sha256_of_table`."""
+        """Return the hash of the content; see `sha256_of_table`."""
         return sha256_of_table(self.to_table())
 
     def write(self, path: Path) -> None:
-        """Write the trace as Parquet. Raises OSError."""
+        """Write the trace as Parquet. Raise OSError if the file cannot be written."""
         pq.write_table(self.to_table(), path, compression="zstd")
 
 
 def read_trace(path: Path) -> pa.Table:
-    """A trace as `Trace.write` wrote it. Raises OSError."""
+    """Return a trace that `Trace.write` wrote. Raise OSError if the file cannot be read."""
     return pq.read_table(path)
 
 
 def sha256_of_table(table: pa.Table) -> str:
-    """SHA-256 over a trace's content, in the order of its rows, independent of how it was stored."""
+    """SHA-256 of a trace's content in the order of its rows, independent of how it was stored."""
     digest = hashlib.sha256()
     for column in table.column_names:
         array = table.column(column).combine_chunks()
@@ -236,7 +242,7 @@ def sha256_of_table(table: pa.Table) -> str:
 
 
 def _canonical_codes(array: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
-    """Names as codes into the sorted list of those that occur."""
+    """Return an array of names as codes (n,) into the sorted list of the names that occur, and this list."""
     if not pa.types.is_dictionary(array.type):
         array = array.dictionary_encode()
     values = array.dictionary.to_pylist()

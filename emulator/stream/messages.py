@@ -1,8 +1,9 @@
-"""What those who watch a run are told: plain messages `scene`, `period` and `end`.
+"""Messages to observers of a run: `scene`, `period` and `end`.
 
-Numbers, text, bytes and tables only, so that any language reads them. Arrays are little-endian float32 bytes, row
-by row, in the order of `node_ids`, unless it says otherwise; NaN stands for what a node did not report. For a run
-that is on they are made of what the emulator knows, for one that is over of its files, by the same functions.
+They contain numbers, text, bytes and maps only, which every language reads. Arrays are little-endian float32 bytes
+in row-major order, a row for each node in the order of `node_ids`, unless stated otherwise; NaN stands for a value
+that a node did not report. The same functions build them for a live run, from the emulator's state, and for a
+finished run, from its files.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ from vnet.node import Report
 from vnet.types import Array
 
 LATENCY_BIN_NS = 2_000_000
+"""Width of a bin of the latency histogram."""
 LATENCY_BINS = 50
+"""Bins of the latency histogram."""
 WEIGHT = "weight."
-"""How the values begin by which programs report the weights of their fusion; a node's id follows."""
+"""Prefix of the reported values that are weights of a fusion; a node's id follows."""
 LONGEST_DETAIL = 200
-"""Characters that are told of one detail of an event."""
+"""Characters of a detail of an event."""
 
 
 def pack(array: ArrayLike) -> bytes:
-    """An array as float32 bytes."""
+    """Return an array as float32 bytes."""
     return np.ascontiguousarray(array, dtype="<f4").tobytes()
 
 
@@ -44,23 +47,22 @@ def unpack(data: bytes, columns: int = 1) -> NDArray[np.float32]:
 
 
 def unpack_pairs(message: Mapping[str, Any]) -> NDArray[np.int32]:
-    """The `pairs` of a period message, as (k, 4): sender, receiver, number of the `Outcome`, how many."""
+    """Return the `pairs` of a period message (k, 4): sender, receiver, number of the `Outcome`, and count."""
     return np.frombuffer(message["pairs"], dtype="<i4").reshape(-1, 4)
 
 
 def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
-    """What does not change during a run, but for the faults in `scenario` that are planned while it is on.
+    """Return the message of a run's constants; only faults may be added to its `scenario` during the run.
 
-    `node_ids`, lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`: infinite for a line that goes both ways
-    from its point), `range_m` (None where the scenario gives links or a path loss, and the range says nothing
-    about who hears whom), `component` (int16, n) of the network that each vehicle belongs to at first (-1: it is
-    not there yet), `area_m` (float32, 2 × 2), the corners of the box in which vehicles are during the run, whether
-    they move, and the resolved scenario as TOML.
+    `node_ids`; lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`, which is infinite for a line in both
+    directions from its point); `range_m` (None if links or path loss decide connectivity); `component` (int16, n),
+    the connected component of each vehicle at the start (-1: absent); `area_m` (float32, 2 × 2), the corners of the
+    bounding box of all positions during the run; `moves`, true if vehicles drive; `scenario`, resolved, as TOML.
     """
     start = world.at(0)
     radio = scenario.radio
-    reach = connectivity_of(radio, scenario.run.seed, world.links)
-    in_range = reach.in_range(start.position_m, distances_m(start.position_m))
+    connectivity = connectivity_of(radio, scenario.run.seed, world.links)
+    in_range = connectivity.in_range(start.position_m, distances_m(start.position_m))
     label = components(start.position_m, radio.range_m, in_range)
     return {
         "name": scenario.run.name,
@@ -81,8 +83,9 @@ def scene_message(world: World, scenario: Scenario) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What nodes reported in a period: arrays (n, 2) and (n, 4), NaN where a node said nothing; and by node the
-    numbers of its cloud, point by point, and the weights (n,) of its fusion.
+    """The nodes' reports in a period: arrays (n, 2) and (n, 4), NaN where a node reported nothing.
+
+    `clouds` are the coordinates x, y, x, y, … of each node's cloud, and `weights` (n,) those of its fusion.
     """
 
     estimate_m: Array
@@ -94,37 +97,42 @@ class Beliefs:
 
 
 def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
-    """The last report of each node; `number` gives each node's."""
+    """Return the last report of each node; `number` is the index of each node."""
     last = {report.node: report for report in reports}
-    weighed = {WEIGHT + node: place for node, place in number.items()}
+    weight_index = {WEIGHT + node: index for node, index in number.items()}
 
     def named(name: str, size: int) -> Array:
         return collect(number, last, lambda report: report.values.get(name), size)
 
     return Beliefs(
-        collect(number, last, lambda report: report.estimate_m, 2),
-        collect(number, last, lambda report: report.covariance_m2, 4),
-        named("common_error_m", 2),
-        named("common_error_covariance_m2", 4),
-        {n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))},
-        {n: w for n, r in last.items() if (w := _weights(weighed, r)) is not None},
+        estimate_m=collect(number, last, lambda report: report.estimate_m, 2),
+        covariance_m2=collect(number, last, lambda report: report.covariance_m2, 4),
+        common_error_m=named("common_error_m", 2),
+        common_error_covariance_m2=named("common_error_covariance_m2", 4),
+        clouds={
+            n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))
+        },
+        weights={n: w for n, r in last.items() if (w := _weights(weight_index, r)) is not None},
     )
 
 
 def is_cloud(count: int) -> bool:
-    """Whether so many numbers can be points."""
+    """Return true if `count` numbers can be the coordinates of points."""
     return count % 2 == 0
 
 
-def _weights(place: Mapping[str, int], report: Report) -> Array | None:
-    """The weights (n,) that a node reported, 0 where none; None if it reported none at all. `place` is by name."""
+def _weights(index: Mapping[str, int], report: Report) -> Array | None:
+    """Return the weights (n,) that a node reported, 0 for missing ones; None if it reported none.
+
+    `index` is that of the node whose weight a value is, by the value's name.
+    """
     weights = None
-    for name in report.values.keys() & place.keys():
+    for name in report.values.keys() & index.keys():
         value = report.values[name]
         one = value if isinstance(value, list) else [value]
         if len(one) == 1:
-            weights = np.zeros(len(place)) if weights is None else weights
-            weights[place[name]] = one[0]
+            weights = np.zeros(len(index)) if weights is None else weights
+            weights[index[name]] = one[0]
     return weights
 
 
@@ -140,11 +148,11 @@ def period_message(
     events: Iterable[Event],
     busy_ratio: Array,
 ) -> dict[str, Any]:
-    """One period, [instant.time_ns, end_ns).
+    """Return the message of the period [instant.time_ns, end_ns).
 
-    Truth, fixes, what was reported, `figures`, `faults` acting in it (labels), `events` since the last message,
-    `up` (uint8, n) at its end, how busy the medium was (n), NaN where senders share none, and what became of
-    frames, from `rows` of the trace: all that were sent or decided in the period, and any others.
+    Truth, fixes, reports, `figures`, labels of the `faults` that act in it, `events` since the last message, `up`
+    (uint8, n) at its end, `busy_ratio` (n), the channel busy ratios (NaN without `[radio.mac]`), and the outcomes
+    of frames. `rows` of the trace must include all that were sent or decided in the period, and may include others.
     """
     return {
         "period": instant.period,
@@ -169,24 +177,24 @@ def period_message(
 
 
 def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> dict[str, Any]:
-    """What became of frames in [start, end).
+    """Return the part of a period's message about receptions decided in [start_ns, end_ns).
 
-    `pairs`: int32 (k, 4), sender, receiver, outcome and how many rows of the trace were so decided; `pairs_age_ms`
-    (k): how long before the end the newest of their frames was sent; `outcomes`: how many by name;
-    `latency_counts`: int32 (LATENCY_BINS,), deliveries by time on the way in bins of LATENCY_BIN_NS, the last for
-    all that took longer; `sent_bytes`, `received_bytes` (n): of the frames that were sent (with the copies that
-    faults make, and without those that nobody was in range of: no trace is kept of them) and delivered.
+    `pairs`: int32 (k, 4), sender, receiver, outcome, and the number of receptions; `pairs_age_ms` (k): time from
+    the newest of their frames to the end; `outcomes`: number of receptions by outcome; `latency_counts`: int32
+    (LATENCY_BINS,), deliveries by latency in bins of LATENCY_BIN_NS, the last open; `sent_bytes`, `received_bytes`
+    (n): bytes of frames sent (with copies made by faults; without frames that had no node in range, which are not
+    in the trace) and delivered.
     """
     time_ns = decided_ns(rows)
     decided = rows[(rows["outcome"] != Outcome.pending) & (start_ns <= time_ns) & (time_ns < end_ns)]
     sender, receiver = decided["sender"].astype(np.int64), decided["receiver"]
-    key, which, number = np.unique(
+    key, inverse, number = np.unique(
         (sender * count + receiver) * len(Outcome) + decided["outcome"], return_inverse=True, return_counts=True
     )
-    place = key // len(Outcome)
+    link = key // len(Outcome)
     newest_ns = np.zeros(len(key), np.int64)
-    np.maximum.at(newest_ns, which, decided["sent_ns"])
-    pairs = np.column_stack([place // count, place % count, key % len(Outcome), number])
+    np.maximum.at(newest_ns, inverse, decided["sent_ns"])
+    pairs = np.column_stack([link // count, link % count, key % len(Outcome), number])
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
     bins = np.minimum((delivered["arrival_ns"] - delivered["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1)
@@ -202,7 +210,7 @@ def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> d
 
 
 def _one_each(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """One row of each frame that was sent."""
+    """Return one row of each frame."""
     if not len(rows):
         return rows
     seq = rows["seq"] - rows["seq"].min()
@@ -212,7 +220,7 @@ def _one_each(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def event_message(event: Event) -> dict[str, Any]:
-    """An event, with no more of its details than one can read at a glance."""
+    """Return an event as a map, with long details truncated."""
     return {
         "time_ns": event.time_ns,
         "kind": event.kind,

@@ -1,4 +1,4 @@
-"""A played run in wall-clock pace: which message is due when."""
+"""Playback of a run in wall-clock time: due times of its messages."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from emulator.stream.playback import Message
 def schedule(
     messages: Iterable[Message], speed: float, from_ns: int = 0, to_ns: int | None = None
 ) -> Iterator[tuple[float, Message]]:
-    """The messages from one emulated instant to another, each with the second at which it is due.
+    """Yield the messages of the emulated times [from_ns, to_ns), each with its due time.
 
-    Seconds are of the wall clock, and `from_ns` is their 0. The scene always comes first and the end last; periods
-    that start before `from_ns`, or at `to_ns` or later, are left out.
+    Due times are in seconds of the wall clock from `from_ns` on. The scene is always first and the end last;
+    periods that start before `from_ns`, or at `to_ns` or later, are skipped.
     """
     due_s = 0.0
     for stream, message in messages:
@@ -35,9 +35,9 @@ def play(
     now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> int:
-    """Show each message when it is due, or as soon as those before it have been; returns how many periods.
+    """Show each message when it is due, or later if those before it take longer; return the number of periods.
 
-    The clock starts with the first period, however long it took to find.
+    The clock starts with the first period, however long reading up to it takes.
     """
     periods = 0
     started_s = 0.0

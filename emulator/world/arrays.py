@@ -1,4 +1,4 @@
-"""Arrays from NPZ files that may be anything."""
+"""Arrays from untrusted NPZ files."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ from vnet.errors import ScenarioError, printable
 
 
 def read_arrays(path: Path, names: Iterable[str], largest_bytes: int) -> dict[str, NDArray[Any]]:
-    """Those of the arrays `names` that an NPZ file holds. Raises ScenarioError where one is larger than allowed.
+    """Return the arrays of an NPZ file that are among `names`. Raise ScenarioError if one is larger than allowed.
 
-    No more memory is taken than the file has content for.
+    No more memory is allocated than the file has content for.
     """
     arrays = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            there = set(archive.namelist())
+            members = set(archive.namelist())
             for name in names:
-                if f"{name}.npy" in there:
+                if f"{name}.npy" in members:
                     _check_size(archive, f"{name}.npy", largest_bytes)
                     with archive.open(f"{name}.npy") as member:
                         arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except Exception as error:  # zipfile, zlib and numpy have a dozen ways to say that something is wrong
+    except Exception as error:  # zipfile, zlib and numpy raise a dozen types for a bad file
         raise ScenarioError(f"{path}: not an NPZ file: {printable(str(error), 300)}") from None
     return arrays
 
 
 def _check_size(archive: zipfile.ZipFile, name: str, largest_bytes: int) -> None:
-    """Raises ValueError where an array is larger than what is taken, or than it is."""
+    """Raise ValueError if an array is larger than allowed, or its header claims more than its content."""
     size = archive.getinfo(name).file_size
     if size > largest_bytes:
-        raise ValueError(f"{name}: {size:,} bytes; at most {largest_bytes:,} are taken")
+        raise ValueError(f"{name}: {size:,} bytes; at most {largest_bytes:,} are allowed")
     with archive.open(name) as member:
         version = np.lib.format.read_magic(member)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

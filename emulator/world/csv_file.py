@@ -1,4 +1,4 @@
-"""CSV files that others wrote, read within bounds: what is no table is refused before it fills the memory."""
+"""Untrusted CSV files, read within bounds: a file that is not a table is refused before it fills the memory."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import TextIO
 
 from vnet.errors import ScenarioError
 
-MOST_ROWS = 10_000
-"""As many vehicles as a scenario may have."""
+MAX_ROWS = 10_000
+"""Most rows of a file: the most vehicles of a scenario."""
 
 
 @contextmanager
 def open_csv(path: Path, longest_line: int) -> Iterator[Iterator[str]]:
-    """The lines of a CSV file, with or without a byte-order mark, for a reader of the csv module.
+    """Yield the lines of a CSV file, without a byte-order mark, for a reader of the csv module.
 
-    `longest_line` is in characters. Whatever is wrong with the file, here or in the reader, is a ScenarioError.
+    `longest_line` is in characters. Raise ScenarioError for a bad file, also if the reader finds it bad.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -39,6 +39,6 @@ def _lines(path: Path, file: TextIO, longest_line: int) -> Iterator[str]:
 
 
 def check_row_count(path: Path, rows: int) -> None:
-    """Raises ScenarioError above `MOST_ROWS`."""
-    if rows > MOST_ROWS:
-        raise ScenarioError(f"{path}: more than {MOST_ROWS} rows; that is as many vehicles as there may be")
+    """Raise ScenarioError if there are more than `MAX_ROWS` rows."""
+    if rows > MAX_ROWS:
+        raise ScenarioError(f"{path}: more than {MAX_ROWS} rows; a scenario has at most so many vehicles")

@@ -1,4 +1,4 @@
-"""What the faults do to a vehicle's GNSS receiver and clock: functions of the plan and the time alone."""
+"""Effects of faults on GNSS receivers and clocks: functions of the fault plan and the time alone."""
 
 from __future__ import annotations
 
@@ -9,26 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from emulator.faults.plan import PlannedFault, stream
-from emulator.scenario.faults import (
-    ConstPosOffset,
-    Drift,
-    GnssFault,
-    GnssFreeze,
-    GnssJump,
-    GnssOutage,
-    GnssRamp,
-    RandomPos,
-    Skew,
-)
+from emulator.scenario.fault_families import GnssFault
+from emulator.scenario.faults import Drift, GnssFreeze, GnssOutage, RandomPos, Skew
 from emulator.world.world import Instant, World
 from vnet.node import Fix
 from vnet.transport.wire import ClockError
 from vnet.types import Array
-from vnet.units import NS_PER_S
 
 
 class FaultyGnss:
-    """The fixes of a run as the receivers give them: the world's, and what faults make of them."""
+    """The fixes of a run as programs get them: the world's, changed by faults."""
 
     def __init__(self, world: World, faults: Sequence[PlannedFault], seed: int) -> None:
         self._world = world
@@ -36,7 +26,7 @@ class FaultyGnss:
         self._seed = seed
 
     def fix(self, period: int, number: int) -> Fix | None:
-        """The fix of vehicle `number` at the start of `period`; None in an outage."""
+        """Return the fix of vehicle `number` at the start of `period`; None in an outage."""
         time_ns = period * self._world.period_ns
         acting = [
             planned
@@ -56,17 +46,20 @@ class FaultyGnss:
         return replace(fix, position_m=position_m)
 
     def at(self, period: int) -> Instant:
-        """The truth at the start of `period`, with the fixes as they were given (NaN in an outage)."""
+        """Return the truth at the start of `period`, with the fixes that programs get (NaN in an outage)."""
         instant = self._world.at(period)
         if not any(isinstance(p.fault, GnssFault) and p.acts_at(instant.time_ns) for p in self._faults):
             return instant
         nothing = np.full(2, np.nan)
-        there = instant.present.tolist()
-        fixes = [self.fix(period, number) if here else None for number, here in enumerate(there)]
+        present = instant.present.tolist()
+        fixes = [self.fix(period, number) if is_present else None for number, is_present in enumerate(present)]
         return replace(instant, fix_m=np.array([nothing if fix is None else fix.position_m for fix in fixes]))
 
     def _start(self, acting: Sequence[PlannedFault], fix: Fix, number: int) -> Array:
-        """The position that frozen receivers repeat: their last before the earliest freeze, or first since."""
+        """Return the position before other faults: the fix's, or that of a frozen receiver.
+
+        A frozen receiver repeats its last position before the earliest freeze, or its first one since.
+        """
         frozen = [planned.start_ns for planned in acting if isinstance(planned.fault, GnssFreeze)]
         if not frozen:
             return fix.position_m
@@ -76,22 +69,19 @@ class FaultyGnss:
         return self._world.fix(last, number).position_m
 
     def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:
-        match planned.fault:
-            case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
-                return np.asarray(position_m + np.array(offset_m))
-            case GnssRamp(rate_m_s=rate_m_s):
-                return np.asarray(position_m + np.array(rate_m_s) * (time_ns - planned.start_ns) / NS_PER_S)
-            case RandomPos(radius_m=radius_m):
-                # A place of its own for each vehicle and period, whatever was drawn before.
-                draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
-                angle, away_m = 2 * math.pi * draws[0], radius_m * math.sqrt(draws[1])
-                return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
-            case _:
-                return position_m
+        fault = planned.fault
+        assert isinstance(fault, GnssFault)
+        if isinstance(fault, RandomPos):
+            # Drawn for each vehicle and period, independent of other draws.
+            draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
+            angle, away_m = 2 * math.pi * draws[0], fault.radius_m * math.sqrt(draws[1])
+            return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
+        displacement_m = fault.displacement_m(time_ns - planned.start_ns)
+        return position_m if displacement_m is None else np.asarray(position_m + displacement_m)
 
 
 def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockError:
-    """How the clock of a vehicle goes at `time_ns`: skews add up; drifts multiply, so that it never stands."""
+    """Return the clock error of a vehicle at `time_ns`: skews add; drifts multiply, so the clock never stops."""
     acting = [planned for planned in faults if planned.acts_at(time_ns) and planned.nodes[number]]
     offset_ns = sum(p.fault.offset_ms * 1e6 for p in acting if isinstance(p.fault, Skew))
     drifts = [(p.start_ns, p.fault.rate_ppm / 1e6) for p in acting if isinstance(p.fault, Drift)]

@@ -1,4 +1,4 @@
-"""Who hears whom, where a scenario gives it as a matrix instead of a range; read from CSV or as it stands there."""
+"""Connectivity given as a matrix instead of a range, read from CSV or from the scenario itself."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.scenario import Radio
-from emulator.world.csv_file import MOST_ROWS, check_row_count, open_csv
+from emulator.world.csv_file import MAX_ROWS, check_row_count, open_csv
 from vnet.errors import ScenarioError, shown
 
-_LONGEST_LINE = 10 * MOST_ROWS
-"""An entry may be written as `1.000000,`."""
+_LONGEST_LINE = 10 * MAX_ROWS
+"""Characters of a line: an entry may be written as `1.000000,`."""
 
 
 def load_links(radio: Radio, vehicles: int) -> NDArray[np.bool_] | None:
-    """`radio.links` as (N, N): whether vehicle i (row) hears vehicle j (column); None where the range decides.
+    """Return `radio.links` (N, N): entry (i, j) is true if vehicle i receives vehicle j; None without a matrix.
 
-    Nobody hears itself, whatever the diagonal says. Raises ScenarioError if it is no square matrix of 0 and 1, or
-    not one of `vehicles` rows.
+    The diagonal is ignored: no vehicle receives itself. Raise ScenarioError unless it is a square matrix of 0 and 1
+    with `vehicles` rows.
     """
     if radio.links is None:
         return None

@@ -1,8 +1,8 @@
-"""Networks: which vehicles there are, and on which lanes; read from CSV or generated.
+"""Networks of standing vehicles on straight lanes, read from CSV or generated.
 
-The generated ones have the character of the three networks of the paper (Ann Arbor, zhao-lab/network-propagation,
-MIT): their sorted degrees at 3 km range and the sizes of their components are the targets below. Positions are
-drawn and then annealed until the degrees fit; nothing of the published positions is used.
+Generated networks have the character of the paper's three networks (Ann Arbor, zhao-lab/network-propagation, MIT):
+the targets below are their sorted degrees at 3 km range and the sizes of their components. Positions are drawn, and
+then annealed until the degrees fit. The published positions are not used.
 """
 
 from __future__ import annotations
@@ -15,33 +15,42 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.random_streams import NETWORK_KEY, philox
 from emulator.world.csv_file import check_row_count, open_csv
 from vnet.errors import ScenarioError, shown
 from vnet.transport.keys import is_segment
 from vnet.types import Array
 
 COLUMNS = ("id", "x_m", "y_m", "heading_rad")
+"""Columns of a network file."""
 REFERENCE_RANGE_M = 3000.0
-FARTHEST_M = 2e7
-"""Positions are within ±20 000 km: twice what projections use, and what frames can say in 32-bit cm."""
+"""Radio range at which the degrees below hold."""
+MAX_COORDINATE_M = 2e7
+"""Bound of coordinates: twice what projections use, and what the cooperative program's frames hold in 32-bit cm."""
 _LONGEST_LINE = 10_000
+"""Characters of a line of a network file."""
 
-# Sorted degrees of the published networks at 3 km, as (degree, how many vehicles have it).
+# Degrees of the published networks at 3 km, by number of vehicles, as "degree:number of vehicles that have it".
 _DEGREES = {
     50: "2:2 3:1 4:2 5:1 7:3 8:1 9:2 10:4 11:4 12:4 13:3 14:2 15:3 16:6 17:3 18:5 20:1 21:2 22:1",
     38: "2:2 3:2 4:2 5:3 6:3 7:7 8:2 9:6 10:8 12:3",
     24: "2:8 3:5 4:2 5:2 7:4 8:2 9:1",
 }
 _COMPONENTS = {50: (50,), 38: (38,), 24: (15, 6, 3)}
+"""Sizes of the published networks' components, by number of vehicles."""
 
-# Headings: a grid town. Shares of all vehicles that drive within 4° of an axis; the others go anywhere.
 _AXIS_SHARES = {0.0: 0.24, math.pi / 2: 0.08, math.pi: 0.16, 3 * math.pi / 2: 0.04}
+"""Shares of the vehicles with a heading along an axis, as in a town with a grid; the others' headings are
+uniform."""
 _AXIS_SPREAD_RAD = math.radians(2.0)
+"""Standard deviation of a heading along an axis."""
 
 TOWN_SIDE_M = 10_500.0
-"""Side of the square that holds 50 vehicles; others in proportion to their number."""
+"""Side of the square for 50 vehicles; its area is proportional to their number."""
 _ANNEALING_MOVES = 20_000
+"""Most moves of the annealing."""
 _LARGEST_ANNEALED = 200
+"""Largest network that is annealed; larger ones are drawn uniformly."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +63,15 @@ class Network:
 
 
 def load_network(path: Path) -> Network:
-    """Read a CSV with the columns id, x_m, y_m, heading_rad. Raises ScenarioError that names the line."""
+    """Read a CSV file with the columns `COLUMNS`. Raise ScenarioError, naming the line, for a bad file."""
     vehicles: dict[str, tuple[float, float, float]] = {}
     with open_csv(path, _LONGEST_LINE) as lines:
         reader = csv.DictReader(lines)
         names = list(reader.fieldnames or [])
         for column in COLUMNS:
             if names.count(column) != 1:
-                how = "two columns" if column in names else "no column"
-                raise ScenarioError(f"{path}: {how} {column!r}; needed are {', '.join(COLUMNS)}")
+                problem = "two columns" if column in names else "no column"
+                raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(COLUMNS)}")
         for row in reader:
             name, values = _read_row(path, reader.line_num, row)
             if name in vehicles:
@@ -87,10 +96,10 @@ def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, t
             value = float(row[column] or "")
         except ValueError:
             value = math.nan
-        if not abs(value) <= FARTHEST_M:
+        if not abs(value) <= MAX_COORDINATE_M:
             raise ScenarioError(
                 f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, "
-                f"within ±{FARTHEST_M:g}"
+                f"within ±{MAX_COORDINATE_M:g}"
             )
         values.append(value)
     return name, (values[0], values[1], values[2])
@@ -99,10 +108,11 @@ def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, t
 def generate_network(layout: str, vehicles: int, seed: int) -> Network:
     """Draw a network of `vehicles`; the same arguments give the same network.
 
-    `urban` has the degrees and components of the published networks for 50, 38 and 24 vehicles, and of the
-    nearest of them, scaled, for other counts. `dense` is a city centre in which everybody is in range of most.
+    `urban` has the degrees and components of the published networks for 50, 38 and 24 vehicles; for other numbers,
+    the scaled degrees of the nearest of them. `dense` is a city centre in which most vehicles are in range of each
+    other.
     """
-    rng = np.random.Generator(np.random.Philox(key=np.array([seed, 0x6E6574], dtype=np.uint64)))
+    rng = np.random.Generator(philox(seed, NETWORK_KEY))
     width = max(2, len(str(vehicles)))
     node_ids = tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
     heading_rad = _draw_headings(rng, vehicles)
@@ -124,7 +134,7 @@ def _draw_headings(rng: np.random.Generator, vehicles: int) -> Array:
 
 
 def _target_degrees(vehicles: int) -> NDArray[np.intp]:
-    """Sorted degrees to aim at: published ones, or the quantiles of the nearest connected published network."""
+    """Return the sorted target degrees: published, or quantiles of the nearest connected published network."""
     connected = [count for count, sizes in _COMPONENTS.items() if len(sizes) == 1 or count == vehicles]
     nearest = min(connected, key=lambda count: (abs(count - vehicles), count))
     pairs = [entry.split(":") for entry in _DEGREES[nearest].split()]
@@ -138,10 +148,10 @@ def _target_degrees(vehicles: int) -> NDArray[np.intp]:
 
 
 class _Town:
-    """Positions under annealing: districts, one a component, that lie further apart than the range.
+    """Positions under annealing, in districts (one for each component) that lie further apart than the range.
 
-    Vehicles move within their district. The cost is the L1 distance between the sorted degrees and the target,
-    and `SPLIT_COST` where a district falls apart.
+    Vehicles move within their district. The cost is the L1 distance between the sorted degrees and the target, plus
+    `SPLIT_COST` if a district is not connected.
     """
 
     SPLIT_COST = 8.0
@@ -171,7 +181,7 @@ class _Town:
         return cost
 
     def _is_split(self) -> bool:
-        """Whether a district has fallen apart; districts lie too far apart to merge."""
+        """Return true if a district is not connected; districts lie too far apart to merge."""
         first = 0
         for size in self._components:
             reached = np.zeros(len(self.linked), dtype=bool)
@@ -188,10 +198,10 @@ class _Town:
         return False
 
     def anneal(self) -> Array:
-        """Move vehicles one at a time, by the rule of Metropolis, until the cost is 0; returns the best."""
+        """Move single vehicles by the Metropolis rule until the cost is least; return the best positions (N, 2)."""
         best_m, best_cost = self.position_m.copy(), self.cost
         for move in range(_ANNEALING_MOVES):
-            if best_cost == self._target.sum() % 2:  # degrees add up to an even number
+            if best_cost == self._target.sum() % 2:  # the sum of all degrees is even
                 break
             temperature = 1.5 * (1 - move / _ANNEALING_MOVES) ** 2
             self._try_move(temperature)

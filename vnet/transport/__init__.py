@@ -1,1 +1,1 @@
-"""The transport between agents and emulator: keys, messages, sessions, and who may do what on the router."""
+"""The transport between agents and emulator: keys, messages, sessions, and access rules of the router."""

@@ -1,9 +1,9 @@
-"""Who may do what on the router: users, passwords, certificates and rules for one run.
+"""Access control of the router: users, passwords, certificates and rules of one run.
 
-The router denies by default. Roles: *node* (one user an agent process, granted exactly its nodes' keys),
-*observer* (receives only), *operator* (queries `control`) and *emulator* (all of the run's keys; needed only where
-the emulator is a client of a separate router). Rules have no templating by user name, so that there is a set for
-each process.
+The router denies by default. Roles: *node* (a user for each agent process, with access to exactly its nodes' keys),
+*observer* (receives only), *operator* (queries `control`) and *emulator* (all keys of the run; used only if the
+emulator is a client of a separate router). Zenoh's rules have no templates by user name, so each process has its
+own.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ OPERATOR = "operator"
 
 @dataclass(frozen=True)
 class Access:
-    """All users of a run. `processes` are the node ids of each agent process, its lead first.
+    """All users of a run. `processes` are the node ids of each agent process; the first is the process's id.
 
-    With `tls`, the router speaks only TLS, and believes a user only with its own certificate beside its password.
+    With `tls` the router accepts only TLS, and a user needs its own certificate as well as its password.
     """
 
     run: str
@@ -57,8 +57,8 @@ class Access:
     ) -> Access:
         """Draw new passwords for every process and role of a run.
 
-        `certify` issues the certificates of all users, for a router that speaks only TLS: see
-        `certificates.certifier`. Raises TransportError where it cannot.
+        `certify` issues the certificates of all users for a router that accepts only TLS; see
+        `certificates.certifier`. Raise TransportError if it cannot.
         """
         users = _users(processes)
         return cls(
@@ -69,23 +69,23 @@ class Access:
         )
 
     def credentials(self, user: str) -> Credentials:
-        """One user's credentials; node users are named by `node_user(process_id)`."""
+        """Return a user's credentials; node users are named by `node_user(process_id)`."""
         identity = None if self.tls is None else Identity(self.tls.authority, self.tls.users[user])
         return Credentials(user, self.passwords[user], identity)
 
     def dictionary(self) -> str:
-        """The router's dictionary file: a line `user:password` each."""
+        """Return the router's dictionary file: a line `user:password` for each user."""
         return "".join(f"{user}:{password}\n" for user, password in self.passwords.items())
 
     def access_control(self) -> dict[str, Any]:
-        """The `access_control` section of a router's configuration."""
+        """Return the `access_control` section of a router's configuration."""
         rules: list[Rule] = []
         subjects: list[dict[str, Any]] = []
         policies: list[dict[str, Any]] = []
         for user, user_rules in self._roles():
             rules += user_rules
             subject: dict[str, Any] = {"id": user, "usernames": [user]}
-            if self.tls is not None:  # Zenoh wants both of a subject: another's password or certificate is no use
+            if self.tls is not None:  # Zenoh then requires both from the same user
                 subject["cert_common_names"] = [common_name(user)]
             subjects.append(subject)
             policies.append({"rules": [rule["id"] for rule in user_rules], "subjects": [user]})
@@ -124,11 +124,11 @@ class Access:
         ]
 
     def save(self, folder: Path, listen: str, router_folder: Path) -> None:
-        """Write what a separate `zenohd` and hand-started agents need. Raises TransportError if it cannot.
+        """Write the files for a separate `zenohd` and manually started agents. Raise TransportError on failure.
 
-        `zenohd.json5`, `users.txt` (its dictionary) and `credentials/{role or process_id node}.json`, all 0600, in
-        folders of 0700 (an existing `folder` keeps its mode). Certificates and keys stand in these files.
-        `router_folder` is where the router sees the folder, which in a container is somewhere else.
+        `zenohd.json5`, `users.txt` (its dictionary) and `credentials/{role or process id}.json`, all with mode
+        0600, in folders of 0700 (an existing `folder` keeps its mode). These files contain certificates and keys.
+        `router_folder` is the folder's path on the router, which may differ in a container.
         """
         self.check_endpoint(listen)
         try:
@@ -147,7 +147,7 @@ class Access:
 
     @classmethod
     def load(cls, folder: Path) -> Access:
-        """Restore what `save` wrote. Raises TransportError."""
+        """Restore what `save` wrote. Raise TransportError if a file is missing or bad."""
         try:
             access = load_record(folder / "access.json", cls)
             access._check()
@@ -158,7 +158,7 @@ class Access:
         return access
 
     def _check(self) -> None:
-        """Raises ValueError if this is not what `create` makes: rules and the dictionary are written from it."""
+        """Raise ValueError if `create` cannot have made this: rules and the dictionary are written from it."""
         names = [self.run, *(node for nodes in self.processes for node in nodes)]
         if not all(map(keys.is_segment, names)) or not all(self.processes):
             raise ValueError
@@ -169,15 +169,13 @@ class Access:
             check_user(user, password)
 
     def check_endpoint(self, listen: str) -> None:
-        """Raise TransportError unless `listen` speaks TLS if and only if its users have certificates."""
+        """Raise TransportError unless `listen` is a TLS endpoint exactly if the users have certificates."""
         if self.tls is None and is_tls(listen):
             raise TransportError(
                 f"{listen}: the users have no certificates; write them with: vnet access --listen tls/…"
             )
         if self.tls is not None and not is_tls(listen):
-            raise TransportError(
-                f"{listen}: the users have certificates; only at tls/HOST:PORT are they asked for them"
-            )
+            raise TransportError(f"{listen}: the users have certificates, which are used only at tls/HOST:PORT")
 
 
 SUBSCRIBE = ["declare_subscriber"]
@@ -196,24 +194,24 @@ EVERYTHING = [
 
 
 def _users(processes: Sequence[Sequence[str]]) -> list[str]:
-    """All users of a run: one for each process, and the other roles."""
+    """Return all users of a run: one for each process, and the other roles."""
     return [*(node_user(nodes[0]) for nodes in processes), EMULATOR, OBSERVER, OPERATOR]
 
 
 def node_user(process_id: str) -> str:
-    """The user name of an agent process, by the first of its nodes."""
+    """Return the user name of an agent process, whose id is the first of its nodes."""
     return f"node-{process_id}"
 
 
 def is_tls(endpoint: str) -> bool:
-    """Whether an endpoint is one of TLS."""
+    """Return true for a TLS endpoint."""
     return endpoint.startswith("tls/")
 
 
 def router_config(
     listen: Sequence[str], dictionary: Path, access_control: dict[str, Any], tls: Certificates | None
 ) -> dict[str, Any]:
-    """The configuration of a router that lets in only the run's users, embedded or separate."""
+    """Return the configuration of a router, embedded or separate, that admits only the run's users."""
     config: dict[str, Any] = {
         "mode": "router",
         "listen": {"endpoints": list(listen)},
@@ -248,7 +246,8 @@ def _node_rules(run: str, nodes: Sequence[str]) -> list[Rule]:
         _rule(f"{process_id}-token", ["ingress"], ["liveliness_token"], alive),
         _rule(f"{process_id}-subscribe", ["ingress"], SUBSCRIBE, rx),
         _rule(f"{process_id}-receive", ["egress"], ["put"], rx),
-        # That the emulator and observers listen (they do so to all nodes at once) is what opens a publisher.
+        # A publisher sends only once it knows the subscriptions of the emulator and observers, which match all
+        # nodes.
         _rule(
             f"{process_id}-matching", ["egress"], SUBSCRIBE, [keys.node_tx(run, "*"), keys.node_report(run, "*")]
         ),

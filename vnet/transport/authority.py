@@ -1,8 +1,8 @@
-"""Certificates for one run: an authority whose key nobody keeps, and a key pair for the router and every user.
+"""Issuing of certificates for one run: a certificate authority, and key pairs for the router and every user.
 
-The authority signs once, when the run's users are drawn, and its private key is then forgotten: nobody can issue
-another certificate that this run's router believes. This module needs the package `cryptography` (extra `tls`) and
-is imported only where certificates are made; Zenoh takes them as PEM.
+The authority signs once, when the run's users are created, and its private key is then discarded: no further
+certificate that this run's router accepts can be issued. This module needs the package `cryptography` (extra `tls`)
+and is imported only to issue certificates. Zenoh reads them as PEM.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ from vnet.errors import TransportError, shown
 from vnet.transport.credentials import Certificates, KeyPair, common_name
 
 VALID_DAYS = 365
+"""Validity of certificates, longer than any run."""
 
 
 def issue_certificates(users: Iterable[str], names: Sequence[str]) -> Certificates:
-    """Draw all key pairs of a run; `names` are the names and addresses that the router goes by.
+    """Issue all certificates of a run; `names` are the host names and addresses of the router.
 
-    They are valid from a day ago, because clocks differ, for `VALID_DAYS`. Raises TransportError for a bad name.
+    They are valid from a day ago, because clocks differ, for `VALID_DAYS`. Raise TransportError for a bad name.
     """
     authority = _Authority()
     router = authority.issue("router", ExtendedKeyUsageOID.SERVER_AUTH, [_general_name(name) for name in names])
@@ -45,11 +46,11 @@ def _general_name(name: str) -> x509.GeneralName:
     try:
         return x509.DNSName(name.encode("idna").decode())
     except UnicodeError:
-        raise TransportError(f"{shown(name)}: not a name or an address that a certificate can bear") from None
+        raise TransportError(f"{shown(name)}: not a host name or an address for a certificate") from None
 
 
 class _Authority:
-    """Signs certificates for as long as this object lives."""
+    """A certificate authority, whose key exists only as long as this object."""
 
     def __init__(self) -> None:
         self._key = ec.generate_private_key(ec.SECP256R1())
@@ -59,7 +60,7 @@ class _Authority:
         self.certificate = self._sign(builder)
 
     def issue(self, name: str, usage: ObjectIdentifier, alternatives: Sequence[x509.GeneralName] = ()) -> KeyPair:
-        """A new key pair for `name`, to be used on one side of a connection only."""
+        """Issue a key pair for `name`, for one side of a connection (server or client) only."""
         key = ec.generate_private_key(ec.SECP256R1())
         builder = self._builder(name, key.public_key())
         builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)

@@ -1,4 +1,4 @@
-"""Certificates of a run, for a router that speaks TLS: the names it goes by, and how to have them issued."""
+"""Certificates of a TLS router: its names, and a function that issues the certificates of a run."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from vnet.errors import TransportError
 from vnet.transport.credentials import Certificates
 
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
-_ANYWHERE = ("0.0.0.0", "::", "*")
+"""Names of this machine for itself."""
+_ANY_ADDRESS = ("0.0.0.0", "::", "*")
+"""Hosts of endpoints that listen on all addresses."""
 
 
 def certifier(listen: str, names: Sequence[str] = ()) -> Callable[[Sequence[str]], Certificates]:
     """Return a function that issues the certificates of the users of a router that listens at `listen`.
 
-    `names` are further names or addresses that the router goes by: clients verify that they met one of these.
-    Raises TransportError where the package cryptography is missing; the function raises it for what is no name.
+    `names` are further host names or addresses of the router, which clients verify. Raise TransportError if the
+    package cryptography is missing; the function raises it for a bad name.
     """
     try:
         from vnet.transport.authority import issue_certificates
@@ -27,12 +29,12 @@ def certifier(listen: str, names: Sequence[str] = ()) -> Callable[[Sequence[str]
 
 
 def router_names(endpoint: str, more: Sequence[str] = ()) -> list[str]:
-    """What a router that listens at `endpoint` goes by: its clients verify that they met one of these.
+    """Return the names of a router that listens at `endpoint`, of which clients verify one.
 
-    Loopback, the endpoint's host (where that is all addresses: what this machine knows itself by), and `more`.
+    They are loopback, the endpoint's host (or, if it listens on all addresses, this machine's names), and `more`.
     """
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
-    names = [*_LOOPBACK, *(_own_names() if host in _ANYWHERE else [host]), *more]
+    names = [*_LOOPBACK, *(_own_names() if host in _ANY_ADDRESS else [host]), *more]
     return list(dict.fromkeys(names))
 
 
@@ -40,5 +42,5 @@ def _own_names() -> list[str]:
     name = socket.gethostname()
     try:
         return [name, *sorted({str(address[4][0]) for address in socket.getaddrinfo(name, None)})]
-    except OSError:  # a machine that does not know its own address
+    except OSError:  # the machine's name does not resolve
         return [name]

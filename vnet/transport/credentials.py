@@ -1,4 +1,4 @@
-"""Credentials: users' passwords, key pairs and certificates, and the private files in which they are kept."""
+"""Credentials: users' passwords, key pairs and certificates, and the private files that hold them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vnet.bounded import read_bounded
 from vnet.errors import TransportError
 
 LARGEST_FILE_BYTES = 64 * 2**20
-"""Of a file with credentials; ten thousand users with certificates take 22 of the 64 MiB."""
+"""Largest file with credentials: ten thousand users with certificates take 22 of the 64 MiB."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class Certificates:
-    """All of a run: the certificate of its authority (PEM), the router's key pair and each user's."""
+    """All certificates of a run: that of its authority (PEM), and the key pairs of the router and each user."""
 
     authority: str
     router: KeyPair
@@ -37,7 +37,7 @@ class Certificates:
 
 @dataclass(frozen=True)
 class Identity:
-    """What a client needs for TLS: whose certificates it believes (PEM), and its own key pair."""
+    """A client's TLS identity: the certificate of the authority that it trusts (PEM), and its own key pair."""
 
     authority: str
     own: KeyPair
@@ -47,7 +47,7 @@ class Identity:
 class Credentials:
     """A user of the router, its password and, for TLS, its certificate.
 
-    Kept in 0600 files or passed by an inherited descriptor; never shown.
+    They are kept in files of mode 0600 or passed by an inherited descriptor, and never shown.
     """
 
     user: str
@@ -55,12 +55,12 @@ class Credentials:
     tls: Identity | None = None
 
     def dumps(self) -> str:
-        """The form of a credentials file."""
+        """Return the text of a credentials file."""
         return dump_record(self)
 
     @classmethod
     def load(cls, path: Path) -> Credentials:
-        """Read a credentials file. Raises LinkError."""
+        """Read a credentials file. Raise TransportError if it is missing or bad."""
         try:
             credentials = load_record(path, cls)
             check_user(credentials.user, credentials.password)
@@ -72,7 +72,7 @@ class Credentials:
 
 
 def common_name(user: str) -> str:
-    """The name of a user in its certificate, where there is room for 64 characters."""
+    """Return the name of a user in its certificate, which holds 64 characters."""
     if len(user) <= 64:
         return user
     return f"user-{hashlib.blake2b(user.encode(), digest_size=16).hexdigest()}"
@@ -87,7 +87,7 @@ def write_private(path: Path, text: str) -> None:
 
 
 def as_base64(pem: str) -> str:
-    """PEM as Zenoh takes it within a configuration."""
+    """Return PEM in the form of Zenoh's configuration."""
     return base64.b64encode(pem.encode()).decode()
 
 
@@ -99,7 +99,7 @@ def dump_record(record: Any) -> str:
 
 
 def load_record(path: Path, kind: type[_T]) -> _T:
-    """Restore `dump_record`. Raises OSError, and ValueError if the file holds anything else."""
+    """Restore a file of `dump_record`. Raise OSError, or ValueError if the file holds anything else."""
     try:
         return msgspec.json.decode(read_bounded(path, LARGEST_FILE_BYTES), type=kind)
     except (msgspec.DecodeError, RecursionError) as error:
@@ -107,6 +107,6 @@ def load_record(path: Path, kind: type[_T]) -> _T:
 
 
 def check_user(user: str, password: str) -> None:
-    """Raises ValueError for what would not stay one entry in the router's dictionary."""
+    """Raise ValueError unless user and password make exactly one entry of the router's dictionary."""
     if not user or not password or ":" in user or not (user + password).isprintable():
         raise ValueError

@@ -1,8 +1,8 @@
-"""How the Linux scheduler treats the threads of a run.
+"""Time slices of a run's threads in the Linux scheduler.
 
-Whoever passes messages on has little to do and must do it at once; programs compute for milliseconds, many on one
-processor. Since Linux 6.12 a thread with a short time slice preempts those with longer ones as soon as it is
-woken (EEVDF: `sched_runtime` of sched_setattr(2), no privilege needed). Elsewhere these calls do nothing.
+Threads that pass messages on have little work but must run at once; programs compute for milliseconds, many on one
+processor. Since Linux 6.12 a thread with a short time slice preempts those with longer ones as soon as it wakes
+(EEVDF: `sched_runtime` of sched_setattr(2), without privileges). On other systems these functions do nothing.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 PROMPT_SLICE_NS = 100_000
-"""For threads that pass messages on; the least that Linux takes."""
+"""Time slice of threads that pass messages on: the least that Linux accepts."""
 COMPUTING_SLICE_NS = 6_000_000
-"""For programs: longer than they take for a period, so that one is done before the next begins."""
+"""Time slice of programs: longer than their work for a period, so that each is finished before the next starts."""
 DEFAULT_SLICE = 0
-"""Whatever the kernel gives."""
+"""The kernel's default."""
 
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _this_thread = threading.local()
@@ -28,7 +28,7 @@ _ATTRIBUTES = struct.Struct("IIQiIQQQ")
 
 
 def set_time_slice(slice_ns: int) -> bool:
-    """Ask for this time slice in nanoseconds, for this thread and those that it will start; False if refused."""
+    """Set the time slice in ns of this thread and of those it will start; return false if the kernel refuses."""
     number = _SCHED_SETATTR.get(platform.machine()) if struct.calcsize("P") == 8 else None
     try:
         if number is None or os.uname().sysname != "Linux" or os.sched_getscheduler(0) != os.SCHED_OTHER:
@@ -45,7 +45,7 @@ def set_time_slice(slice_ns: int) -> bool:
 
 @contextmanager
 def default_time_slice() -> Iterator[None]:
-    """For starting processes, which inherit the time slice of the thread that starts them."""
+    """Set the default time slice within the context, to start processes, which inherit the thread's time slice."""
     former_ns = getattr(_this_thread, "slice_ns", DEFAULT_SLICE)
     set_time_slice(DEFAULT_SLICE)
     try:

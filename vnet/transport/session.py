@@ -1,7 +1,7 @@
-"""Opening Zenoh sessions: the emulator's embedded router, or a client of somebody's router.
+"""Opening Zenoh sessions: the emulator's embedded router, or a client of a router.
 
-All settings that were measured to matter are here (DESIGN 4): no multicast scouting, no shared memory,
-explicit endpoints, finite timeouts. Sessions must be closed (`with`): an open one hangs the exit.
+All settings that matter by measurement are here: no multicast scouting, no shared memory, explicit endpoints,
+finite timeouts. Sessions must be closed (`with`): an open one hangs the interpreter's exit.
 """
 
 from __future__ import annotations
@@ -22,25 +22,27 @@ from vnet.transport.access import Access, is_tls, router_config
 from vnet.transport.credentials import Credentials, Identity, as_base64, write_private
 
 AGENT_RUNTIME = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:2))"
-"""`ZENOH_RUNTIME` of an agent: fewer threads, 30 % less CPU. Zenoh reads it when it starts."""
+"""`ZENOH_RUNTIME` of an agent, read by Zenoh when it starts: fewer threads, 30 % less CPU time."""
 
 CONNECT_TIMEOUT_MS = 5000
+"""Longest time to connect to a router: long enough for a loaded machine."""
 
 _NO_CONFIGURATIONS = "zenoh::api::session=off"
+"""Filter of Zenoh's log that drops sessions' configurations, which contain passwords."""
 
 
 @contextmanager
 def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Session]:
-    """A session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
+    """Open a session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
 
-    Raises TransportError if the endpoint cannot be listened on, or speaks TLS where the users have no certificates.
+    Raise TransportError if it cannot listen there, or if only one of the endpoint and the users is set up for TLS.
     """
     access.check_endpoint(listen)
     with tempfile.TemporaryDirectory(prefix="vnet-") as folder:
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())
         config = router_config([listen], dictionary, access.access_control(), access.tls)
-        link = {**_link(lease_ms), "rx": {"max_message_size": wire.LARGEST_SAID_BYTES}}
+        link = {**_queues(lease_ms), "rx": {"max_message_size": wire.LARGEST_MESSAGE_BYTES}}
         config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
         session = _open(config, f"cannot listen on {listen}")
@@ -50,7 +52,7 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
 
 @contextmanager
 def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -> Iterator[zenoh.Session]:
-    """A client session of the router at `endpoint`. Raises TransportError if it is not there or refuses."""
+    """Open a client session of the router at `endpoint`. Raise TransportError if none answers, or it refuses."""
     identity = None if credentials is None else credentials.tls
     if is_tls(endpoint) != (identity is not None):
         has = "have a certificate: connect to tls/HOST:PORT" if identity else "have no certificate"
@@ -66,7 +68,7 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},
-            "link": {**_link(lease_ms), **_identification(identity)},
+            "link": {**_queues(lease_ms), **_identification(identity)},
         },
     }
     if credentials is not None:
@@ -78,7 +80,7 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
 
 
 def router_endpoint(session: zenoh.Session) -> str:
-    """Where an embedded router really listens: the locator with the port that the system chose for port 0."""
+    """Return the locator at which an embedded router listens, with the port that the system chose for port 0."""
     for reply in session.get(f"@/{session.zid()}/router"):
         if reply.ok is not None:
             locators = json.loads(reply.ok.payload.to_string())["locators"]
@@ -87,23 +89,23 @@ def router_endpoint(session: zenoh.Session) -> str:
 
 
 def quiet_zenoh() -> None:
-    """Zenoh's own log on stderr, at `RUST_LOG` if set; otherwise only what vnet itself says is shown.
+    """Show Zenoh's own log on stderr at `RUST_LOG` if it is set; otherwise turn it off.
 
-    Whatever is set, the part of Zenoh that would write a session's configuration, password included, is left out.
+    In any case the part of Zenoh that logs a session's configuration, password included, is off.
     """
     wanted = os.environ.get("RUST_LOG", "off")
     if not wanted.endswith(_NO_CONFIGURATIONS):
-        os.environ["RUST_LOG"] = f"{wanted},{_NO_CONFIGURATIONS}"  # also for the processes that this one starts
+        os.environ["RUST_LOG"] = f"{wanted},{_NO_CONFIGURATIONS}"  # for child processes too
     zenoh.init_log_from_env_or("off")
 
 
-def _link(lease_ms: int) -> dict[str, Any]:
-    """Leases, and queues as long as Zenoh allows: in real time what finds its queue full is dropped."""
+def _queues(lease_ms: int) -> dict[str, Any]:
+    """Return the leases, and queues as long as Zenoh allows: in real time messages to a full queue are dropped."""
     return {"tx": {"lease": lease_ms, "keep_alive": 4, "queue": {"size": {"data": 16}}}}
 
 
 def _identification(identity: Identity | None) -> dict[str, Any]:
-    """How a client shows who it is, and makes sure that it speaks to the run's own router."""
+    """Return the TLS settings by which a client authenticates itself, and verifies the run's router."""
     if identity is None:
         return {}
     return {

@@ -1,8 +1,8 @@
-"""The messages on the keys of a node: typed records <-> msgpack, without any I/O.
+"""The messages on the keys of a node: typed records and their msgpack encoding, without I/O.
 
-`tx` carries what an agent says (`Hello`, `Yield`, `Frames`, `StackDump`), `rx` what the emulator says
-(`Welcome`, `Grant`, `Batch`, `StackRequest`, `End`). Decoding checks every type and bound; what does not fit is a
-`WireError`. All times are integer nanoseconds from the start of the run.
+`tx` carries an agent's messages (`Hello`, `Yield`, `Frames`, `StackDump`), `rx` the emulator's (`Welcome`, `Grant`,
+`Batch`, `StackRequest`, `Await`, `End`). Decoding checks every type and bound; a violation is a `WireError`. All
+times are integer nanoseconds from the start of the run.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 HEAD_START_NS = 200_000_000
-"""Real time: time 0 is this much later than the message that announces it, so that all hear of it in time."""
+"""Real time: time from the announcement of time 0 to time 0, so that all processes receive it before."""
 LATENESS_LIMIT_NS = 20_000_000
 """Deliveries later than this count against a real-time run."""
 LATENESS_BINS = 80
-"""Four for each factor of two, from 10 µs to 10 s around the limit."""
-LARGEST_SAID_BYTES = 64 * 2**20
-"""What an agent may say at once: a frame of the largest payload from each of a thousand nodes still fits."""
+"""Bins of delays, four for each factor of two, from 10 µs to 10 s around the limit."""
+LARGEST_MESSAGE_BYTES = 64 * 2**20
+"""Largest message of an agent: it holds a frame of the largest payload from each of a thousand nodes."""
 
 
 class Message(msgspec.Struct, frozen=True, array_like=True, tag=True):
-    """Common form: an array whose first element names the kind of message."""
+    """Base of all messages: an array whose first element names the kind of message."""
 
 
 class WirePacket(msgspec.Struct, frozen=True, array_like=True):
@@ -45,12 +45,12 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
     payload: bytes
 
     def packet(self) -> Packet:
-        """The packet as the program sees it."""
+        """Return the packet as the program sees it."""
         return Packet(self.sender, self.sent_ns, self.received_ns, self.payload)
 
 
 class WireFix(msgspec.Struct, frozen=True, array_like=True):
-    """A `Fix` for `node`; the covariance is row by row."""
+    """A `Fix` for `node`; the covariance is in row-major order."""
 
     node: str
     time_ns: TimeNs
@@ -60,26 +60,26 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:
-        """The fix in its form on the wire."""
+        """Return the fix in its form on the wire."""
         x, y = fix.position_m.tolist()
         a, b, c, d = fix.covariance_m2.ravel().tolist()
         return cls(node, fix.time_ns, (x, y), (a, b, c, d), fix.heading_rad)
 
     def fix(self) -> Fix:
-        """The fix as the program sees it."""
+        """Return the fix as the program sees it."""
         covariance = np.array(self.covariance_m2).reshape(2, 2)
         return Fix(self.time_ns, np.array(self.position_m), covariance, self.heading_rad)
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
-    """One broadcast that `node` hands to the radio."""
+    """One broadcast that `node` enqueues."""
 
     node: str
     payload: bytes
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
-    """A node's program is over: it returned, raised, or span at one instant (`details` says where)."""
+    """The end of a node's program: it returned, raised, or never let time advance (`details` has the stack)."""
 
     node: str
     kind: Literal["finished", "crashed", "spun"]
@@ -88,7 +88,7 @@ class Ending(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Traffic(msgspec.Struct, frozen=True, array_like=True):
-    """What the nodes of one process hand over at once: frames and reports in the order they were made."""
+    """Frames, reports and endings of the nodes of one process, in the order of their creation."""
 
     frames: Sequence[Frame] = ()
     reports: Sequence[Report] = ()
@@ -96,10 +96,11 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(Message, frozen=True):
-    """A node asks to join. `process_id` is the first node of its process, whose keys carry the process's traffic.
+    """A node's request to join. `process_id` is the first node of its process, whose keys carry its traffic.
 
-    `nonce` is a secret of the process: later messages bear it, so that nobody else can speak for the node.
-    Said again with `ready` once the welcome has come and the program is loaded, or with the `failure` to.
+    `nonce` is a secret of the process; later messages contain it, so that no other process can impersonate the
+    node. The message is sent again with `ready` after the welcome, once the program is loaded, or with the
+    `failure` to load it.
     """
 
     node: str
@@ -112,7 +113,7 @@ class Hello(Message, frozen=True):
 
 
 class Yield(Message, frozen=True):
-    """Lockstep: the process has nothing left to do at the instant of grant `seq`."""
+    """Lockstep: the process has nothing left to do at the time of grant `seq`."""
 
     nonce: bytes
     seq: Count
@@ -123,13 +124,13 @@ class Yield(Message, frozen=True):
 
 
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
-    """Real time: how late packets reached their process, as counts in the bins of `lateness_bin`."""
+    """Real time: delays of packets to their process, as counts in the bins of `lateness_bin`."""
 
     counts: Annotated[Sequence[Count], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
 
 
 class Frames(Message, frozen=True):
-    """Real time: traffic since the last message; acknowledges batches up to `received_seq`, less the gaps."""
+    """Real time: traffic since the last message; acknowledges batches up to `received_seq` without `missed`."""
 
     nonce: bytes
     seq: Count
@@ -148,9 +149,9 @@ class StackDump(Message, frozen=True):
 
 
 class Welcome(Message, frozen=True):
-    """A node is taken in: all it needs to run its program. The scenario itself never travels.
+    """Admission of a node, with all that it needs to run its program; the scenario itself is never sent.
 
-    Without `runs` the program has ended before its process was started anew, and stays so.
+    Without `runs` the program had ended before its process was restarted, and does not run again.
     """
 
     node: str
@@ -170,7 +171,7 @@ class Welcome(Message, frozen=True):
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):
-    """How the clock of `node` goes wrong: at time t it shows t + offset_ns + rate · (t − since_ns)."""
+    """Error of the clock of `node`: at time t it shows t + offset_ns + rate · (t − since_ns)."""
 
     node: str
     since_ns: TimeNs
@@ -179,20 +180,23 @@ class ClockError(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the clock is wrong at all."""
+        """True if the clock deviates."""
         return bool(self.offset_ns or self.rate)
 
     def shown_ns(self, time_ns: int) -> int:
-        """What the clock shows at `time_ns`."""
+        """Return the reading of the clock at `time_ns`."""
         return time_ns + self.offset_ns + round(self.rate * (time_ns - self.since_ns))
 
     def time_ns(self, shown_ns: int) -> int:
-        """When the clock shows this."""
+        """Return the time at which the clock reads `shown_ns`."""
         return self.since_ns + round((shown_ns - self.since_ns - self.offset_ns) / (1 + self.rate))
 
 
 class Grant(Message, frozen=True):
-    """Lockstep: it is now `time_ns`; here is what is due. Grant 0 starts a process. `clocks` that have changed."""
+    """Lockstep: the time `time_ns`, and the packets and fixes due. Grant 0 starts a process.
+
+    `clocks` are the clock errors that have changed.
+    """
 
     seq: Count
     time_ns: TimeNs
@@ -202,10 +206,11 @@ class Grant(Message, frozen=True):
 
 
 class Batch(Message, frozen=True):
-    """Real time: what is due by now. Batch 0 starts the process: it is `start_ns` at `origin_ns` + `start_ns` on
-    the monotonic clock of the machine whose boot the welcome names; on other machines, when it arrives.
+    """Real time: the packets and fixes due by now. Batch 0 starts the process.
 
-    `held`: packets waited for a process that stood still, so that nobody is to blame that they are late.
+    The emulated time `start_ns` is at `origin_ns` + `start_ns` on the monotonic clock of the machine whose boot the
+    welcome names; on other machines it is the arrival of batch 0. `held` is true if packets waited for a paused
+    process, so that they do not count as late.
     """
 
     fixes: Sequence[WireFix]
@@ -218,17 +223,17 @@ class Batch(Message, frozen=True):
 
 
 class StackRequest(Message, frozen=True):
-    """The emulator waits too long for this process: where does it stand?"""
+    """Request for the stacks of a process for which the emulator has waited too long."""
 
 
 class Await(Message, frozen=True):
-    """The emulator, or its router, is about to go away, and expects to be back within `within_s`."""
+    """Notice that the emulator, or its router, will be absent, for at most `within_s` seconds."""
 
     within_s: float
 
 
 class End(Message, frozen=True):
-    """The run is over, or this node is refused."""
+    """End of the run, or refusal of this node."""
 
     nonce: bytes | None
     reason: str
@@ -246,44 +251,44 @@ _report_decoder: msgspec.msgpack.Decoder[Report] = msgspec.msgpack.Decoder(Repor
 
 
 def encode(message: AgentMessage | EmulatorMessage | Report) -> bytes:
-    """Any message as bytes."""
+    """Encode a message."""
     return _encoder.encode(message)
 
 
 def decode_tx(data: bytes) -> AgentMessage:
-    """What an agent said. Raises WireError, also where it is larger than `LARGEST_SAID_BYTES`."""
+    """Decode a message of an agent. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
     _check_size(data)
     return _decode(_agent_decoder, data)
 
 
 def decode_rx(data: bytes) -> EmulatorMessage:
-    """What the emulator said. Raises WireError."""
+    """Decode a message of the emulator. Raise WireError for a bad one."""
     return _decode(_emulator_decoder, data)
 
 
 def decode_report(data: bytes) -> Report:
-    """A copy of a report. Raises WireError, also where it is larger than `LARGEST_SAID_BYTES`."""
+    """Decode a copy of a report. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
     _check_size(data)
     return _decode(_report_decoder, data)
 
 
 def encode_observation(message: dict[str, Any]) -> bytes:
-    """A message for observers: numbers, text, bytes, lists and tables of these."""
+    """Encode a message to observers: numbers, text, bytes, lists and maps of these."""
     return _encoder.encode(message)
 
 
 def decode_observation(data: bytes) -> dict[str, Any]:
-    """Restore `encode_observation`. Raises WireError."""
+    """Decode a message to observers. Raise WireError for a bad one."""
     return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
 
 
 def is_batch(data: bytes) -> bool:
-    """Whether an encoded message is a batch: told from its first bytes, without decoding it."""
+    """Return true if an encoded message is a batch, judged by its first bytes without decoding it."""
     return data[1:7] == b"\xa5Batch"
 
 
 def is_packets_only(data: bytes) -> bool:
-    """Whether an encoded message is a batch without fixes."""
+    """Return true if an encoded message is a batch without fixes."""
     return is_batch(data) and data[7:8] == b"\x90"
 
 
@@ -291,20 +296,22 @@ def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
     try:
         return decoder.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise WireError(f"{len(data)} bytes that are no message: {printable(str(error), 200)}") from None
+        raise WireError(f"{len(data)} bytes are not a message: {printable(str(error), 200)}") from None
 
 
 def _check_size(data: bytes) -> None:
-    # Decoded, a byte can become 30: what a stranger may have the emulator allocate is bounded here.
-    if len(data) > LARGEST_SAID_BYTES:
-        raise WireError(f"{len(data)} bytes at once: at most {LARGEST_SAID_BYTES} are read")
+    # A byte can take 30 when decoded: this bounds the memory that an untrusted sender can make the emulator
+    # allocate.
+    if len(data) > LARGEST_MESSAGE_BYTES:
+        raise WireError(f"message of {len(data)} bytes: at most {LARGEST_MESSAGE_BYTES} allowed")
 
 
 _LATENESS_LIMIT_BIN = 44
+"""Bin whose lower edge is `LATENESS_LIMIT_NS`."""
 
 
 def lateness_bin(late_ns: int) -> int:
-    """The bin of a delay: four a factor of two, so that bin 44 starts just at the limit of 20 ms."""
+    """Return the bin of a delay: four bins for each factor of two; bin 44 begins at the bound of 20 ms."""
     if late_ns <= 0:
         return 0
     position = _LATENESS_LIMIT_BIN + math.floor(4 * math.log2(late_ns / LATENESS_LIMIT_NS))
@@ -312,12 +319,12 @@ def lateness_bin(late_ns: int) -> int:
 
 
 def lateness_edge_ms(index: int) -> float:
-    """The upper edge of a lateness bin in milliseconds."""
+    """Return the upper edge of a lateness bin in milliseconds."""
     return LATENESS_LIMIT_NS / 1e6 * float(2 ** ((index + 1 - _LATENESS_LIMIT_BIN) / 4))
 
 
 def boot_id() -> str:
-    """Names this boot of this machine: processes with the same one share a monotonic clock."""
+    """Return the id of this machine's boot: processes with the same id share a monotonic clock."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

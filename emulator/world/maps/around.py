@@ -1,4 +1,4 @@
-"""The part of a map that programs are given: the lanes around where vehicles drive."""
+"""The part of a map that programs get: the lanes around the vehicles' trajectories."""
 
 from __future__ import annotations
 
@@ -14,41 +14,43 @@ from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
 FAR_M = 100.0
-"""Who is further from all roads is off the map."""
+"""Distance to the nearest lane beyond which a position is off the map."""
 SAMPLES = 5000
+"""Positions that are tested for it."""
 
 
 def read_lanes(section: Map, course_m: Array, origin_deg: tuple[float, float] | None) -> RoadMap:
-    """The lanes of `[map]` around the course (K, N, 2) of all vehicles; `origin_deg` is where its metres start.
+    """Return the lanes of `[map]` around the positions `course_m` (K, N, 2) of all vehicles.
 
-    Raises ScenarioError where the file cannot be read, or most of the course is nowhere near its roads.
+    `origin_deg` is the origin of their metres. Raise ScenarioError if the file cannot be read, or most positions
+    are off the map.
     """
     roads = read_roads(section.path, section.origin_deg or origin_deg)
     return lanes_around(roads, section, course_m)
 
 
 def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
-    """As `read_lanes`, of roads that have been read."""
-    place_m = course_m[np.isfinite(course_m[..., 0])]
-    low_m, high_m = place_m.min(axis=0) - section.margin_m, place_m.max(axis=0) + section.margin_m
+    """Return the lanes as `read_lanes` does, from roads that have been read."""
+    position_m = course_m[np.isfinite(course_m[..., 0])]
+    low_m, high_m = position_m.min(axis=0) - section.margin_m, position_m.max(axis=0) + section.margin_m
     part = roads.within(low_m, high_m)
     lanes = part.lane_map(section.drive_on, section.sigma_m) if len(part) else None
     if lanes is not None and section.aside_m:
         lanes = replace(lanes, point_m=lanes.point_m + section.aside_m * lanes.normal)
-    if lanes is None or _far_share(lanes, place_m) > 0.5:
-        (x, y), (left, low), (right, high) = np.median(place_m, axis=0), *_extent(roads)
+    if lanes is None or _far_share(lanes, position_m) > 0.5:
+        (x, y), (left, low), (right, high) = np.median(position_m, axis=0), *_extent(roads)
         raise ScenarioError(
-            f"{section.path}: most of what vehicles drive is over {FAR_M:g} m from all its roads: they are around "
-            f"({x:.0f}, {y:.0f}) m, and the roads from ({left:.0f}, {low:.0f}) to ({right:.0f}, {high:.0f}) m: "
-            "is another origin_deg, or another projection meant?"
+            f"{section.path}: most positions of vehicles are over {FAR_M:g} m from all roads: vehicles are around "
+            f"({x:.0f}, {y:.0f}) m, and the roads from ({left:.0f}, {low:.0f}) to ({right:.0f}, {high:.0f}) m; "
+            "check origin_deg and the projection"
         )
     return lanes
 
 
-def _far_share(lanes: RoadMap, place_m: Array) -> float:
-    some = place_m[:: max(1, len(place_m) // SAMPLES)]
-    row, _, _ = lanes.near(some, np.full(len(some), np.nan), np.full(len(some), FAR_M))
-    return 1 - len(np.unique(row)) / len(some)
+def _far_share(lanes: RoadMap, position_m: Array) -> float:
+    sample_m = position_m[:: max(1, len(position_m) // SAMPLES)]
+    row, _, _ = lanes.near(sample_m, np.full(len(sample_m), np.nan), np.full(len(sample_m), FAR_M))
+    return 1 - len(np.unique(row)) / len(sample_m)
 
 
 def _extent(roads: Roads) -> tuple[Array, Array]:

@@ -1,11 +1,11 @@
-"""A generated city with the character of a middle-sized American town, which Ann Arbor is.
+"""A generated city with the character of a mid-sized American town such as Ann Arbor.
 
-Arterial roads form a grid, slightly turned and bent. Around the middle the squares between them are cut into dense
-blocks, with streets that are one way in pairs, and alleys; further out streets bend until they point anywhere, and
-many end. There are roads that cut across, a river with a road along it, service roads beside the arterials and in
-front of shops, and a motorway around two sides, with ramps.
+Arterial roads form a grid, slightly rotated and curved. Near the centre the squares between them are divided into
+dense blocks, with one-way streets in pairs, and alleys. Further out streets curve in all directions, and many are
+dead ends. There are diagonal roads, a river with a road along it, service roads beside the arterials and in front
+of shops, and a motorway along two sides, with ramps.
 
-Streets are drawn on a plan of straight lines, squares and angles, which is then bent as a whole.
+Streets are drawn on a plan of straight lines and right angles, which is then rotated and warped.
 """
 
 from __future__ import annotations
@@ -22,38 +22,48 @@ from vnet.errors import ScenarioError
 from vnet.types import Array
 
 SIZE_M = 3000.0
+"""Default size of the city."""
 SMALLEST_M, LARGEST_M = 1000.0, 10_000.0
+"""Least and greatest size of the city."""
 ORIGIN_DEG = (42.0, -40.0)
-"""In the Atlantic, where no town is."""
+"""Latitude and longitude of the centre: in the Atlantic, so that no real town is meant."""
 
 _MARGIN = 1.1
-"""What is turned and bent takes more room."""
+"""Size of the warped plan relative to the plan."""
 _ARTERIAL_M = (420.0, 640.0)
+"""Range of the distance between neighbouring arterials."""
 _CORE = 0.22
-"""The dense core's radius, as a part of the city's size."""
+"""Radius of the dense core, relative to the city's size."""
 _BLOCK_M, _CORE_BLOCK_M = 125.0, 95.0
-_MOTORWAY_ASIDE_M = 11.0
+"""Mean length of a block outside the core and in it."""
+_MOTORWAY_OFFSET_M = 11.0
+"""Distance of a motorway carriageway from the motorway's centre line."""
 _NEAR_MOTORWAY_M = 115.0
-_RAMP_M, _RAMP_ASIDE_M = 290.0, 62.0
-_BEND_STEP_M = 11.0
+"""Distance from the motorway within which no other streets are built."""
+_RAMP_M = 290.0
+"""Length of a ramp along the motorway."""
+_RAMP_OFFSET_M = 62.0
+"""Distance of a ramp's end from the motorway's centre line."""
+_RIVER_STEP_M = 11.0
+"""Distance between the points of the road along the river."""
 
 
 def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:
-    """The roads of a generated city, about `size_m` across; the same arguments give the same city.
+    """Return the roads of a generated city, about `size_m` across; the same arguments give the same city.
 
-    Raises ScenarioError unless `size_m` is from `SMALLEST_M` to `LARGEST_M`.
+    Raise ScenarioError unless `size_m` is from `SMALLEST_M` to `LARGEST_M`.
     """
     if not SMALLEST_M <= size_m <= LARGEST_M:
         raise ScenarioError(f"size_m = {size_m:g}: {SMALLEST_M:g} to {LARGEST_M:g} allowed")
     rng = np.random.default_rng((seed, 0))
     city = _City(rng, size_m / _MARGIN)
     builder = RoadsBuilder(f"city of seed {seed}")
-    add_streets(builder, city.streets(), _Bend(rng, size_m))
-    return builder.build(builder.places(), Frame.around(*ORIGIN_DEG))
+    add_streets(builder, city.streets(), _Warp(rng, size_m))
+    return builder.build(builder.coordinates(), Frame.around(*ORIGIN_DEG))
 
 
-class _Bend:
-    """Turns the plan a little, and bends it in long waves."""
+class _Warp:
+    """Rotates the plan slightly, and displaces it by long waves."""
 
     def __init__(self, rng: np.random.Generator, size_m: float) -> None:
         self._turn_rad = math.radians(rng.uniform(4, 14)) * rng.choice([-1, 1])
@@ -68,7 +78,7 @@ class _Bend:
 
 
 class _City:
-    """Draws the streets on the plan, a square with its middle at 0, 0."""
+    """Draws the streets on the plan, a square centred at (0, 0)."""
 
     def __init__(self, rng: np.random.Generator, size_m: float) -> None:
         self._rng = rng
@@ -80,7 +90,7 @@ class _City:
         self._shops: list[tuple[Array, Array]] = []
 
     def streets(self) -> list[Street]:
-        """All streets of the city."""
+        """Return all streets of the city."""
         return [
             *self._arterials(),
             *self._diagonals(),
@@ -90,10 +100,10 @@ class _City:
             *self._cells(),
         ]
 
-    # The large lines.
+    # Main roads.
 
     def _arterial_lines(self) -> Array:
-        """Where arterials cross one axis: in the middle, and outwards at irregular distances."""
+        """Return the sorted coordinates at which arterials cross an axis: 0, and others at irregular distances."""
         last_m = self._half_m - 330.0
         lines = [0.0]
         for side in (-1, 1):
@@ -115,39 +125,39 @@ class _City:
         return streets
 
     def _diagonals(self) -> list[Street]:
-        """Roads from near the core outwards, across the grid."""
+        """Return roads from near the core outwards, diagonal to the grid."""
         streets = []
         quadrants = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
-        for number, way in enumerate(quadrants[self._rng.permutation(4)[:2]].tolist()):
-            start = np.array([self._next_line(axis, way[axis]) for axis in range(2)])
-            aim = (
-                np.array(way)
+        for number, quadrant in enumerate(quadrants[self._rng.permutation(4)[:2]].tolist()):
+            start = np.array([self._next_line(axis, quadrant[axis]) for axis in range(2)])
+            end = (
+                np.array(quadrant)
                 * self._half_m
                 * np.array([self._rng.uniform(0.75, 0.95), self._rng.uniform(0.55, 0.8)])
             )
-            aside = np.array([aim[1] - start[1], start[0] - aim[0]]) * self._rng.uniform(-0.12, 0.12)
+            bulge = np.array([end[1] - start[1], start[0] - end[0]]) * self._rng.uniform(-0.12, 0.12)
             part = np.linspace(0, 1, 60)[:, None]
-            line = (1 - part) * start + part * aim + 4 * part * (1 - part) * aside
+            line = (1 - part) * start + part * end + 4 * part * (1 - part) * bulge
             streets.append(Street(f"Cross Road {number + 1}", "secondary", divided(line)))
         return streets
 
     def _next_line(self, axis: int, side: int) -> float:
-        """The first arterial off the middle on one side, or the plan's edge."""
+        """Return the coordinate of the first arterial beside the central one on a side, or halfway to the edge."""
         beyond = [at_m for at_m in self._lines[axis].tolist() if at_m * side > 1]
         return min(beyond, key=abs) if beyond else side * 0.5 * self._half_m
 
     def _river_m(self, east_m: Array) -> Array:
-        """How far north the river is."""
+        """Return the river's coordinates (n,) north at coordinates (n,) east."""
         at_m, (early, late) = self._river
         return np.asarray(at_m + 90 * np.sin(east_m / 330 + early) + 45 * np.sin(east_m / 130 + late))
 
     def _river_road(self) -> list[Street]:
-        east_m = np.arange(-self._half_m, self._half_m, _BEND_STEP_M)
+        east_m = np.arange(-self._half_m, self._half_m, _RIVER_STEP_M)
         line = np.column_stack([east_m, self._river_m(east_m) - 75])
         return [Street("River Road", "tertiary", line[~self._near_motorway(line)])]
 
     def _motorway_line(self) -> Array:
-        """From the north edge down the east side, around the corner, and along the south side."""
+        """Return the motorway's centre line: from the north edge along the east side, then along the south side."""
         side_m, radius_m = self._half_m - 155.0, 0.35 * self._half_m
         turn = np.radians(np.linspace(0, -90, 40))[:, None]
         corner = np.array([side_m - radius_m, radius_m - side_m])
@@ -156,12 +166,12 @@ class _City:
         return divided(line, 10.0)
 
     def _near_motorway(self, points_m: Array, near_m: float = _NEAR_MOTORWAY_M) -> NDArray[np.bool_]:
-        """Which points (n, 2) are near the motorway, (n,)."""
+        """Return the mask (n,) of the points (n, 2) near the motorway."""
         offset = points_m[:, None] - self._motorway_m[None, ::4]
         return np.asarray(np.hypot(offset[..., 0], offset[..., 1]).min(axis=1) < near_m)
 
     def _motorway(self) -> list[Street]:
-        """Both carriageways, and ramps to a road on the east side and one on the south side."""
+        """Return both carriageways, and ramps to a road on the east side and one on the south side."""
         line = self._motorway_m
         along = np.gradient(line, axis=0)
         along /= np.hypot(*along.T)[:, None]
@@ -169,35 +179,35 @@ class _City:
         crossings = [self._crossing(line, 1, 0), self._crossing(line, 0, len(line))]
         streets = []
         for side, name in ((1, "west"), (-1, "east")):
-            place = line + side * _MOTORWAY_ASIDE_M * right
+            carriageway = line + side * _MOTORWAY_OFFSET_M * right
             steps = round(_RAMP_M / 10.0)
             joints = []
             for number, at in enumerate(crossings):
                 leave, join = at - side * steps, at + side * steps
                 joints += [leave, join]
-                foot = line[at] + side * _RAMP_ASIDE_M * right[at]
+                foot = line[at] + side * _RAMP_OFFSET_M * right[at]
                 ahead = side * along[at]
-                ramps = ((place[leave], foot, "off"), (foot, place[join], "on"))
-                for start, end, what in ramps:
+                ramps = ((carriageway[leave], foot, "off"), (foot, carriageway[join], "on"))
+                for start, end, kind in ramps:
                     curve = _curve(start, start + 130 * ahead, end - 130 * ahead, end, 30)
-                    joint = 0 if what == "off" else len(curve) - 1
-                    label = f"Motorway {name}, ramp {what} {number + 1}"
+                    joint = 0 if kind == "off" else len(curve) - 1
+                    label = f"Motorway {name}, ramp {kind} {number + 1}"
                     streets.append(Street(label, "motorway_link", curve, True, joints=(joint,)))
             order = slice(None, None, side)
             numbers = tuple(n if side > 0 else len(line) - 1 - n for n in joints)
-            streets.append(Street(f"Motorway {name}", "motorway", place[order], True, True, numbers))
+            streets.append(Street(f"Motorway {name}", "motorway", carriageway[order], True, True, numbers))
         return streets
 
     def _crossing(self, line: Array, axis: int, after: int) -> int:
-        """The point of the motorway at which the middle arterial goes across, which lies on `axis` = 0."""
+        """Return the index of the motorway's point at which the central arterial crosses, where `axis` is 0."""
         away = np.abs(line[:, axis])
         half = len(line) // 2
         return int(np.argmin(away[:half])) if not after else half + int(np.argmin(away[half:]))
 
-    # The streets between.
+    # Streets between the main roads.
 
     def _services(self) -> list[Street]:
-        """Roads beside arterials, and the lanes of car parks in front of shops."""
+        """Return roads beside arterials, and the lanes of car parks in front of shops."""
         streets: list[Street] = []
         for axis, lines in enumerate(self._lines):
             across = self._lines[1 - axis]
@@ -208,7 +218,7 @@ class _City:
         return streets
 
     def _frontage(self, axis: int, at_m: float, low_m: float, high_m: float) -> list[Street]:
-        """A road beside the arterial at `at_m`; behind it, it may be, the rows of a car park."""
+        """Return a road beside the arterial at `at_m`, half of the time with the rows of a car park behind it."""
         inwards = -math.copysign(1, at_m)
         start_m, end_m = low_m + 70, low_m + self._rng.uniform(0.5, 0.8) * (high_m - low_m)
         rows = int(self._rng.integers(3, 6)) if self._rng.random() < 0.5 else 1
@@ -225,18 +235,18 @@ class _City:
         return [Street("Service Road", "service", divided(line)) for line in plan]
 
     def _in_park(self, points_m: Array) -> Array:
-        """Which points (n, 2) lie by the river, where nobody builds, (n,)."""
+        """Return the mask (n,) of the points (n, 2) in the park along the river, which is not built up."""
         north_m = points_m[:, 1] - self._river_m(points_m[:, 0])
         return np.asarray((north_m > -105) & (north_m < 55))
 
     def _is_free(self, line: Array) -> bool:
-        """Whether a street may be here."""
+        """Return true if a street may be built on this line."""
         if self._in_park(line).any() or self._near_motorway(line).any():
             return False
         return not any(((line > low) & (line < high)).all(axis=1).any() for low, high in self._shops)
 
     def _cells(self) -> list[Street]:
-        """The streets in all squares between arterials."""
+        """Return the streets in all cells between arterials."""
         edges = [np.concatenate([[-self._half_m], lines, [self._half_m]]) for lines in self._lines]
         streets = []
         for column in range(len(edges[0]) - 1):
@@ -250,7 +260,7 @@ class _City:
 
 
 class _Cell:
-    """The streets in one square between arterials: a lattice, which outside the core is bent and has gaps."""
+    """The streets in one cell between arterials: a lattice, which outside the core is twisted and has gaps."""
 
     def __init__(self, rng: np.random.Generator, low_m: Array, high_m: Array, core: bool) -> None:
         self._rng, self._low_m, self._high_m, self._core = rng, low_m, high_m, core
@@ -261,7 +271,7 @@ class _Cell:
         self._name = f"{'Core' if core else 'Quarter'} {low_m[0] / 100:.0f}/{low_m[1] / 100:.0f}"
 
     def streets(self) -> list[Street]:
-        """The streets of the cell; arterials at its edges are not among them."""
+        """Return the streets of the cell, without the arterials at its edges."""
         found = []
         for axis in range(2):
             for line in range(1, int(self._count[axis])):
@@ -275,7 +285,7 @@ class _Cell:
         return found
 
     def _direction(self, axis: int, line: int) -> int:
-        """1 or -1 where a street of the core is one way, else 0: those next to the middle arterials, in pairs."""
+        """Return 1 or -1 for a one-way street of the core (those next to the central arterials), else 0."""
         if not self._core:
             return 0
         after = abs(self._low_m[axis]) < 1 and line == 1
@@ -283,11 +293,11 @@ class _Cell:
         return (1 if after else -1 if before else 0) * (1 if axis == 0 else -1)
 
     def _street(self, axis: int, line: float, step: float, one_way: int) -> Street:
-        """The street of the lattice on `line` of `axis`, from `step` to the next."""
+        """Return the street of the lattice on `line` of `axis`, from `step` to the next."""
         points = 2 if self._core else 13
         lattice = np.full((points, 2), float(line))
         lattice[:, 1 - axis] = np.linspace(step, step + 1, points)
-        plan = self._bent(lattice / self._count)
+        plan = self._twisted(lattice / self._count)
         if one_way < 0:
             plan = plan[::-1]
         name = f"{self._name} {'Street' if axis == 0 else 'Place'} {line:g}"
@@ -297,7 +307,7 @@ class _Cell:
         return Street(name, "tertiary" if wide else "residential", divided(plan))
 
     def _alleys(self) -> list[Street]:
-        """Service streets in the middle of some blocks."""
+        """Return service streets in the middle of some blocks."""
         alleys = []
         for line in range(int(self._count[0])):
             for step in range(int(self._count[1])):
@@ -306,8 +316,8 @@ class _Cell:
                     alleys.append(Street(alley.name, "service", alley.points_m))
         return alleys
 
-    def _bent(self, part: Array) -> Array:
-        """Where points (n, 2) of the lattice, from 0 to 1, are: turned about the middle, most where furthest in."""
+    def _twisted(self, part: Array) -> Array:
+        """Return plan coordinates (n, 2) of lattice points in [0, 1]²: rotated, most strongly at the centre."""
         weight = np.sin(np.pi * part).prod(axis=1)
         size_m = self._high_m - self._low_m
         from_middle = (part - 0.5) * size_m
@@ -323,6 +333,6 @@ class _Cell:
 
 
 def _curve(start: Array, one: Array, other: Array, end: Array, count: int) -> Array:
-    """A cubic Bézier curve (count, 2)."""
+    """Return a cubic Bézier curve (count, 2) with these control points."""
     t = np.linspace(0, 1, count)[:, None]
     return np.asarray((1 - t) ** 3 * start + 3 * t * (1 - t) ** 2 * one + 3 * t**2 * (1 - t) * other + t**3 * end)

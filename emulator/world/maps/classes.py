@@ -1,7 +1,7 @@
-"""Classes of roads, by the names of OpenStreetMap, and what is assumed of a road whose map does not say more.
+"""Road classes, by their names in OpenStreetMap, with the lane widths and numbers of lanes assumed by default.
 
-Lane widths and numbers of lanes are those of ordinary design guides. `road` is a road of
-which nothing is known, `crossing` the inside of a crossing (SUMO's internal lanes).
+The defaults are those of common design guides. `road` is a road of unknown class, `crossing` the inside of an
+intersection (SUMO's internal lanes).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from vnet.types import Array
 
 @dataclass(frozen=True)
 class RoadClass:
-    """What is assumed of a road: the width of a lane, and lanes in each direction."""
+    """Defaults of a road class: width of a lane, and lanes in each direction."""
 
     lane_width_m: float
     lanes: int
@@ -40,13 +40,22 @@ CLASSES = {
     "crossing": RoadClass(3.2, 1),
 }
 NAMES = tuple(CLASSES)
+"""Names of the classes, indexed by their numbers."""
 NUMBER = {name: number for number, name in enumerate(NAMES)}
+"""Number of a class by its name."""
 UNKNOWN = NUMBER["road"]
+"""Number of the class of a road whose class is unknown."""
 
 VEHICLE_WIDTH_M = 1.8
-NARROWEST_M, WIDEST_M = 2.0, 20.0
-"""Lanes are no narrower and no wider; a strip that stands for all lanes of a road may be wide."""
-MOST_LANES = 16
+"""Width of every vehicle: that of a passenger car."""
+MIN_LANE_WIDTH_M = 2.0
+"""Least width of a lane in a map."""
+MAX_LANE_WIDTH_M = 20.0
+"""Greatest width of a lane in a map: some maps have one strip for all lanes of a road."""
+MAX_LANES = 16
+"""Most lanes of a road in one direction."""
 
 LANE_WIDTH_M: Array = np.array([each.lane_width_m for each in CLASSES.values()])
+"""Default lane widths, indexed by class."""
 LANES = np.array([each.lanes for each in CLASSES.values()])
+"""Default numbers of lanes in each direction, indexed by class."""

@@ -1,4 +1,4 @@
-"""Map files of all kinds, told apart by their names: reading and writing."""
+"""Map files in all formats, distinguished by their names: reading and writing."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ WRITERS: dict[str, Callable[[Roads, Path], None]] = {
     ".npz": write_graph,
 }
 LARGEST_BYTES = 2**31
+"""Largest file that is read."""
 
 
 def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roads:
-    """Read a map. `origin_deg` (latitude, longitude) is where its metres start.
+    """Read a map. `origin_deg` (latitude, longitude) is the origin of its metres.
 
-    Without it they start in the middle of the map, or where a file that is in metres says.
-
-    Raises ScenarioError in one line that names the file, and the line or the feature.
+    Without it the origin is the centre of the map, or the one that a file in metres states. Raise ScenarioError, in
+    one line that names the file and the line or feature, for a bad file.
     """
-    reader = _of(path, READERS)
+    reader = _by_ending(path, READERS)
     try:
         size = path.stat().st_size
         if not path.is_file():
@@ -53,7 +53,7 @@ def read_roads(path: Path, origin_deg: tuple[float, float] | None = None) -> Roa
 
 
 def write_roads(roads: Roads, path: Path) -> None:
-    """Write a map. Raises ScenarioError."""
+    """Write a map. Raise ScenarioError if the format is unknown, or the file cannot be written."""
     writer = writer_of(path)
     try:
         writer(roads, path)
@@ -62,12 +62,12 @@ def write_roads(roads: Roads, path: Path) -> None:
 
 
 def writer_of(path: Path) -> Callable[[Roads, Path], None]:
-    """What writes files of this name. Raises ScenarioError where nothing does."""
-    return _of(path, WRITERS)
+    """Return the function that writes files of this name. Raise ScenarioError if there is none."""
+    return _by_ending(path, WRITERS)
 
 
-def _of(path: Path, table: dict[str, _T]) -> _T:
+def _by_ending(path: Path, table: dict[str, _T]) -> _T:
     for ending, entry in table.items():
         if path.name.lower().endswith(ending):
             return entry
-    raise ScenarioError(f"{path}: no kind of map is called so; allowed are {', '.join('*' + end for end in table)}")
+    raise ScenarioError(f"{path}: unknown map format; allowed are {', '.join('*' + end for end in table)}")

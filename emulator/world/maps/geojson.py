@@ -1,7 +1,7 @@
 """Maps as lines in GeoJSON (RFC 7946, always WGS-84), read and written.
 
-Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`; or,
-without `class`, OpenStreetMap's `highway` and its other tags. Features that are no lines are left out and counted.
+Properties of a line: `class`, `lanes_forward` and `lanes_backward` (or `oneway`), `lane_width_m`; or, without
+`class`, OpenStreetMap's `highway` and its other tags. Features that are not lines are skipped and counted.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import numpy as np
 from emulator.world.maps.classes import (
     CLASSES,
     LANE_WIDTH_M,
-    MOST_LANES,
+    MAX_LANE_WIDTH_M,
+    MAX_LANES,
+    MIN_LANE_WIDTH_M,
     NAMES,
-    NARROWEST_M,
     NUMBER,
     UNKNOWN,
-    WIDEST_M,
 )
 from emulator.world.maps.roads import Roads, RoadsBuilder
 from emulator.world.maps.tags import Street, street
@@ -29,9 +29,13 @@ from vnet.errors import ScenarioError, printable, shown
 from vnet.types import Array
 
 LARGEST_BYTES = 512 * 2**20
+"""Largest file that is read."""
 _WGS84_NAMES = ("CRS84", "EPSG::4326", "EPSG:4326")
-_SAME_DIGITS, _DIGITS = 7, 9
-"""Decimals of a degree in which points that are one agree (a centimetre), and that are written (0.1 mm)."""
+"""Parts of the names of WGS-84 as a coordinate reference system."""
+_SAME_DIGITS = 7
+"""Decimals of a degree to which equal points agree (1 cm)."""
+_DIGITS = 9
+"""Decimals of a degree that are written (0.1 mm)."""
 
 
 class _Geometry(msgspec.Struct):
@@ -51,9 +55,9 @@ class _Collection(msgspec.Struct):
 
 
 def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
-    """Read roads; the origin is their middle unless given. Raises ScenarioError that names the feature.
+    """Read roads; the origin is their centre unless given. Raise ScenarioError, naming the feature, for a bad file.
 
-    Points that are equal to seven decimals are one, so that roads meet where their lines do.
+    Points that are equal to seven decimals are the same, so that lines that meet are joined roads.
     """
     try:
         collection = msgspec.json.decode(read_bounded(path, LARGEST_BYTES), type=_Collection)
@@ -75,7 +79,7 @@ def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Featu
     where = f"{path}: feature {number}"
     geometry, properties = feature.geometry, feature.properties or {}
     if geometry is None or geometry.type not in ("LineString", "MultiLineString"):
-        builder.note("features that are no lines")
+        builder.note("features that are not lines")
         return
     if "highway" in properties and "class" not in properties:
         found = street({key: str(value).lower() for key, value in properties.items()})
@@ -88,7 +92,7 @@ def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Featu
     name = f"feature {number}"
     for line in lines:
         points = _points(where, line)
-        builder.add(name, points[::-1] if found.turned else points, found.kind, found.lanes, found.lane_width_m)
+        builder.add(name, points[::-1] if found.reversed else points, found.kind, found.lanes, found.lane_width_m)
 
 
 def _own_street(where: str, properties: dict[str, Any]) -> Street:
@@ -99,12 +103,13 @@ def _own_street(where: str, properties: dict[str, Any]) -> Street:
     one_way = properties.get("oneway") in (True, 1, "yes", "true", "1")
     usual = CLASSES[NAMES[kind]].lanes
     lanes = [
-        _number(where, properties, "lanes_forward", usual, 0, MOST_LANES),
-        _number(where, properties, "lanes_backward", 0 if one_way else usual, 0, MOST_LANES),
+        _number(where, properties, "lanes_forward", usual, 0, MAX_LANES),
+        _number(where, properties, "lanes_backward", 0 if one_way else usual, 0, MAX_LANES),
     ]
     if not any(lanes) or any(count % 1 for count in lanes):
         raise ScenarioError(f"{where}: lanes_forward, lanes_backward = {lanes}: integers, not both 0, are needed")
-    width_m = _number(where, properties, "lane_width_m", float(LANE_WIDTH_M[kind]), NARROWEST_M, WIDEST_M)
+    usual_m = float(LANE_WIDTH_M[kind])
+    width_m = _number(where, properties, "lane_width_m", usual_m, MIN_LANE_WIDTH_M, MAX_LANE_WIDTH_M)
     return Street(kind, (int(lanes[0]), int(lanes[1])), float(width_m), False)
 
 
@@ -116,31 +121,31 @@ def _number(where: str, properties: dict[str, Any], key: str, usual: float, leas
 
 
 def _points(where: str, line: Any) -> list[tuple[object, tuple[float, float]]]:
-    """The points of a line, each with what it shares with those that are the same."""
+    """Return the points of a line as (key, (longitude, latitude)); equal points have equal keys."""
     try:
         found = msgspec.convert(line, list[list[float]])
     except ValueError:
         found = []
     if len(found) < 2 or any(len(point) < 2 for point in found):
-        raise ScenarioError(f"{where}: its coordinates are no line of two or more points")
+        raise ScenarioError(f"{where}: its coordinates are not a line of two or more points")
     degrees = np.array([point[:2] for point in found])
     beyond = ~(np.abs(degrees) <= [180.0, 90.0])
     if beyond.any():
         at, axis = np.argwhere(beyond)[0].tolist()
-        what, most = (("longitude", 180), ("latitude", 90))[axis]
-        raise ScenarioError(f"{where}: {what} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
+        quantity, most = (("longitude", 180), ("latitude", 90))[axis]
+        raise ScenarioError(f"{where}: {quantity} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
     keys = np.round(degrees * 10**_SAME_DIGITS).astype(np.int64).tolist()
     return [((east, north), (lon, lat)) for (east, north), (lon, lat) in zip(keys, degrees.tolist(), strict=True)]
 
 
 def write_geojson(roads: Roads, path: Path) -> None:
-    """Write the centre lines. Raises ScenarioError where nobody knows the roads' place on the earth."""
+    """Write the centre lines. Raise ScenarioError if the roads' projection is unknown."""
     if roads.frame is None:
-        raise ScenarioError(f"{path}: GeoJSON is in degrees, and nothing says where on the earth this map is")
+        raise ScenarioError(f"{path}: GeoJSON is in degrees, and the projection of this map is unknown")
     degrees: Array = np.column_stack(roads.frame.to_wgs84(roads.node_m)[::-1]).round(_DIGITS)
     if not np.isfinite(degrees).all():
         raise ScenarioError(
-            f"{path}: GeoJSON is in degrees, and this map's projection does not reach all of its points"
+            f"{path}: GeoJSON is in degrees, and some points of this map are outside its projection"
         )
     lines = np.split(roads.node, roads.first[1:-1])
     features = [

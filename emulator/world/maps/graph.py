@@ -1,8 +1,8 @@
 """Maps as nodes and directed edges in a NumPy archive (NPZ), read and written.
 
-`edges` (E, 2) holds pairs of node numbers from 0; nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m`
-and `node_y_m`, of which `frame_proj` and `frame_offset_m` may say where on the earth they are. Optional, one an
-edge: `edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes both ways is two edges.
+`edges` (E, 2) are node numbers from 0. Nodes are `node_lon_deg` and `node_lat_deg` (N,), or `node_x_m` and
+`node_y_m` (N,), whose projection `frame_proj` and `frame_offset_m` may state. Optional for each edge (E,):
+`edge_class` (names), `edge_lanes`, `edge_lane_width_m`. A road with lanes in both directions is two edges.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from emulator.world.arrays import read_arrays
 from emulator.world.maps.classes import (
     LANE_WIDTH_M,
     LANES,
-    MOST_LANES,
+    MAX_LANE_WIDTH_M,
+    MAX_LANES,
+    MIN_LANE_WIDTH_M,
     NAMES,
-    NARROWEST_M,
     NUMBER,
     UNKNOWN,
-    WIDEST_M,
 )
-from emulator.world.maps.roads import MOST_POINTS, Ints, Roads, check_extent
-from emulator.world.networks import FARTHEST_M
+from emulator.world.maps.roads import MAX_POINTS, Ints, Roads, check_extent
+from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame, project
 from vnet.errors import ScenarioError, shown
 from vnet.types import Array
 
-LARGEST_ARRAY_BYTES = 16 * MOST_POINTS
+LARGEST_ARRAY_BYTES = 16 * MAX_POINTS
+"""Largest array that is read: two 8-byte numbers a point."""
 _NODES = ("node_lon_deg", "node_lat_deg", "node_x_m", "node_y_m")
 _EDGES = ("edges", "edge_class", "edge_lanes", "edge_lane_width_m")
 _FRAME = ("frame_proj", "frame_offset_m")
@@ -40,10 +41,10 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def read_graph(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
-    """Read roads; the origin is their middle unless given, or the file's own if it is in metres.
+    """Read roads; without `origin_deg` the origin is their centre, or the file's own if it is in metres.
 
-    Edges that meet where no others do, and are of one kind, become one road. Raises ScenarioError that names the
-    array and the entry.
+    Edges with the same attributes that meet at a node without other edges become one road. Raise ScenarioError,
+    naming the array and the entry, for a bad file.
     """
     arrays = read_arrays(path, (*_NODES, *_EDGES, *_FRAME), LARGEST_ARRAY_BYTES)
     if "node_lon_deg" in arrays:
@@ -55,7 +56,7 @@ def read_graph(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
 
 
 def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) -> Array:
-    """An array of finite numbers (count,)."""
+    """Return an array of finite numbers (count,)."""
     if name not in arrays:
         raise ScenarioError(f"{path}: no array {name!r}")
     array = arrays[name]
@@ -71,7 +72,7 @@ def _numbers(path: Path, arrays: Arrays, name: str, count: int | None = None) ->
 
 
 def _degrees(path: Path, arrays: Arrays) -> tuple[Array, Array]:
-    """Latitudes and longitudes of all nodes, one at least."""
+    """Return latitudes and longitudes (N,) of all nodes; there is at least one."""
     lon = _within(path, arrays, "node_lon_deg", None, -180.0, 180.0)
     lat = _within(path, arrays, "node_lat_deg", len(lon), -90.0, 90.0)
     if not len(lon):
@@ -82,8 +83,8 @@ def _degrees(path: Path, arrays: Arrays) -> tuple[Array, Array]:
 def _metres(path: Path, arrays: Arrays) -> Array:
     if "node_x_m" not in arrays:
         raise ScenarioError(f"{path}: neither 'node_lon_deg' nor 'node_x_m' is among its arrays")
-    x = _within(path, arrays, "node_x_m", None, -FARTHEST_M, FARTHEST_M)
-    return np.column_stack([x, _within(path, arrays, "node_y_m", len(x), -FARTHEST_M, FARTHEST_M)])
+    x = _within(path, arrays, "node_x_m", None, -MAX_COORDINATE_M, MAX_COORDINATE_M)
+    return np.column_stack([x, _within(path, arrays, "node_y_m", len(x), -MAX_COORDINATE_M, MAX_COORDINATE_M)])
 
 
 def _frame(path: Path, arrays: Arrays) -> Frame | None:
@@ -92,7 +93,7 @@ def _frame(path: Path, arrays: Arrays) -> Frame | None:
     proj = arrays["frame_proj"]
     if proj.shape or proj.dtype.kind != "U":
         raise ScenarioError(f"{path}: frame_proj: one text is needed, not {proj.dtype} {proj.shape}")
-    x, y = _within(path, arrays, "frame_offset_m", 2, -FARTHEST_M, FARTHEST_M).tolist()
+    x, y = _within(path, arrays, "frame_offset_m", 2, -MAX_COORDINATE_M, MAX_COORDINATE_M).tolist()
     try:
         return Frame.named(str(proj), (x, y))
     except ScenarioError as error:
@@ -101,7 +102,7 @@ def _frame(path: Path, arrays: Arrays) -> Frame | None:
 
 @dataclass(frozen=True)
 class _Edges:
-    """Directed edges (E, 2) and what is known of each (E,)."""
+    """Directed edges (E, 2) and their attributes (E,)."""
 
     ends: Ints
     kind: Ints
@@ -125,9 +126,9 @@ def _edges(path: Path, arrays: Arrays, nodes: int) -> _Edges:
     if "edge_class" not in arrays:
         lanes = np.ones(len(ends), dtype=np.intp)
     if "edge_lanes" in arrays:
-        lanes = _within(path, arrays, "edge_lanes", len(ends), 1, MOST_LANES).astype(np.intp)
+        lanes = _within(path, arrays, "edge_lanes", len(ends), 1, MAX_LANES).astype(np.intp)
     if "edge_lane_width_m" in arrays:
-        width_m = _within(path, arrays, "edge_lane_width_m", len(ends), NARROWEST_M, WIDEST_M)
+        width_m = _within(path, arrays, "edge_lane_width_m", len(ends), MIN_LANE_WIDTH_M, MAX_LANE_WIDTH_M)
     return _Edges(ends.astype(np.intp), kind, lanes, width_m)
 
 
@@ -157,29 +158,29 @@ def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
 
 
 class _Merger:
-    """Makes roads of edges: both directions of one, then a chain of those that just go on, become one road."""
+    """Merges edges into roads: both directions of an edge, then chains of edges without crossings."""
 
     def __init__(self, path: Path, node_m: Array, edges: _Edges, frame: Frame | None) -> None:
         self._path, self._node_m, self._frame = path, node_m, frame
         self._notes: dict[str, int] = {}
-        ends = self._pair(edges)
-        # Edges at each node, one after another.
+        ends = self._undirected(edges)
+        # Edges by node.
         self._order = np.argsort(ends.T.ravel(), kind="stable") % max(1, len(ends))
         self._degree = np.bincount(ends.ravel(), minlength=len(node_m))
         self._begin = np.concatenate([[0], np.cumsum(self._degree)])
         self._ends: list[list[int]] = ends.tolist()
 
-    def _pair(self, edges: _Edges) -> Ints:
-        """The edges without their twins (the other direction, and duplicates); returns their ends (U, 2)."""
+    def _undirected(self, edges: _Edges) -> Ints:
+        """Merge opposite and duplicate edges; set their attributes, and return their ends (U, 2)."""
         low, high = edges.ends.min(axis=1), edges.ends.max(axis=1)
         real = low != high
         self._note("edges without length", int((~real).sum()))
         against = edges.ends[:, 0] > edges.ends[:, 1]
         key = low * len(self._node_m) + high
-        _, first, which = np.unique(key[real], return_index=True, return_inverse=True)
+        _, first, index = np.unique(key[real], return_index=True, return_inverse=True)
         number = np.flatnonzero(real)
         lanes = np.zeros((2, len(first)), dtype=np.intp)  # from the lower node to the higher, and back
-        np.maximum.at(lanes, (against[number].astype(np.intp), which), edges.lanes[number])
+        np.maximum.at(lanes, (against[number].astype(np.intp), index), edges.lanes[number])
         self._note("edges given twice", int(real.sum() - (lanes > 0).sum()))
         first = number[first]
         swapped = lanes[0] == 0
@@ -189,12 +190,12 @@ class _Merger:
         ends[swapped] = ends[swapped, ::-1]
         return ends
 
-    def _note(self, what: str, count: int) -> None:
+    def _note(self, oddity: str, count: int) -> None:
         if count:
-            self._notes[what] = count
+            self._notes[oddity] = count
 
     def roads(self) -> Roads:
-        """All roads. Raises ScenarioError without any."""
+        """Return all roads. Raise ScenarioError as `check_extent` does."""
         check_extent(self._path, self._node_m, len(self._ends), "node {}".format)
         chains = list(self._chains())
         node = np.array([n for chain, _ in chains for n in chain], dtype=np.intp)
@@ -204,34 +205,34 @@ class _Merger:
         used, node = np.unique(node, return_inverse=True)
         self._note("nodes without an edge", len(self._node_m) - len(used))
         return Roads(
-            self._node_m[used],
-            node,
-            first,
-            tuple(f"edge {number}" for number in self._file_edge[edge].tolist()),
-            self._kind[edge],
-            lanes[0],
-            lanes[1],
-            self._width_m[edge],
-            lanes.min(axis=0) == 0,
-            self._frame,
-            self._notes,
+            node_m=self._node_m[used],
+            node=node,
+            first=first,
+            name=tuple(f"edge {number}" for number in self._file_edge[edge].tolist()),
+            kind=self._kind[edge],
+            forward=lanes[0],
+            backward=lanes[1],
+            lane_width_m=self._width_m[edge],
+            one_way=lanes.min(axis=0) == 0,
+            frame=self._frame,
+            notes=self._notes,
         )
 
     def _chains(self) -> Iterator[tuple[list[int], int]]:
-        """Nodes of each road, and one of its edges, whose direction is the road's."""
+        """Yield the nodes of each road, and one of its edges, whose direction is the road's."""
         done = bytearray(len(self._ends))
-        goes_on = self._goes_on().tolist()
+        is_inner = self._inner_nodes().tolist()
         for edge, (start, end) in enumerate(self._ends):
             if not done[edge]:
                 done[edge] = 1
-                ahead = self._walk(edge, end, done, goes_on)
-                behind = self._walk(edge, start, done, goes_on)
+                ahead = self._walk(edge, end, done, is_inner)
+                behind = self._walk(edge, start, done, is_inner)
                 yield [*reversed(behind), start, end, *ahead], edge
 
-    def _walk(self, edge: int, node: int, done: bytearray, goes_on: list[bool]) -> list[int]:
-        """The nodes that follow `node` on the road of `edge`."""
+    def _walk(self, edge: int, node: int, done: bytearray, is_inner: list[bool]) -> list[int]:
+        """Return the nodes that follow `node` on the road of `edge`; mark their edges as done."""
         found = []
-        while goes_on[node]:
+        while is_inner[node]:
             begin = self._begin[node]
             one, other = self._order[begin], self._order[begin + 1]
             edge = int(other if one == edge else one)
@@ -243,23 +244,23 @@ class _Merger:
             found.append(node)
         return found
 
-    def _goes_on(self) -> NDArray[np.bool_]:
-        """Nodes (N,) where exactly two edges meet that are the same road's."""
+    def _inner_nodes(self) -> NDArray[np.bool_]:
+        """Return the mask (N,) of nodes at which exactly two edges meet that have the same attributes."""
         two = np.flatnonzero(self._degree == 2)
         one, other = self._order[self._begin[two]], self._order[self._begin[two] + 1]
         ends = np.array(self._ends, dtype=np.intp).reshape(-1, 2)
-        # As seen from the node: lanes that come in on the one side go out on the other.
+        # Seen from the node: the lanes that enter on one side leave on the other.
         out = [np.where(ends[e, 0] == two, self._lanes[0, e], self._lanes[1, e]) for e in (one, other)]
         into = [np.where(ends[e, 0] == two, self._lanes[1, e], self._lanes[0, e]) for e in (one, other)]
         same = (into[0] == out[1]) & (into[1] == out[0])
         same &= (self._kind[one] == self._kind[other]) & (self._width_m[one] == self._width_m[other])
-        goes_on = np.zeros(len(self._node_m), dtype=np.bool_)
-        goes_on[two[same]] = True
-        return goes_on
+        is_inner = np.zeros(len(self._node_m), dtype=np.bool_)
+        is_inner[two[same]] = True
+        return is_inner
 
 
 def write_graph(roads: Roads, path: Path) -> None:
-    """Write an NPZ that `read_graph` reads, in metres. Raises OSError."""
+    """Write an NPZ in metres, as `read_graph` reads it. Raise OSError if it cannot be written."""
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     road = roads.road_of[roads.segment]
     ahead, back = roads.forward[road] > 0, roads.backward[road] > 0

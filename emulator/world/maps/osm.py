@@ -1,4 +1,4 @@
-"""OpenStreetMap files, XML or PBF, read by pyosmium: the ways that cars may use."""
+"""OpenStreetMap files (XML or PBF), read by pyosmium: the ways that cars may use."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from osmium.osm import Way
 
 _LONGEST_LINE = 1 << 16
+"""Bytes of a line that are searched at once."""
 
 
 def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
-    """Read roads; the origin is their middle unless given. Raises ScenarioError that names the way."""
+    """Read roads; the origin is their centre unless given. Raise ScenarioError, naming the way, for a bad file."""
     try:
         import osmium
     except ImportError:
@@ -38,7 +39,7 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
 
 
 def _line_of(path: Path, value: str) -> str:
-    """Where a value is in an XML file: pyosmium says only of what is no XML at all in which line it stands."""
+    """Return `line N: ` of a quoted value in an XML file, or nothing: pyosmium gives lines only for bad XML."""
     quoted, line = value.encode(), 1
     with path.open("rb") as file:
         while part := file.readline(_LONGEST_LINE):
@@ -61,9 +62,9 @@ def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:
         if not node.location.valid():
             raise ScenarioError(
                 f"{path}: {name}: node {node.ref} is not in the file, or not on the earth; "
-                "cut maps out with whole ways"
+                "extract maps with complete ways"
             )
         points.append((node.ref, (node.location.lon, node.location.lat)))
-    if found.turned:
+    if found.reversed:
         points.reverse()
     builder.add(name, points, found.kind, found.lanes, found.lane_width_m)

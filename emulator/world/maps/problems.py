@@ -1,4 +1,4 @@
-"""What is wrong with a map, counted, so that nobody has to find out from a run."""
+"""Quality report of a map: its size, and counts of its likely errors, before a run meets them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from emulator.world.maps.classes import NAMES
 from emulator.world.maps.roads import Ints, Roads
 
 GAP_M = 1.0
-"""A road's end so near to another point, and not joined to it, is more likely a mistake than a dead end."""
+"""A road's end this close to another point, but not joined to it, is more likely an error than a dead end."""
 
 
 @dataclass(frozen=True)
 class MapReport:
-    """What `vnet map show` says: lengths in km, counts; `problems` by what they are, without those that are not."""
+    """The figures that `vnet map show` prints: lengths in km, counts, and the `problems` that occur.
+
+    `by_class` gives the number of roads and their length in km; `size_km` the extent east and north.
+    """
 
     length_km: float
     lane_km: float
@@ -31,7 +34,7 @@ class MapReport:
 
 
 def examine(roads: Roads) -> MapReport:
-    """Measure a map and look for what is odd."""
+    """Measure a map and count its likely errors."""
     km = roads.length_m / 1000
     by_class = {
         NAMES[kind]: (int((roads.kind == kind).sum()), float(km[roads.kind == kind].sum()))
@@ -39,19 +42,19 @@ def examine(roads: Roads) -> MapReport:
     }
     east, north = np.ptp(roads.node_m, axis=0) / 1000
     return MapReport(
-        float(km.sum()),
-        float(km @ (roads.forward + roads.backward)),
-        len(roads),
-        len(roads.node_m),
-        dict(sorted(by_class.items(), key=lambda entry: -entry[1][1])),
-        float(km[roads.one_way].sum()),
-        (float(east), float(north)),
-        _problems(roads),
+        length_km=float(km.sum()),
+        lane_km=float(km @ (roads.forward + roads.backward)),
+        roads=len(roads),
+        nodes=len(roads.node_m),
+        by_class=dict(sorted(by_class.items(), key=lambda entry: -entry[1][1])),
+        one_way_km=float(km[roads.one_way].sum()),
+        size_km=(float(east), float(north)),
+        problems=_problems(roads),
     )
 
 
 def _piece_of_node(roads: Roads) -> Ints:
-    """Which connected piece each point belongs to, (N,); 0 is the one of most road."""
+    """Return the connected component (N,) of each point; component 0 has the greatest length of road."""
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     count = len(roads.node_m)
     joined = coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count))
@@ -63,25 +66,25 @@ def _piece_of_node(roads: Roads) -> Ints:
 
 
 def _problems(roads: Roads) -> dict[str, str]:
-    found = {what: f"{count:,}" for what, count in roads.notes.items()}
+    found = {oddity: f"{count:,}" for oddity, count in roads.notes.items()}
     start, end = roads.node[roads.segment], roads.node[roads.segment + 1]
     piece = _piece_of_node(roads)
     if piece.max():
-        aside_km = roads.segment_length_m[piece[start] > 0].sum() / 1000
-        found["isolated pieces"] = f"{piece.max():,}, {aside_km:.1f} km of road beside the largest piece"
+        isolated_km = roads.segment_length_m[piece[start] > 0].sum() / 1000
+        found["isolated pieces"] = f"{piece.max():,}, {isolated_km:.1f} km of road outside the largest piece"
     low, high = np.minimum(start, end), np.maximum(start, end)
     _, times = np.unique(low * len(roads.node_m) + high, return_counts=True)
-    _say(found, "segments under another", int((times - 1).sum()))
-    _say(found, "segments without length", int((roads.segment_length_m == 0).sum()))
+    _add_count(found, "duplicate segments", int((times - 1).sum()))
+    _add_count(found, "segments without length", int((roads.segment_length_m == 0).sum()))
     degree = np.bincount(np.concatenate([start, end]), minlength=len(roads.node_m))
-    _say(found, "dead ends", int((degree == 1).sum()))
-    _say(found, f"ends within {GAP_M:g} m of a point that they are not joined to", _gaps(roads, degree, start, end))
+    _add_count(found, "dead ends", int((degree == 1).sum()))
+    _add_count(found, f"ends within {GAP_M:g} m of a point but not joined to it", _gaps(roads, degree, start, end))
     return found
 
 
-def _say(found: dict[str, str], what: str, count: int) -> None:
+def _add_count(found: dict[str, str], problem: str, count: int) -> None:
     if count:
-        found[what] = f"{count:,}"
+        found[problem] = f"{count:,}"
 
 
 def _gaps(roads: Roads, degree: Ints, start: Ints, end: Ints) -> int:
@@ -91,5 +94,5 @@ def _gaps(roads: Roads, degree: Ints, start: Ints, end: Ints) -> int:
     neighbour[start] = end
     neighbour[end] = start  # an end has one neighbour only
     distance_m, nearest = tree.query(roads.node_m[ends], k=3, distance_upper_bound=GAP_M)
-    there = np.isfinite(distance_m) & (nearest != ends[:, None]) & (nearest != neighbour[ends, None])
-    return int(there.any(axis=1).sum())
+    present = np.isfinite(distance_m) & (nearest != ends[:, None]) & (nearest != neighbour[ends, None])
+    return int(present.any(axis=1).sum())

@@ -1,7 +1,7 @@
-"""Roads: centre lines between shared points, and what is known of each; all readers end here.
+"""Roads: centre lines between shared points, with their attributes; the common result of all map readers.
 
-From roads to lanes: a road's lanes lie side by side, its centre line in the middle of all of them, those in its own
-direction on the side on which people drive.
+Lanes of a road lie side by side, with its centre line in the middle of all of them. The lanes in the road's own
+direction are on the side on which people drive.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.maps.classes import NAMES, VEHICLE_WIDTH_M
-from emulator.world.projection import WIDEST_M, Frame, most_off, project
+from emulator.world.projection import MAX_FROM_ORIGIN_M, Frame, outlier_index, project
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap, touch_box
 from vnet.types import Array
 
-MOST_POINTS = 5_000_000
-"""A map has no more points: a large city has a tenth of that."""
-NARROWEST_SPACE_M = 0.3
-"""Half-width left to a vehicle's centre in a lane that is hardly wider than the vehicle."""
-_SHARPEST = 0.5
-"""At a bend sharper than 120° a lane's corner is cut: 1 + cos of the turn is no less."""
+MAX_POINTS = 5_000_000
+"""Most points of a map: ten times those of a large city."""
+MIN_HALF_WIDTH_M = 0.3
+"""Least half-width left to a vehicle's centre, in a lane hardly wider than the vehicle."""
+_MIN_ONE_PLUS_COSINE = 0.5
+"""Lower bound of 1 + cos(turn): at a turn sharper than 120° the corner of a lane is cut off."""
 
 Ints = NDArray[np.intp]
 
@@ -34,10 +34,11 @@ Ints = NDArray[np.intp]
 class Roads:
     """R roads through N points.
 
-    Road r runs through the points `node[first[r]:first[r + 1]]` of `node_m` (N, 2), two at least; roads meet where
-    they share a point. `name` (R,) is what the file calls them; `kind` (R,) their class, an index into `NAMES`;
-    `forward`, `backward` (R,) lanes in and against their direction; `lane_width_m` (R,); `one_way` (R,). `frame`
-    says where on the earth this is, if anybody knows. `notes` counts what was odd about the file and put right.
+    Road r runs through the points `node[first[r]:first[r + 1]]` of `node_m` (N, 2), at least two; roads are joined
+    where they share a point. `name` (R,) are their names in the file; `kind` (R,) their classes, indices into
+    `NAMES`; `forward` and `backward` (R,) the lanes in and against their direction; `lane_width_m` (R,); `one_way`
+    (R,). `frame` is the projection, or None if it is unknown. `notes` counts the oddities of the file that were
+    corrected.
     """
 
     node_m: Array
@@ -57,19 +58,19 @@ class Roads:
 
     @cached_property
     def road_of(self) -> Ints:
-        """Which road each entry of `node` belongs to, (P,)."""
+        """Road index (P,) of each entry of `node`."""
         return np.repeat(np.arange(len(self)), np.diff(self.first))
 
     @cached_property
     def segment(self) -> Ints:
-        """Entries of `node` from which a segment goes to the next entry, (G,)."""
+        """Indices (G,) of the entries of `node` from which a segment goes to the next entry."""
         return np.flatnonzero(self.road_of[:-1] == self.road_of[1:])
 
     @cached_property
     def segment_length_m(self) -> Array:
         """Lengths (G,) of the segments of the centre lines."""
-        place = self.node_m[self.node]
-        return np.asarray(np.hypot(*(place[self.segment + 1] - place[self.segment]).T))
+        point_m = self.node_m[self.node]
+        return np.asarray(np.hypot(*(point_m[self.segment + 1] - point_m[self.segment]).T))
 
     @cached_property
     def length_m(self) -> Array:
@@ -79,12 +80,12 @@ class Roads:
         )
 
     def within(self, low_m: Array, high_m: Array) -> Roads:
-        """What of the roads touches the box from `low_m` (2,) to `high_m` (2,), in whole segments.
+        """Return the segments that touch the box from `low_m` (2,) to `high_m` (2,), as roads without notes.
 
-        A road that leaves the box and comes back becomes several of the same name. Notes are about the whole.
+        A road that leaves the box and returns becomes several of the same name.
         """
-        place = self.node_m[self.node]
-        segment = self.segment[touch_box(place[self.segment], place[self.segment + 1], low_m, high_m)]
+        point_m = self.node_m[self.node]
+        segment = self.segment[touch_box(point_m[self.segment], point_m[self.segment + 1], low_m, high_m)]
         begins, ends = np.zeros((2, len(self.node)), dtype=np.bool_)
         begins[segment], ends[segment + 1] = True, True
         kept = begins | ends
@@ -106,39 +107,39 @@ class Roads:
         )
 
     def around(self, source: object, origin_deg: tuple[float, float] | None) -> Roads:
-        """The same roads in metres around another origin, if one is given.
+        """Return the same roads in metres around another origin, if one is given.
 
-        Raises ScenarioError, naming `source`, where nobody knows where on the earth they are, or too far from it.
+        Raise ScenarioError, naming `source`, if the projection is unknown, or the origin too far away.
         """
         if origin_deg is None:
             return self
         if self.frame is None:
-            raise ScenarioError(f"{source}: does not say where on the earth its metres are; leave out the origin")
+            raise ScenarioError(f"{source}: states no projection of its metres; leave out the origin")
         frame, node_m = project(source, *self.frame.to_wgs84(self.node_m), origin_deg)
         return replace(self, node_m=node_m, frame=frame)
 
     # Lanes.
 
     def lane_map(self, drive_on: str = "right", sigma_m: float = 0.0) -> RoadMap:
-        """The directed lanes of all roads; `drive_on` is `right` or `left`, `sigma_m` as in `RoadMap`."""
-        road, aside_m, against = self._lanes(1.0 if drive_on == "right" else -1.0)
+        """Return the directed lanes of all roads; `drive_on` is `right` or `left`, `sigma_m` as in `RoadMap`."""
+        road, offset_m, against = self._lanes(1.0 if drive_on == "right" else -1.0)
         counts = np.diff(self.first)[road]
         lane = np.repeat(np.arange(len(road)), counts)
         number = np.arange(len(lane)) - np.repeat(np.cumsum(counts) - counts, counts)
         entry = np.where(against[lane], self.first[road + 1][lane] - 1 - number, self.first[road][lane] + number)
-        place = self.node_m[self.node[entry]] + aside_m[lane, None] * self._aside[entry]
-        step = place[1:] - place[:-1]
+        point_m = self.node_m[self.node[entry]] + offset_m[lane, None] * self._right[entry]
+        step = point_m[1:] - point_m[:-1]
         ahead = self.node_m[self.node[entry[1:]]] - self.node_m[self.node[entry[:-1]]]
-        # Inside a tight bend a lane's short segments turn round: they are no road.
-        goes_on = (lane[1:] == lane[:-1]) & (np.einsum("ij,ij->i", step, ahead) > 0)
-        segment = np.flatnonzero(goes_on)
+        # On the inside of a tight curve a lane's short segments point backwards: they are dropped.
+        is_segment = (lane[1:] == lane[:-1]) & (np.einsum("ij,ij->i", step, ahead) > 0)
+        segment = np.flatnonzero(is_segment)
         of_lane = lane[segment]
         of_road = road[of_lane]
         return RoadMap(
-            place[segment],
+            point_m[segment],
             _heading_rad(step[segment]),
             np.hypot(step[segment, 0], step[segment, 1]),
-            np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, NARROWEST_SPACE_M),
+            np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, MIN_HALF_WIDTH_M),
             self.kind[of_road].astype(np.uint8),
             self.one_way[of_road],
             of_road.astype(np.int32),
@@ -148,38 +149,38 @@ class Roads:
         )
 
     def _lanes(self, side: float) -> tuple[Ints, Array, NDArray[np.bool_]]:
-        """All lanes: their road, how far right of its centre line as it goes, and which go against it."""
+        """Return the road of each lane, its offset in m right of the centre line, and a mask of opposite lanes."""
         counts = self.forward + self.backward
         road = np.repeat(np.arange(len(self)), counts)
         number = np.arange(len(road)) - np.repeat(np.cumsum(counts) - counts, counts)
         against = number >= self.forward[road]
-        from_between = np.where(against, self.forward[road] - number - 0.5, number + 0.5)
-        between = (self.backward - self.forward)[road] / 2  # the two directions meet there
-        return road, side * (between + from_between) * self.lane_width_m[road], against
+        from_divider = np.where(against, self.forward[road] - number - 0.5, number + 0.5)
+        divider = (self.backward - self.forward)[road] / 2  # the line between the two directions
+        return road, side * (divider + from_divider) * self.lane_width_m[road], against
 
     @cached_property
-    def _aside(self) -> Array:
-        """Where the point of each entry of `node` goes when its road is moved right by a metre, (P, 2)."""
-        place = self.node_m[self.node]
-        step = place[1:] - place[:-1]
+    def _right(self) -> Array:
+        """Displacement (P, 2) of the point of each entry of `node` if its road is moved right by a metre."""
+        point_m = self.node_m[self.node]
+        step = point_m[1:] - point_m[:-1]
         length_m = np.hypot(step[:, 0], step[:, 1])
         right = np.column_stack([step[:, 1], -step[:, 0]]) / np.where(length_m > 0, length_m, 1)[:, None]
         right[self.road_of[:-1] != self.road_of[1:]] = 0.0
         after, before = np.vstack([right, [[0, 0]]]), np.vstack([[[0, 0]], right])
         both = after.any(axis=1) & before.any(axis=1)
-        scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), _SHARPEST), 1.0)
+        scale = np.where(both, np.maximum(1 + np.einsum("ij,ij->i", after, before), _MIN_ONE_PLUS_COSINE), 1.0)
         return np.asarray((after + before) / scale[:, None])
 
 
 def _heading_rad(step_m: Array) -> Array:
-    """Directions (n,) of steps (n, 2), in [0, 2π)."""
+    """Return the directions (n,) of steps (n, 2), in [0, 2π)."""
     heading_rad = np.mod(np.arctan2(step_m[:, 1], step_m[:, 0]), 2 * np.pi)
-    return np.where(heading_rad < 2 * np.pi, heading_rad, 0.0)  # of the smallest negative angles mod makes 2π
+    return np.where(heading_rad < 2 * np.pi, heading_rad, 0.0)  # mod returns 2π for the smallest negative angles
 
 
 @dataclass
 class _Row:
-    """What is known of a road while a file is read."""
+    """Attributes of a road while a file is read."""
 
     name: str
     kind: int
@@ -190,20 +191,20 @@ class _Row:
 
 
 class RoadsBuilder:
-    """Collects roads as a reader comes by them; points are told apart by a key of the reader's choice."""
+    """Collects roads as a file is read; points with the same key, which the reader chooses, are the same point."""
 
     def __init__(self, source: object) -> None:
         self._source = source
         self._number: dict[object, int] = {}
-        self._place: list[tuple[float, float]] = []
+        self._coordinates: list[tuple[float, float]] = []
         self._node: list[int] = []
         self._first = [0]
         self._rows: list[_Row] = []
         self.notes: dict[str, int] = {}
 
-    def note(self, what: str) -> None:
-        """Count something odd."""
-        self.notes[what] = self.notes.get(what, 0) + 1
+    def note(self, oddity: str) -> None:
+        """Count an oddity of the file."""
+        self.notes[oddity] = self.notes.get(oddity, 0) + 1
 
     def add(
         self,
@@ -214,9 +215,9 @@ class RoadsBuilder:
         lane_width_m: float,
         one_way: bool | None = None,
     ) -> None:
-        """A road through points, each with its key; `lanes` are forward and backward. Two equal points are one.
+        """Add a road through points, given as (key, coordinates); `lanes` are those forward and backward.
 
-        Raises ScenarioError when there are more points than `MOST_POINTS`.
+        Equal successive points become one. Raise ScenarioError if there are more points than `MAX_POINTS`.
         """
         line: list[tuple[object, tuple[float, float]]] = []
         for point in points:
@@ -227,49 +228,49 @@ class RoadsBuilder:
         if len(line) < 2:
             self.note("roads without length")
             return
-        for key, place in line:
-            number = self._number.setdefault(key, len(self._place))
-            if number == len(self._place):
-                self._place.append(place)
+        for key, coordinates in line:
+            number = self._number.setdefault(key, len(self._coordinates))
+            if number == len(self._coordinates):
+                self._coordinates.append(coordinates)
             self._node.append(number)
-        if len(self._node) > MOST_POINTS:
-            raise ScenarioError(f"{self._source}: {name}: more than {MOST_POINTS} points; cut out a part first")
+        if len(self._node) > MAX_POINTS:
+            raise ScenarioError(f"{self._source}: {name}: more than {MAX_POINTS} points; cut out a part first")
         self._first.append(len(self._node))
         if one_way is None:
             one_way = 0 in lanes
         self._rows.append(_Row(name, kind, *lanes, lane_width_m, one_way))
 
-    def places(self) -> Array:
-        """The coordinates of the points so far, (N, 2)."""
-        return np.array(self._place, dtype=float).reshape(-1, 2)
+    def coordinates(self) -> Array:
+        """Return the coordinates (N, 2) of the points so far."""
+        return np.array(self._coordinates, dtype=float).reshape(-1, 2)
 
     def build_from_degrees(self, origin_deg: tuple[float, float] | None) -> Roads:
-        """The roads, whose points are longitudes and latitudes. Raises ScenarioError as `project` does."""
+        """Return the roads, whose coordinates are longitude and latitude. Raise ScenarioError as `project` does."""
         if not self._rows:
             raise ScenarioError(f"{self._source}: no roads that vehicles may use")
-        lon, lat = self.places().T
+        lon, lat = self.coordinates().T
         frame, node_m = project(self._source, lat, lon, origin_deg, self._name_of)
         return self.build(node_m, frame)
 
     def _name_of(self, point: int) -> str:
-        """The name of a road that runs through a point."""
+        """Return the name of a road that runs through a point."""
         return self._rows[bisect(self._first, self._node.index(point)) - 1].name
 
     def build(self, node_m: Array, frame: Frame | None) -> Roads:
-        """The roads, with the points' places in metres (N, 2). Raises ScenarioError as `check_extent` does."""
+        """Return the roads, with the points at `node_m` (N, 2). Raise ScenarioError as `check_extent` does."""
         check_extent(self._source, node_m, len(self._rows), self._name_of)
         return Roads(
-            node_m,
-            np.array(self._node, dtype=np.intp),
-            np.array(self._first, dtype=np.intp),
-            tuple(row.name for row in self._rows),
-            _column([row.kind for row in self._rows]),
-            _column([row.forward for row in self._rows]),
-            _column([row.backward for row in self._rows]),
-            np.array([row.lane_width_m for row in self._rows]),
-            np.array([row.one_way for row in self._rows], dtype=np.bool_),
-            frame,
-            self.notes,
+            node_m=node_m,
+            node=np.array(self._node, dtype=np.intp),
+            first=np.array(self._first, dtype=np.intp),
+            name=tuple(row.name for row in self._rows),
+            kind=_column([row.kind for row in self._rows]),
+            forward=_column([row.forward for row in self._rows]),
+            backward=_column([row.backward for row in self._rows]),
+            lane_width_m=np.array([row.lane_width_m for row in self._rows]),
+            one_way=np.array([row.one_way for row in self._rows], dtype=np.bool_),
+            frame=frame,
+            notes=self.notes,
         )
 
 
@@ -278,17 +279,17 @@ def _column(values: Sequence[int]) -> Ints:
 
 
 def check_extent(source: object, node_m: Array, roads: int, name: Callable[[int], str]) -> None:
-    """Raises ScenarioError where there are no roads, or where points (N, 2) lie too far apart to be one map.
+    """Raise ScenarioError if there are no roads, or points (N, 2) lie too far apart to be one map.
 
-    `name` says what a point is in the file.
+    `name` returns a point's name in the file.
     """
     if not roads:
         raise ScenarioError(f"{source}: no roads that vehicles may use")
     if not np.isfinite(node_m).all():
-        raise ScenarioError(f"{source}: positions that its projection does not reach")
+        raise ScenarioError(f"{source}: some positions are outside its projection")
     span_m = float(np.ptp(node_m, axis=0).max())
-    if span_m > 2 * WIDEST_M:
+    if span_m > 2 * MAX_FROM_ORIGIN_M:
         raise ScenarioError(
-            f"{source}: {name(most_off(node_m))}: the map spans {span_m / 1000:.0f} km, and at most "
-            f"{2 * WIDEST_M / 1000:.0f} are allowed; are all points in the same projection?"
+            f"{source}: {name(outlier_index(node_m))}: the map spans {span_m / 1000:.0f} km, and at most "
+            f"{2 * MAX_FROM_ORIGIN_M / 1000:.0f} are allowed; are all points in the same projection?"
         )

@@ -1,4 +1,4 @@
-"""From streets as they are drawn to roads that meet: crossings are where streets cross or end at one another."""
+"""Conversion of drawn streets to joined roads: crossings are where streets cross or end at one another."""
 
 from __future__ import annotations
 
@@ -15,21 +15,25 @@ from emulator.world.maps.roads import Ints, RoadsBuilder
 from vnet.types import Array
 
 STEP_M = 30.0
-"""No two points of a street are further apart."""
+"""Greatest distance between neighbouring points of a street."""
 MERGE_M = 14.0
-"""Crossings that are nearer to each other are one."""
+"""Crossings closer than this become one."""
 SHORTEST_DEAD_END_M = 35.0
+"""Shortest dead end that is kept."""
 _TOUCH_M = 0.5
-"""A street that ends so near to another one ends at it."""
-_FLATTEST = 0.1
-"""Sine of the least angle at which streets cross; what is flatter runs side by side."""
+"""A street that ends this close to another one ends at it."""
+_MIN_SINE = 0.1
+"""Sine of the least angle at which streets cross; streets at a smaller angle are parallel."""
 _ABOVE_M = 1e6
+"""Height that separates elevated streets from those on the ground in the search for crossings."""
 
 
 @dataclass
 class Street:
-    """A line through `points_m` (n, 2). What is `above` the ground meets others only at its `joints`, which are
-    numbers of points; a street on the ground whose last point is such a joint of another (a ramp) says so likewise.
+    """A street through `points_m` (n, 2).
+
+    A street `above` the ground meets others only at its `joints`, which are indices of points. A street on the
+    ground that joins one (a ramp) lists the index of its own point there.
     """
 
     name: str
@@ -42,7 +46,7 @@ class Street:
 
 @dataclass
 class _Piece:
-    """Part of a street between two crossings, by their numbers; `shape` are numbers of points between."""
+    """Part of a street between the crossings numbered `ends`; `shape` are the indices of the points between."""
 
     street: int
     ends: tuple[int, int]
@@ -51,7 +55,7 @@ class _Piece:
 
 
 def divided(points_m: Array, step_m: float = STEP_M) -> Array:
-    """A line (n, 2) with further points on it, so that no two neighbours are further apart than `step_m`."""
+    """Return a line (n, 2) with points added so that neighbours are at most `step_m` apart."""
     length_m = np.hypot(*np.diff(points_m, axis=0).T)
     parts = np.maximum(1, np.ceil(length_m / step_m)).astype(int)
     along = np.concatenate([n + np.arange(part) / part for n, part in enumerate(parts)] + [[len(parts)]])
@@ -59,14 +63,14 @@ def divided(points_m: Array, step_m: float = STEP_M) -> Array:
     return np.column_stack([np.interp(along, number, axis) for axis in points_m.T])
 
 
-def add_streets(builder: RoadsBuilder, streets: Sequence[Street], place: Callable[[Array], Array]) -> None:
-    """Cut streets into roads at their crossings, and add the largest piece that hangs together.
+def add_streets(builder: RoadsBuilder, streets: Sequence[Street], warp: Callable[[Array], Array]) -> None:
+    """Cut streets into roads at their crossings, and add the largest connected component.
 
-    Streets are drawn on a plan; `place` says where points (n, 2) of the plan are.
+    Streets are drawn on a plan; `warp` maps points (n, 2) of the plan to metres.
     """
     plan = _Plan(streets)
     pieces = _without_stubs(plan.pieces())
-    crossing_m, point_m = place(plan.crossing_m), place(plan.point_m)
+    crossing_m, point_m = warp(plan.crossing_m), warp(plan.point_m)
     for piece in _largest(pieces, len(crossing_m)):
         street = streets[piece.street]
         start, end = piece.ends
@@ -80,7 +84,7 @@ def add_streets(builder: RoadsBuilder, streets: Sequence[Street], place: Callabl
 
 
 class _Plan:
-    """All points of all streets, and where streets meet."""
+    """All points of all streets, and the crossings of streets."""
 
     def __init__(self, streets: Sequence[Street]) -> None:
         count = [len(street.points_m) for street in streets]
@@ -93,29 +97,36 @@ class _Plan:
         self._along, self._number = self._meetings()
 
     def _meetings(self) -> tuple[Array, Ints]:
-        """Where on the streets crossings are, as the number of a point and a part of the way on, and which."""
+        """Return the positions of crossings along the streets, and the crossings' numbers.
+
+        A position is the index of a point plus a fraction. Both arrays are sorted by street, then by position. Sets
+        `crossing_m` and `_street_of`.
+        """
         one, other, t, u = self._intersections()
         ends = np.concatenate([self._first[:-1], self._first[1:] - 1])
         along = np.concatenate([one + t, other + u, ends, self._joints]).astype(float)
         before = np.minimum(np.floor(along).astype(np.intp), len(self.point_m) - 2)
         part = (along - before)[:, None]
-        where_m = (1 - part) * self.point_m[before] + part * self.point_m[before + 1]
-        # What is above the ground meets what is there, far from all others.
+        at_m = (1 - part) * self.point_m[before] + part * self.point_m[before + 1]
+        # Streets above the ground meet only each other's joints.
         street = np.concatenate(
             [self._street[one], self._street[other], self._street[ends], self._street[self._joints]]
         )
         is_above = self._above[street] | np.isin(along, self._joints)
-        pairs = cKDTree(np.column_stack([where_m, _ABOVE_M * is_above])).query_pairs(MERGE_M, output_type="ndarray")
+        pairs = cKDTree(np.column_stack([at_m, _ABOVE_M * is_above])).query_pairs(MERGE_M, output_type="ndarray")
         same = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(along), len(along)))
         crossings, number = connected_components(same, directed=False)
         share = np.bincount(number, minlength=crossings)
-        self.crossing_m: Array = np.column_stack([np.bincount(number, axis) / share for axis in where_m.T])
+        self.crossing_m: Array = np.column_stack([np.bincount(number, axis) / share for axis in at_m.T])
         order = np.lexsort((along, street))
         self._street_of = street[order]
         return along[order], number[order]
 
     def _intersections(self) -> tuple[Ints, Ints, Array, Array]:
-        """Pairs of segments, by their first points, that cross on the ground, and at which part of each."""
+        """Return the segments that cross on the ground, by the indices of their first points.
+
+        The last two arrays are the fractions of the two segments at which they cross.
+        """
         segment = np.flatnonzero((self._street[:-1] == self._street[1:]) & ~self._above[self._street[:-1]])
         start, step = self.point_m[segment], self.point_m[segment + 1] - self.point_m[segment]
         pairs = cKDTree(start + step / 2).query_pairs(STEP_M + 2 * _TOUCH_M, output_type="ndarray")
@@ -123,7 +134,7 @@ class _Plan:
         one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
         length = np.hypot(*step.T)
         sine = _cross(step[one], step[other])
-        crossing = np.abs(sine) > _FLATTEST * length[one] * length[other]
+        crossing = np.abs(sine) > _MIN_SINE * length[one] * length[other]
         one, other, sine = one[crossing], other[crossing], sine[crossing]
         between = start[other] - start[one]
         t, u = _cross(between, step[other]) / sine, _cross(between, step[one]) / sine
@@ -133,7 +144,7 @@ class _Plan:
         return segment[one[meet]], segment[other[meet]], t, u
 
     def pieces(self) -> list[_Piece]:
-        """All parts of streets between neighbouring crossings; between the same two, those that differ."""
+        """Return all parts of streets between neighbouring crossings, without near-copies between the same two."""
         found: list[_Piece] = []
         seen: dict[tuple[int, int], list[float]] = {}
         same = (self._street_of[1:] == self._street_of[:-1]) & (self._number[1:] != self._number[:-1])
@@ -157,7 +168,7 @@ def _cross(one: Array, other: Array) -> Array:
 
 
 def _without_stubs(pieces: list[_Piece]) -> list[_Piece]:
-    """The pieces but for short dead ends."""
+    """Return the pieces without short dead ends."""
     ends = np.array([piece.ends for piece in pieces], dtype=np.intp)
     degree = np.bincount(ends.ravel())
     dead_end = (degree[ends] == 1).any(axis=1)
@@ -169,7 +180,7 @@ def _without_stubs(pieces: list[_Piece]) -> list[_Piece]:
 
 
 def _largest(pieces: list[_Piece], crossings: int) -> list[_Piece]:
-    """Those pieces that hang together, of which there are most."""
+    """Return the pieces of the connected component with the greatest length."""
     ends = np.array([piece.ends for piece in pieces], dtype=np.intp)
     joined = coo_matrix((np.ones(len(ends)), ends.T), shape=(crossings, crossings))
     _, label = connected_components(joined, directed=False)

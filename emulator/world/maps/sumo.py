@@ -1,8 +1,8 @@
 """SUMO road networks (.net.xml): the lanes that passenger cars may use, each as a road of its own.
 
-Read by expat as a stream, within bounds. SUMO's own reader (sumolib) knows no lines to name in an error, and
-expands whatever entities a file declares; here a file that declares any is refused. Coordinates stay SUMO's, so
-that its traces fit; its projection, if it states one, becomes the frame.
+Files are read by expat as a stream, within bounds. SUMO's own reader (sumolib) cannot name lines in its errors, and
+expands all entities that a file declares; here a file that declares any is refused. Coordinates remain SUMO's, so
+that they match its trips; its projection, if it states one, becomes the frame.
 """
 
 from __future__ import annotations
@@ -13,18 +13,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulator.world.maps.classes import NARROWEST_M, NUMBER, UNKNOWN, WIDEST_M
-from emulator.world.maps.roads import MOST_POINTS, Roads, RoadsBuilder
-from emulator.world.networks import FARTHEST_M
+from emulator.world.maps.classes import MAX_LANE_WIDTH_M, MIN_LANE_WIDTH_M, NUMBER, UNKNOWN
+from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder
+from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError, printable, shown
 
 LARGEST_BYTES = 2**31
+"""Largest file that is read."""
 _CHUNK_BYTES = 2**20
+"""Bytes that are parsed at once."""
 _SUMO_WIDTH_M = 3.2
-"""Of a lane that does not say; SUMO's default."""
+"""Width of a lane that does not state it: SUMO's default."""
 _NO_ROADS = {"crossing", "walkingarea", "connector"}
+"""Functions of edges that are not roads."""
 _CARS = {"passenger", "all", "private"}
+"""SUMO's vehicle classes that include passenger cars."""
 
 
 @dataclass
@@ -37,7 +41,7 @@ class _Lane:
 
 
 class _Reader:
-    """What expat calls; keeps the lanes of all edges until it is known which have an opposite."""
+    """Handlers for expat; they keep the lanes of all edges until the opposite edges are known."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -49,16 +53,16 @@ class _Reader:
         self._edge: dict[str, str] | None = None
         self.frame: Frame | None = None
         self.lanes: list[_Lane] = []
-        self._points_left = MOST_POINTS
-        self.pairs: set[tuple[str, str]] = set()
-        self.left_out = 0
+        self._points_left = MAX_POINTS
+        self.edge_ends: set[tuple[str, str]] = set()
+        self.skipped = 0
 
-    def wrong(self, what: str) -> ScenarioError:
-        """An error at the line that is being read."""
-        return ScenarioError(f"{self._path}: line {self._parser.CurrentLineNumber}: {what}")
+    def wrong(self, problem: str) -> ScenarioError:
+        """Return an error that names the line being read."""
+        return ScenarioError(f"{self._path}: line {self._parser.CurrentLineNumber}: {problem}")
 
     def read(self) -> None:
-        """Read the whole file."""
+        """Read the file."""
         size = 0
         try:
             with self._path.open("rb") as file:
@@ -71,9 +75,9 @@ class _Reader:
         except OSError as error:
             raise ScenarioError(f"{self._path}: cannot be read: {error.strerror}") from None
         except xml.parsers.expat.ExpatError as error:
-            what = xml.parsers.expat.ErrorString(error.code)
-            raise ScenarioError(f"{self._path}: line {error.lineno}: not XML: {what}") from None
-        except (LookupError, ValueError) as error:  # an encoding that Python does not know, or has more bytes
+            problem = xml.parsers.expat.ErrorString(error.code)
+            raise ScenarioError(f"{self._path}: line {error.lineno}: not XML: {problem}") from None
+        except (LookupError, ValueError) as error:  # an encoding that is unknown or not supported
             raise self.wrong(f"not XML: {printable(str(error))}") from None
 
     def _refuse_doctype(self, *_: object) -> None:
@@ -110,14 +114,14 @@ class _Reader:
     def _start_edge(self, attributes: dict[str, str]) -> None:
         self._edge = attributes
         if "from" in attributes and "to" in attributes:
-            self.pairs.add((attributes["from"], attributes["to"]))
+            self.edge_ends.add((attributes["from"], attributes["to"]))
 
     def _lane(self, attributes: dict[str, str]) -> None:
         edge = self._edge
         if edge is None:
             raise self.wrong("<lane> outside of an <edge>")
         if edge.get("function") in _NO_ROADS or not _for_cars(attributes):
-            self.left_out += 1
+            self.skipped += 1
             return
         name = attributes.get("id", "")
         points = self._points(attributes.get("shape", ""), f"lane {printable(name)}: shape")
@@ -135,24 +139,26 @@ class _Reader:
             width_m = float(text)
         except ValueError:
             width_m = math.nan
-        if not 0 < width_m <= WIDEST_M:
-            raise self.wrong(f"width = {shown(text)}: a positive number of metres up to {WIDEST_M:g} is needed")
-        return max(width_m, NARROWEST_M)
+        if not 0 < width_m <= MAX_LANE_WIDTH_M:
+            raise self.wrong(
+                f"width = {shown(text)}: a positive number of metres up to {MAX_LANE_WIDTH_M:g} is needed"
+            )
+        return max(width_m, MIN_LANE_WIDTH_M)
 
-    def _points(self, text: str, what: str) -> list[tuple[float, float]]:
-        """Points written as `x,y x,y …`, a height ignored."""
+    def _points(self, text: str, name: str) -> list[tuple[float, float]]:
+        """Return the points of a text `x,y x,y …`, without heights; `name` is used in errors."""
         points = []
         for part in text.split():
             try:
                 numbers = [float(number) for number in part.split(",")]
             except ValueError:
                 numbers = []
-            if len(numbers) not in (2, 3) or not all(abs(number) <= FARTHEST_M for number in numbers):
-                raise self.wrong(f"{what}: {shown(part)}: x,y in metres is needed")
+            if len(numbers) not in (2, 3) or not all(abs(number) <= MAX_COORDINATE_M for number in numbers):
+                raise self.wrong(f"{name}: {shown(part)}: x,y in metres is needed")
             points.append((numbers[0], numbers[1]))
         self._points_left -= len(points)
         if self._points_left < 0:
-            raise self.wrong(f"more than {MOST_POINTS} points; cut out a part first")
+            raise self.wrong(f"more than {MAX_POINTS} points; cut out a part first")
         return points
 
 
@@ -164,15 +170,18 @@ def _for_cars(lane: dict[str, str]) -> bool:
 
 
 def read_sumo(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
-    """Read the lanes; metres are SUMO's own unless an origin is given. Raises ScenarioError that names the line."""
+    """Read the lanes; metres are SUMO's own unless an origin is given.
+
+    Raise ScenarioError, naming the line, for a bad file.
+    """
     reader = _Reader(path)
     reader.read()
     builder = RoadsBuilder(path)
-    if reader.left_out:
-        builder.notes["lanes not for cars"] = reader.left_out
+    if reader.skipped:
+        builder.notes["lanes not for cars"] = reader.skipped
     for lane in reader.lanes:
-        # The ends of lanes inside crossings are those of the lanes they join, to the centimetre.
+        # The ends of lanes inside intersections equal those of the lanes that they join, to the centimetre.
         points = [((round(100 * x), round(100 * y)), (x, y)) for x, y in lane.points]
-        one_way = lane.ends is None or lane.ends[::-1] not in reader.pairs
+        one_way = lane.ends is None or lane.ends[::-1] not in reader.edge_ends
         builder.add(lane.name, points, lane.kind, (1, 0), lane.width_m, one_way)
-    return builder.build(builder.places(), reader.frame).around(path, origin_deg)
+    return builder.build(builder.coordinates(), reader.frame).around(path, origin_deg)

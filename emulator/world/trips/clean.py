@@ -1,10 +1,10 @@
-"""What of a trip is believed: positions that a receiver held, jumps, and times of which nothing is known.
+"""Cleaning of recorded trips: held positions, jumps and gaps.
 
-Held: the same position again is a stand, unless the vehicle then moves faster than any can from a stand: then its
-receiver held the position (as files do that repeat samples to reach a rate), and the repetitions are left out, for
-at most `longest_gap_s`. Jumps: where two samples are further apart than `fastest_mps` allows, the largest set of
-samples without a jump is kept. Gaps: up to `longest_gap_s` without a sample the vehicle drives straight on from one
-sample to the next; after more it has left, and enters anew. docs/motion.md has examples.
+Held positions: a repeated position means a standing vehicle, unless it then moves faster than a vehicle can from a
+standstill. Then its receiver held the position (as files do that repeat samples to reach a rate), and repetitions
+for up to `longest_gap_s` are dropped. Jumps: if two samples are further apart than `fastest_mps` allows, the
+largest set of samples without a jump is kept. Gaps: across a gap of up to `longest_gap_s` the vehicle moves
+linearly from sample to sample; after a longer one it has left, and enters again. docs/motion.md has examples.
 """
 
 from __future__ import annotations
@@ -18,31 +18,32 @@ from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 from vnet.types import Array
 
-HARDEST_MPS2 = 10.0
-"""No vehicle starts harder."""
-MOST_JUMPS = 0.05
-"""A trip with a larger share of jumps is no trip: units, projection or ids are wrong."""
-FEW_JUMPS = 10
-FARTHEST_RUNS = 20
-"""A chain leaves out so many runs of samples at most."""
-FARTHEST_EXIT = 5
-"""And so many samples before a jump: what a filter in a receiver makes of one."""
+MAX_ACCELERATION_MPS2 = 10.0
+"""Greatest acceleration of a vehicle from a standstill."""
+MAX_JUMP_SHARE = 0.05
+"""Greatest share of jumps in a trip: with more, its units, projection or ids are wrong."""
+ALWAYS_ALLOWED_JUMPS = 10
+"""Jumps that are allowed in every trip, however short."""
+MAX_SKIPPED_RUNS = 20
+"""Most runs of samples that a chain skips."""
+MAX_SKIPPED_SAMPLES = 5
+"""Most samples before a jump that a chain skips: a filter in the receiver spreads a jump over a few."""
 
 Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What no vehicle does, and for how long it may be out of sight."""
+    """Greatest speed of a vehicle, and longest gap between its samples."""
 
     fastest_mps: float
     longest_gap_s: float
 
 
 def clean(trip: Trip, rules: Rules) -> list[Rows]:
-    """The samples that are believed, as row numbers for each time without a gap, of two samples at least.
+    """Return the row numbers of the samples that are kept, one array for each part without a long gap.
 
-    Raises ScenarioError, naming the vehicle, where so much is jumps that nothing should be believed.
+    Parts have at least two samples. Raise ScenarioError, naming the vehicle, if too many steps are jumps.
     """
     kept = _fresh(trip, rules)
     kept = kept[_without_jumps(trip, kept, rules)]
@@ -51,13 +52,13 @@ def clean(trip: Trip, rules: Rules) -> list[Rows]:
 
 
 def _fresh(trip: Trip, rules: Rules) -> Rows:
-    """All samples but those in which a moving receiver held its position."""
+    """Return the row numbers of all samples but those in which a moving receiver held its position."""
     time_s, position_m = trip.time_s, trip.position_m
     step_m = np.hypot(*np.diff(position_m, axis=0).T)
     moves = np.flatnonzero(step_m > 0)  # row m and row m + 1 differ
     first = np.concatenate([[0], moves[:-1] + 1]) if len(moves) else np.zeros(0, np.intp)
     step_s = time_s[moves + 1] - time_s[moves]
-    too_hard = step_m[moves] > HARDEST_MPS2 * step_s**2
+    too_hard = step_m[moves] > MAX_ACCELERATION_MPS2 * step_s**2
     bridged = time_s[moves + 1] - time_s[first] <= rules.longest_gap_s
     held = np.zeros(len(time_s), dtype=bool)
     for begin, end in zip(first[too_hard & bridged].tolist(), moves[too_hard & bridged].tolist(), strict=True):
@@ -66,24 +67,24 @@ def _fresh(trip: Trip, rules: Rules) -> Rows:
 
 
 def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
-    """Which of these rows belong to the largest set in which no step is a jump.
+    """Return the mask of the rows that belong to the largest set in which no step is a jump.
 
-    Between two jumps there is a run of samples. A chain leaves a run at its end, or a few samples before, and goes
-    on in a later one, at the first sample there that can be reached, or comes after the longest gap. The chain with
-    most samples wins.
+    Between two jumps there is a run of samples. A chain leaves a run at its end, or a few samples before, and
+    continues in a later run, at its first sample that can be reached or lies after a long gap. The chain with the
+    most samples is kept.
     """
     time_s, position_m = trip.time_s[rows], trip.position_m[rows]
     step_m = np.hypot(*np.diff(position_m, axis=0).T)
     jumps = np.flatnonzero(step_m > rules.fastest_mps * np.diff(time_s))
-    if len(jumps) > max(FEW_JUMPS, MOST_JUMPS * len(rows)):
+    if len(jumps) > max(ALWAYS_ALLOWED_JUMPS, MAX_JUMP_SHARE * len(rows)):
         raise ScenarioError(
             f"{trip.node_id}: {len(jumps)} of {len(rows) - 1} steps are faster than {rules.fastest_mps:g} m/s: "
-            "wrong units, degrees or metres, or several vehicles under one id?"
+            "check units, degrees or metres, and that each id is one vehicle"
         )
     runs = [_Run(start, end) for start, end in zip([0, *(jumps + 1)], [*(jumps + 1), len(rows)], strict=True)]
     for number, run in enumerate(runs):
-        for earlier in runs[max(0, number - FARTHEST_RUNS) : number]:
-            for last in range(earlier.end - 1, max(earlier.entry, earlier.end - 1 - FARTHEST_EXIT) - 1, -1):
+        for earlier in runs[max(0, number - MAX_SKIPPED_RUNS) : number]:
+            for last in range(earlier.end - 1, max(earlier.entry, earlier.end - 1 - MAX_SKIPPED_SAMPLES) - 1, -1):
                 run.follow(earlier, last, time_s, position_m, rules)
     kept = np.zeros(len(rows), dtype=bool)
     best = max(runs, key=lambda run: run.length)
@@ -96,9 +97,9 @@ def _without_jumps(trip: Trip, rows: Rows, rules: Rules) -> NDArray[np.bool_]:
 
 @dataclass(eq=False)
 class _Run:
-    """Samples [start, end) without a jump, and the best chain so far that goes on to their end.
+    """Samples [start, end) without a jump, and the best chain so far that continues to their end.
 
-    The chain has `length` samples; it enters here at `entry`, having left the run `before` after its sample `left`.
+    The chain has `length` samples. It enters this run at `entry`, after it left the run `before` at sample `left`.
     """
 
     start: int
@@ -112,7 +113,7 @@ class _Run:
         self.length, self.entry = self.end - self.start, self.start
 
     def follow(self, earlier: _Run, last: int, time_s: Array, position_m: Array, rules: Rules) -> None:
-        """Come from an earlier run's sample `last`, if that is better."""
+        """Enter from sample `last` of an earlier run if that makes the chain longer."""
         later_s = time_s[self.start : self.end] - time_s[last]
         away_m = np.hypot(*(position_m[self.start : self.end] - position_m[last]).T)
         reached = np.flatnonzero((away_m <= rules.fastest_mps * later_s) | (later_s > rules.longest_gap_s))

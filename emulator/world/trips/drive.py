@@ -1,4 +1,4 @@
-"""From `[network]` to motion: which reader reads the file, and what of it the run takes."""
+"""Motion of the vehicles of a `[network]`: choice of the file's reader, and selection of the run's part of it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from emulator.world.trips.clean import Rules
 from emulator.world.trips.fcd import drive_sumo, read_fcd
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
 from emulator.world.trips.matrices import read_npz
-from emulator.world.trips.motion import Frame, Motion, motion_of
+from emulator.world.trips.motion import Motion, Selection, motion_of
 from emulator.world.trips.samples import Samples
 from emulator.world.trips.tables import read_csv, read_parquet
 from vnet.errors import ScenarioError
@@ -22,11 +22,14 @@ from vnet.roads.road_map import RoadMap
 from vnet.units import NS_PER_S
 
 READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml": read_fcd}
-"""By the ending of the file's name."""
+"""Readers of trips by the ending of the file's name."""
 
 
 def drive(network: Network, periods: int, period_ns: int) -> Motion:
-    """How the vehicles of a network drive over so many periods. Raises ScenarioError, naming file and place."""
+    """Return the motion of a network's vehicles over `periods`.
+
+    Raise ScenarioError, naming the file and the line or row, for a bad file.
+    """
     path = network.path
     assert path is not None
     rules = Rules(network.fastest_mps, network.longest_gap_s)
@@ -44,7 +47,7 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     if start_s is None:
         start_s = min(float(trip.time_s[0]) for trip in trips)
     try:
-        motion = motion_of(trips, Frame(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
+        motion = motion_of(trips, Selection(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
     return replace(motion, origin_deg=samples.origin_deg)
@@ -53,9 +56,9 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
 def drive_through_city(
     network: Network, section: Map | None, periods: int, period_ns: int
 ) -> tuple[Motion, RoadMap]:
-    """Generated trips through a generated city, or through the map of `section`, and the lanes there are.
+    """Return generated trips through a generated city, or through the map of `section`, and the map's lanes.
 
-    Raises ScenarioError where the map cannot be read, or nobody can drive on it.
+    Raise ScenarioError if the map cannot be read, or no vehicle can drive on it.
     """
     if section is None:
         source: object = "the generated city"

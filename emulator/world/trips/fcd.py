@@ -1,8 +1,8 @@
-"""Trips that SUMO drives: its floating car data (`--fcd-output`), read as a stream; and SUMO itself.
+"""Trips from SUMO: its floating car data (`--fcd-output`), read as a stream, and runs of SUMO itself.
 
 An element `timestep` with `time` holds elements `vehicle` with `id`, `x`, `y`, `angle` (degrees clockwise from
-north) and `speed`. Positions are metres of SUMO's network, or degrees where it was told `--fcd-output.geo`, which
-its header says. SUMO means the middle of the front bumper.
+north) and `speed`. Positions are metres of SUMO's network, or degrees with `--fcd-output.geo`, which the header
+states. They are those of the middle of the front bumper.
 """
 
 from __future__ import annotations
@@ -24,17 +24,19 @@ from emulator.world.trips.tables import BATCH_ROWS
 from vnet.errors import ScenarioError, printable, shown
 
 _CHUNK_BYTES = 1 << 20
+"""Bytes that are parsed at once."""
 _GEO = re.compile(r'<fcd-output\.geo\s+value="(?:true|1|t)"')
 _EXPLAIN_LINES = 3
+"""Lines of SUMO's errors that are shown."""
 
 
 def read_fcd(path: Path, window_s: tuple[float, float] | None) -> Samples:
-    """The samples of an FCD file. Raises ScenarioError, with the line, for what is none."""
+    """Return the samples of an FCD file. Raise ScenarioError, naming the line, for a bad file."""
     return _Reader(path, window_s).read()
 
 
 class _Reader:
-    """Takes elements from the parser, and hands them on in batches."""
+    """Handlers for expat, which add the samples in batches."""
 
     def __init__(self, path: Path, window_s: tuple[float, float] | None) -> None:
         self._path = path
@@ -58,7 +60,7 @@ class _Reader:
                 self._parser.Parse(b"", True)
         except OSError as error:
             raise ScenarioError(f"{self._path}: cannot be read: {error.strerror}") from None
-        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter for encodings
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two for encodings
             raise ScenarioError(f"{self._path}: not an XML file: {error}") from None
         self._flush()
         return self._samples
@@ -113,9 +115,9 @@ class _Reader:
 
 
 def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
-    """Have SUMO drive a configuration from its beginning, at most until `end_s`; returns what it drove.
+    """Run SUMO on a configuration from its beginning, at most until `end_s`, and return the samples.
 
-    SUMO with the same files and seed drives the same. Raises ScenarioError if it is not installed, or fails.
+    The same files and seed give the same trips. Raise ScenarioError if SUMO is not installed, or fails.
     """
     with TemporaryDirectory(prefix="vnet-sumo-") as folder:
         output = Path(folder) / "fcd.xml"
@@ -128,16 +130,16 @@ def drive_sumo(path: Path, seed: int, end_s: float | None) -> Samples:
             raise ScenarioError(f"{path}: cannot start {command[0]}: {error.strerror}") from None
         if done.returncode or not output.exists():
             lines = [line for line in done.stderr.splitlines() if line.startswith("Error")] or [done.stderr.strip()]
-            said = " ".join(lines[:_EXPLAIN_LINES])
-            raise ScenarioError(f"{path}: SUMO failed (exit status {done.returncode}): {said}")
+            reason = " ".join(lines[:_EXPLAIN_LINES])
+            raise ScenarioError(f"{path}: SUMO failed (exit status {done.returncode}): {reason}")
         try:
             return read_fcd(output, None)
         except ScenarioError as error:
-            raise ScenarioError(f"{path}: what SUMO drove: {error}") from None
+            raise ScenarioError(f"{path}: output of SUMO: {error}") from None
 
 
 def _sumo(path: Path) -> str:
-    """The program: on the PATH, beside this Python (as the extra `sumo` puts it), or in SUMO_HOME."""
+    """Return the path of SUMO, found on the PATH, beside this Python (the extra `sumo`), or in SUMO_HOME."""
     folders = [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
     if home := os.environ.get("SUMO_HOME"):
         folders.append(str(Path(home) / "bin"))

@@ -1,4 +1,4 @@
-"""Trips as files that `[network] kind = "trips"` reads."""
+"""Writing trips as files that `[network] kind = "trips"` reads."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ ENDINGS = (".csv", ".parquet")
 
 
 def check_trips_name(path: Path) -> None:
-    """Raises ScenarioError unless a file of this name can be written."""
+    """Raise ScenarioError unless trips can be written in the format of this name."""
     if path.suffix.lower() not in ENDINGS:
         raise ScenarioError(f"{path}: trips are written as {' or '.join('*' + ending for ending in ENDINGS)}")
 
 
 def write_trips(motion: Motion, path: Path, rate_hz: float) -> int:
-    """Write where each vehicle is while it is there, in metres, vehicle by vehicle; returns how many samples.
+    """Write the positions of each vehicle while it is present, in metres, by vehicle; return the number of samples.
 
-    Raises ScenarioError.
+    Raise ScenarioError if the file cannot be written.
     """
     vehicle, period = np.nonzero(np.isfinite(motion.position_m[..., 0]).T)
     position_m = motion.position_m[period, vehicle]

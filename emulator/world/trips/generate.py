@@ -1,9 +1,10 @@
-"""Generated trips along a map: from anywhere to anywhere, in lanes, with bends, turns and stops.
+"""Generated trips along a map: random routes in lanes, with curves, turns and stops.
 
-Each vehicle is drawn from a stream of its own, so that one more changes nothing for the others. A route becomes the
-middle of a lane, corners become arcs, and speeds follow: what its streets allow, a lateral acceleration of
-`LATERAL_MPS2` in bends and turns, stops at some crossings, and `STARTING_MPS2` and `BRAKING_MPS2` between. Vehicles
-do not see each other. Some come from a parking lot beside the road, some enter late, and some leave early.
+Each vehicle is drawn from a random stream of its own, so one more changes nothing for the others. A route becomes
+the centre line of a lane, and its corners become arcs. Speeds are bounded by the streets' classes, by the lateral
+acceleration `LATERAL_MPS2` in curves and turns, by stops at some crossings, and by `STARTING_MPS2` and
+`BRAKING_MPS2` between them. Vehicles do not interact. Some start on a parking lot beside the road, some enter late,
+and some leave early.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from emulator.world.lateral import stray
+from emulator.world.lateral import lateral_offsets_m
 from emulator.world.maps.classes import VEHICLE_WIDTH_M
 from emulator.world.maps.roads import Ints, Roads
 from emulator.world.trips.motion import MOST_STATES, SHORTEST_STAY_S, Motion
@@ -22,27 +23,40 @@ from vnet.errors import ScenarioError
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
-LATERAL_MPS2, STARTING_MPS2, BRAKING_MPS2 = 2.5, 2.0, 2.5
+LATERAL_MPS2 = 2.5
+"""Greatest lateral acceleration in a curve: that of a brisk driver."""
+STARTING_MPS2 = 2.0
+"""Acceleration."""
+BRAKING_MPS2 = 2.5
+"""Deceleration."""
 SLOWEST_MPS = 1.5
-"""Through the tightest turn."""
+"""Speed in the tightest turn."""
 STOPS_AT = 0.3
-"""So many of the crossings make a vehicle stop, for `STOPPED_S` in the mean."""
+"""Probability of a stop at a crossing."""
 STOPPED_S, LONGEST_STOP_S = 8.0, 40.0
+"""Mean time of a stop beyond its first second, and longest stop."""
 PARKED, LATE, EARLY = 0.15, 0.2, 0.2
-"""Shares of vehicles that come from a parking lot, that enter during the run, and that leave during it."""
-PARKED_ASIDE_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
-STRAY_SIGMA_M, STRAY_TAU_S, NARROWEST_M = 0.3, 20.0, 0.3
+"""Shares of vehicles that start on a parking lot, that enter during the run, and that leave during it."""
+PARKED_OFFSET_M, PARKED_S = (7.0, 18.0), (5.0, 40.0)
+"""Ranges of a parking lot's distance from the lane, and of the time that a vehicle stays there."""
+LATERAL_SIGMA_M, LATERAL_TAU_S = 0.3, 20.0
+"""Standard deviation and time constant of the lateral offset in a lane."""
+MIN_HALF_WIDTH_M = 0.3
+"""Least bound of the lateral offset, in a lane hardly wider than the vehicle."""
 SLOWEST_SHARE, FASTEST_SHARE = 0.85, 1.05
-"""Of what is usual on a road."""
+"""Range of a vehicle's speed relative to the streets' free-flow speeds."""
 STEP_M, SMOOTH_STEPS = 1.0, 5
-"""A way is followed in steps of this length, over so many of which its last corners are rounded."""
+"""Distance between the points of a trajectory, and number of points over which it is smoothed."""
 CORNER_RAD, CORNER_M = 0.35, 8.0
-"""What turns by more is a corner, and is cut by an arc from so far before it to so far after it."""
+"""Least turn that is rounded by an arc, and distance of the arc's ends from the corner."""
 
 
 @dataclass(frozen=True)
 class Side:
-    """On which side of a road people drive, and how far right of their lane's middle, in the mean."""
+    """The side of a road on which people drive (`sign` 1: right, -1: left).
+
+    `aside_m` is their mean offset to the right of the lane's centre.
+    """
 
     sign: float
     aside_m: float = 0.0
@@ -54,9 +68,9 @@ RIGHT, LEFT = Side(1.0), Side(-1.0)
 def generate_motion(
     source: object, roads: Roads, vehicles: int, seed: int, periods: int, period_ns: int, side: Side = RIGHT
 ) -> Motion:
-    """How `vehicles` (v01, v02, …) drive through `roads` over so many periods, on which `side` of them.
+    """Return the motion of `vehicles` (v01, v02, …) through `roads` over `periods`, on this `side` of the roads.
 
-    Raises ScenarioError, naming `source`, if nobody drives there, or the truth does not fit into memory.
+    Raise ScenarioError, naming `source`, if no vehicle is present, or the truth does not fit into memory.
     """
     if vehicles * periods > MOST_STATES:
         raise ScenarioError(f"{vehicles} vehicles for {periods} periods: at most {MOST_STATES:,} states")
@@ -68,14 +82,16 @@ def generate_motion(
         states[:, number] = _Trip(network, rng, float(time_s[-1]), side).at(time_s)
     there = np.flatnonzero(np.isfinite(states[: periods - 1, :, 0]).any(axis=0))
     if not len(there):
-        raise ScenarioError(f"{source}: nobody drives there within {time_s[-1]:g} s: more vehicles, or for longer?")
+        raise ScenarioError(
+            f"{source}: no vehicle is present within {time_s[-1]:g} s; set more vehicles or a longer duration"
+        )
     width = len(str(vehicles))
     ids = tuple(f"v{number + 1:0{max(2, width)}d}" for number in there.tolist())
     return Motion(ids, states[:, there, :2], states[:, there, 2])
 
 
 class _Trip:
-    """One vehicle's way: `place_m` (S, 2) every metre, and when it is at each of them, `when_s` (S,)."""
+    """One vehicle's trajectory: points `point_m` (S, 2), and the times of arrival and departure there."""
 
     def __init__(self, network: Network, rng: np.random.Generator, duration_s: float, side: Side) -> None:
         self._rng = rng
@@ -83,32 +99,31 @@ class _Trip:
         enters_s = duration_s * rng.uniform(0, 0.5) * late
         stays_s = (duration_s - enters_s) * (rng.uniform(0.4, 0.9) if early else 1.0)
         self._leaves_s = max(enters_s + stays_s, enters_s + SHORTEST_STAY_S) if early else math.inf
-        way = network.route(rng, FASTEST_SHARE * stays_s)
-        edge = network.edge(way[:-1], way[1:])
+        route = network.route(rng, FASTEST_SHARE * stays_s)
+        edge = network.edge(route[:-1], route[1:])
         lane = _Lane(network, edge, int(rng.integers(16)), side)
-        line_m, speed_m_s, crossing = lane.line(way)
+        line_m, speed_m_s, crossing = lane.line(route)
         if parked:
             line_m, speed_m_s, crossing = _from_parking_lot(rng, line_m, speed_m_s, crossing, side.sign)
-        self._room_m = lane.room_m
+        self._half_width_m = lane.half_width_m
         self._follow(line_m, speed_m_s * rng.uniform(SLOWEST_SHARE, FASTEST_SHARE), crossing, parked, enters_s)
-        self._stray = rng.standard_normal
 
     def _follow(self, line_m: Array, speed_m_s: Array, crossing: Array, parked: bool, enters_s: float) -> None:
-        """Divide the line into steps, and work out when the vehicle is where."""
+        """Divide the line into steps, and compute the times of arrival and departure at each."""
         long_m = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))])
         along_m = np.arange(0, max(long_m[-1], 2 * STEP_M), STEP_M)
-        place = np.column_stack([np.interp(along_m, long_m, axis) for axis in line_m.T])
-        self.place_m = _smooth(place)
+        point_m = np.column_stack([np.interp(along_m, long_m, axis) for axis in line_m.T])
+        self.point_m = _smooth(point_m)
         of_line = np.minimum(np.searchsorted(long_m, along_m, side="right") - 1, len(speed_m_s) - 1)
-        limit = np.minimum(speed_m_s[of_line], _bend_speed_m_s(self.place_m))
+        max_m_s = np.minimum(speed_m_s[of_line], _curve_speed_m_s(self.point_m))
         stops = np.zeros(len(along_m))
         for at_m in long_m[np.flatnonzero(crossing)].tolist():
             if self._rng.random() < STOPS_AT:
                 stops[min(int(max(at_m - 3, 0) / STEP_M), len(stops) - 1)] = self._stopped_s()
         if parked:
             stops[0] = self._rng.uniform(*PARKED_S)
-        limit[stops > 0] = 0.0
-        speed = _reachable_m_s(limit)
+        max_m_s[stops > 0] = 0.0
+        speed = _reachable_m_s(max_m_s)
         took_s = STEP_M / np.maximum((speed[1:] + speed[:-1]) / 2, 0.25)
         self._arrives_s = enters_s + np.concatenate([[0], np.cumsum(took_s + stops[:-1])])
         self._departs_s = self._arrives_s + stops
@@ -117,31 +132,32 @@ class _Trip:
         return min(1.0 + self._rng.exponential(STOPPED_S), LONGEST_STOP_S)
 
     def at(self, time_s: Array) -> Array:
-        """Position and heading (K, 3) at these times, NaN where the vehicle is not there."""
+        """Return position and heading (K, 3) at these times; NaN while the vehicle is absent."""
         known_s = np.column_stack([self._arrives_s, self._departs_s]).ravel()
-        along = np.interp(time_s, known_s, np.repeat(np.arange(len(self.place_m), dtype=float), 2))
-        there = (time_s >= self._arrives_s[0]) & (time_s <= min(self._departs_s[-1], self._leaves_s))
-        before = np.minimum(along.astype(np.intp), len(self.place_m) - 2)
+        along = np.interp(time_s, known_s, np.repeat(np.arange(len(self.point_m), dtype=float), 2))
+        present = (time_s >= self._arrives_s[0]) & (time_s <= min(self._departs_s[-1], self._leaves_s))
+        before = np.minimum(along.astype(np.intp), len(self.point_m) - 2)
         part = (along - before)[:, None]
-        ahead = _headings(self.place_m)
+        ahead = _headings(self.point_m)
         heading = ahead[before] + part[:, 0] * np.diff(np.append(ahead, ahead[-1]))[before]
-        place = (1 - part) * self.place_m[before] + part * self.place_m[before + 1]
-        place += self._aside(time_s, along)[:, None] * np.column_stack([np.sin(heading), -np.cos(heading)])
-        state = np.column_stack([place, np.mod(heading, 2 * np.pi)])
-        state[~there] = np.nan
+        position_m = (1 - part) * self.point_m[before] + part * self.point_m[before + 1]
+        right = np.column_stack([np.sin(heading), -np.cos(heading)])
+        position_m += self._lateral_m(time_s, along)[:, None] * right
+        state = np.column_stack([position_m, np.mod(heading, 2 * np.pi)])
+        state[~present] = np.nan
         return state
 
-    def _aside(self, time_s: Array, along: Array) -> Array:
-        """How far right of the lane's middle: a process that stands still while the vehicle does."""
+    def _lateral_m(self, time_s: Array, along: Array) -> Array:
+        """Return the offsets (K,) right of the lane's centre: a process that is paused while the vehicle stands."""
         step_s = float(time_s[1] - time_s[0]) if len(time_s) > 1 else 1.0
         moves = np.concatenate([[0], np.cumsum(np.diff(along) > 0.02 * step_s)])
-        normal = self._stray(len(time_s))
-        offset = stray(normal, STRAY_SIGMA_M, math.exp(-step_s / STRAY_TAU_S), self._room_m)
+        normal = self._rng.standard_normal(len(time_s))
+        offset = lateral_offsets_m(normal, LATERAL_SIGMA_M, math.exp(-step_s / LATERAL_TAU_S), self._half_width_m)
         return np.asarray(offset[moves])
 
 
 class _Lane:
-    """The lane of a way: on each street the `number`-th from the right of those in its direction, if there is."""
+    """The lane of a route: on each street lane `number` from the right, modulo the lanes in this direction."""
 
     def __init__(self, network: Network, edge: Ints, number: int, side: Side) -> None:
         streets = network.streets
@@ -151,25 +167,25 @@ class _Lane:
         count = np.where(against, roads.backward[road], roads.forward[road])
         both = roads.forward[road] + roads.backward[road]
         width_m = roads.lane_width_m[road]
-        # The right-hand edge of the road is half its width off its line; lanes are counted from there.
+        # Lanes are counted from the road's edge, half its width from its centre line.
         from_right = np.minimum(number % np.maximum(count, 1), count - 1) + 0.5
-        self._aside_m = side.sign * (both / 2 - from_right) * width_m + side.aside_m
+        self._offset_m = side.sign * (both / 2 - from_right) * width_m + side.aside_m
         self._speed_m_s = streets.speed_m_s[edge]
-        self.room_m = max(float(((width_m - VEHICLE_WIDTH_M) / 2).min()), NARROWEST_M)
+        self.half_width_m = max(float(((width_m - VEHICLE_WIDTH_M) / 2).min()), MIN_HALF_WIDTH_M)
 
-    def line(self, way: Ints) -> tuple[Array, Array, Array]:
-        """The lane's middle (n, 2), the speed allowed from each point on, and which are before a crossing."""
-        node_m = self._node_m[way]
+    def line(self, route: Ints) -> tuple[Array, Array, Array]:
+        """Return the lane's centre line (n, 2), the speed from each point on, and a mask of points at crossings."""
+        node_m = self._node_m[route]
         step = np.diff(node_m, axis=0)
         length_m = np.maximum(np.hypot(*step.T), 1e-6)
         ahead = step / length_m[:, None]
         right = np.column_stack([ahead[:, 1], -ahead[:, 0]])
-        start = node_m[:-1] + self._aside_m[:, None] * right
-        end = node_m[1:] + self._aside_m[:, None] * right
+        start = node_m[:-1] + self._offset_m[:, None] * right
+        end = node_m[1:] + self._offset_m[:, None] * right
         heading = np.arctan2(ahead[:, 1], ahead[:, 0])
         turn = np.abs(np.mod(np.diff(heading) + np.pi, 2 * np.pi) - np.pi)
         points, speed, crossing = [start[:1]], [self._speed_m_s[0]], [False]
-        is_crossing = self._network.is_crossing[way[1:-1]]
+        is_crossing = self._network.is_crossing[route[1:-1]]
         for k in range(len(turn)):
             if turn[k] > CORNER_RAD:
                 cut = min(CORNER_M, 0.45 * length_m[k], 0.45 * length_m[k + 1])
@@ -184,7 +200,7 @@ class _Lane:
 
 
 def _arc(start: Array, ahead: Array, end: Array, then: Array) -> Array:
-    """A quadratic Bézier curve (7, 2) from `start` to `end`, which leave and arrive in these directions."""
+    """Return a quadratic Bézier curve (7, 2) from `start` in direction `ahead` to `end` in direction `then`."""
     between = end - start
     cross = ahead[0] * then[1] - ahead[1] * then[0]
     reach = (between[0] * then[1] - between[1] * then[0]) / cross if abs(cross) > 0.05 else -1.0
@@ -196,12 +212,12 @@ def _arc(start: Array, ahead: Array, end: Array, then: Array) -> Array:
 def _from_parking_lot(
     rng: np.random.Generator, line_m: Array, speed_m_s: Array, crossing: Array, sign: float
 ) -> tuple[Array, Array, Array]:
-    """The line, with a way to its start from a place beside the road: on the right if `sign` is 1, left if -1."""
+    """Return the line with a path to its start from a parking lot: on the right if `sign` is 1, left if -1."""
     ahead = line_m[1] - line_m[0]
     ahead /= max(float(np.hypot(*ahead)), 1e-6)
     right = sign * np.array([ahead[1], -ahead[0]])
-    aside_m = rng.uniform(*PARKED_ASIDE_M)
-    lot = line_m[0] + aside_m * right - 10.0 * ahead
+    offset_m = rng.uniform(*PARKED_OFFSET_M)
+    lot = line_m[0] + offset_m * right - 10.0 * ahead
     arc = _arc(lot, -right, line_m[0], ahead)
     return (
         np.concatenate([arc[:-1], line_m]),
@@ -210,32 +226,32 @@ def _from_parking_lot(
     )
 
 
-def _smooth(place_m: Array) -> Array:
-    """Means (S, 2) over `SMOOTH_STEPS` steps; both ends stay."""
-    if len(place_m) <= SMOOTH_STEPS:
-        return place_m
+def _smooth(point_m: Array) -> Array:
+    """Return moving averages (S, 2) over `SMOOTH_STEPS` points; both ends stay."""
+    if len(point_m) <= SMOOTH_STEPS:
+        return point_m
     half = SMOOTH_STEPS // 2
-    smooth = place_m.copy()
-    total = np.cumsum(np.concatenate([np.zeros((1, 2)), place_m]), axis=0)
+    smooth = point_m.copy()
+    total = np.cumsum(np.concatenate([np.zeros((1, 2)), point_m]), axis=0)
     smooth[half:-half] = (total[SMOOTH_STEPS:] - total[:-SMOOTH_STEPS]) / SMOOTH_STEPS
     return smooth
 
 
-def _headings(place_m: Array) -> Array:
-    """Unwound headings (S,) along a line, from the points before and after each."""
-    step = np.gradient(place_m, axis=0)
+def _headings(point_m: Array) -> Array:
+    """Return unwrapped headings (S,) along a line, from the points before and after each."""
+    step = np.gradient(point_m, axis=0)
     return np.asarray(np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
 
 
-def _bend_speed_m_s(place_m: Array) -> Array:
-    """What the bends of a line (S, 2) allow at each of its points."""
-    curvature = np.abs(np.gradient(_headings(place_m))) / STEP_M
+def _curve_speed_m_s(point_m: Array) -> Array:
+    """Return the speeds (S,) at which a line (S, 2) is driven with a lateral acceleration of `LATERAL_MPS2`."""
+    curvature = np.abs(np.gradient(_headings(point_m))) / STEP_M
     return np.maximum(np.sqrt(LATERAL_MPS2 / np.maximum(curvature, 1e-6)), SLOWEST_MPS)
 
 
-def _reachable_m_s(limit: Array) -> Array:
-    """Speeds (S,) within limits, with what a vehicle can do from one step to the next. It comes at speed."""
-    square = (limit**2).tolist()
+def _reachable_m_s(max_m_s: Array) -> Array:
+    """Return the highest speeds (S,) below `max_m_s` that acceleration and deceleration allow."""
+    square = (max_m_s**2).tolist()
     for k in range(1, len(square)):
         square[k] = min(square[k], square[k - 1] + 2 * STARTING_MPS2 * STEP_M)
     for k in range(len(square) - 2, -1, -1):

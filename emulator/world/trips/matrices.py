@@ -1,7 +1,7 @@
-"""Trips from matrices: NPZ with `lat_deg`, `lon_deg` or `x_m`, `y_m` (N, K), a vehicle a row, and `rate_hz`.
+"""Trips from matrices: NPZ with `lat_deg`, `lon_deg` or `x_m`, `y_m` (N, K), a row for each vehicle, and `rate_hz`.
 
-Column k is the time k / rate_hz. NaN in both is: not there. `id` (N,), `heading_rad` and `speed_mps` (N, K) may be
-given; without ids vehicles are v1, v2, …, with zeros in front so that they sort.
+Column k is the time k / rate_hz. A vehicle is absent where both coordinates are NaN. `id` (N,), `heading_rad` and
+`speed_mps` (N, K) are optional; without ids vehicles are v1, v2, …, padded with zeros so that they sort.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from vnet.errors import ScenarioError, printable
 from vnet.types import Array
 
 _LARGEST_BYTES = 8 * MOST_SAMPLES + (1 << 20)
-"""Of one array."""
+"""Largest array that is read."""
 
 
 def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
-    """The samples of an NPZ file; rows, which are vehicles, are counted from 1. Raises ScenarioError."""
+    """Return the samples of an NPZ file. Raise ScenarioError, naming the array or the row, for a bad file."""
     arrays = _load(path)
     where = METRES if set(METRES) <= arrays.keys() else DEGREES
     for name in (*where, "rate_hz"):
@@ -41,12 +41,12 @@ def read_npz(path: Path, window_s: tuple[float, float] | None) -> Samples:
             raise ScenarioError(f"{path}: {name} is {arrays[name].shape}, and {where[0]} {(count, length)}")
     samples = Samples(path, "row", window_s)
     for row, node_id in enumerate(_ids(path, arrays, count)):
-        there = ~(np.isnan(first[row]) & np.isnan(second[row]))
-        if not there.any():
+        present = ~(np.isnan(first[row]) & np.isnan(second[row]))
+        if not present.any():
             continue
-        values = {"time_s": time_s[there], **{name: arrays[name][row, there] for name in columns}}
-        place = np.full(int(there.sum()), row + 1)
-        samples.add(pa.array([node_id]).take(pa.array(np.zeros(len(place), np.int64))), place, values)
+        values = {"time_s": time_s[present], **{name: arrays[name][row, present] for name in columns}}
+        row_number = np.full(int(present.sum()), row + 1)
+        samples.add(pa.array([node_id]).take(pa.array(np.zeros(len(row_number), np.int64))), row_number, values)
     return samples
 
 

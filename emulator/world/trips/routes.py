@@ -1,4 +1,4 @@
-"""Ways through a map: which streets lead where, in the direction in which one may drive them."""
+"""Routes through a map: its directed graph of streets, and random routes on it."""
 
 from __future__ import annotations
 
@@ -26,16 +26,20 @@ SPEED_M_S = {
     "crossing": 8.0,
     "road": 12.0,
 }
-"""What people drive where nothing is in the way."""
+"""Free-flow speeds by road class."""
 LINK_SHARE = 0.7
-"""On ramps, of the speed of the road that they belong to."""
+"""Speed on a ramp relative to the road that it belongs to."""
 TRIES = 8
-"""So many destinations are tried for one that does not begin with turning round."""
+"""Destinations that are tried to find one that can be reached without a U-turn."""
 
 
 @dataclass(frozen=True)
 class Streets:
-    """E directed edges between points of `roads`, each (E,): `start`, `end`, its `road`, and 1 if `against` it."""
+    """E directed edges between points of `roads`; arrays (E,).
+
+    `start` and `end` are points, `road` the edge's road, and `against` is 1 for an edge against the road's
+    direction.
+    """
 
     roads: Roads
     start: Ints
@@ -47,71 +51,72 @@ class Streets:
 
 
 class Network:
-    """Where one gets from where: the largest part of a map in which every place leads to every other."""
+    """The largest strongly connected component of a map's streets."""
 
     def __init__(self, source: object, roads: Roads) -> None:
-        """Raises ScenarioError, naming `source`, where no two places lead to each other."""
+        """Find the component. Raise ScenarioError, naming `source`, if it has fewer than two points."""
         self.streets = streets = _streets(roads)
         count = len(roads.node_m)
         graph = csr_matrix((streets.time_s, (streets.start, streets.end)), shape=(count, count))
         _, label = connected_components(graph, connection="strong")
         best = int(np.argmax(np.bincount(label)))
-        self._place = np.flatnonzero(label == best)
+        members = np.flatnonzero(label == best)
         neighbours = np.unique(np.sort(np.column_stack([streets.start, streets.end]), axis=1), axis=0)
         self.is_crossing = np.bincount(neighbours.ravel(), minlength=count) > 2
-        if len(self._place) < 2:
-            raise ScenarioError(f"{source}: no two places on its roads between which one can drive there and back")
+        if len(members) < 2:
+            raise ScenarioError(f"{source}: no two points of its roads can be reached from each other")
         inside = (label[streets.start] == best) & (label[streets.end] == best)
         self._graph = csr_matrix(
             (streets.time_s[inside], (streets.start[inside], streets.end[inside])), shape=(count, count)
         )
-        on = self._place[self.is_crossing[self._place]]
-        self._places = on if len(on) else self._place  # where one can go on without turning round
+        crossings = members[self.is_crossing[members]]
+        self._destinations = crossings if len(crossings) else members  # at crossings no U-turn is needed
         self._key = streets.start * count + streets.end  # ascending
         self._count = count
         self._starts = np.flatnonzero(inside)
-        long = np.cumsum(roads_length_m(streets)[self._starts])
-        self._starts_by_length = long / long[-1]
+        sum_m = np.cumsum(edge_lengths_m(streets)[self._starts])
+        self._starts_by_length = sum_m / sum_m[-1]
 
     def edge(self, start: Ints, end: Ints) -> Ints:
-        """The edges (n,) between points that follow each other."""
+        """Return the edges (n,) between points `start` and `end` (n,)."""
         return np.asarray(np.searchsorted(self._key, start * self._count + end))
 
     def route(self, rng: np.random.Generator, least_s: float) -> Ints:
-        """Points (n,) of a way from somewhere to anywhere, and on from there, until it takes `least_s` at least.
+        """Return the points (n,) of a random route that takes at least `least_s`.
 
-        It starts anywhere, and does not turn round on the way: where it cannot but turn round, it ends.
+        It begins at a random edge and joins fastest paths to random destinations, without U-turns. It ends early
+        where only a U-turn remains.
         """
         for _ in range(TRIES):
             first = self._starts[np.searchsorted(self._starts_by_length, rng.random())]
-            way = [int(self.streets.start[first]), int(self.streets.end[first])]
-            if self._ahead(way):
+            route = [int(self.streets.start[first]), int(self.streets.end[first])]
+            if self._ahead(route):
                 break
         taken_s = float(self.streets.time_s[first])
-        while taken_s < least_s and (ahead := self._ahead(way)):
-            time_s, before = dijkstra(self._graph, indices=way[-1], return_predecessors=True)
-            places = self._places[rng.integers(len(self._places), size=TRIES)].tolist()
-            legs = (_leg(before, way[-1], place) for place in places)
-            leg = next((leg for leg in legs if leg and leg[0] != way[-2]), None)
-            leg = leg or [ahead[rng.integers(len(ahead))]]  # all ways lead back: round the next corner, then
-            way += leg
+        while taken_s < least_s and (ahead := self._ahead(route)):
+            time_s, before = dijkstra(self._graph, indices=route[-1], return_predecessors=True)
+            destinations = self._destinations[rng.integers(len(self._destinations), size=TRIES)].tolist()
+            legs = (_leg(before, route[-1], destination) for destination in destinations)
+            leg = next((leg for leg in legs if leg and leg[0] != route[-2]), None)
+            leg = leg or [ahead[rng.integers(len(ahead))]]  # every path begins with a U-turn: go on to a neighbour
+            route += leg
             taken_s += float(time_s[leg[-1]])
-        return np.array(way, dtype=np.intp)
+        return np.array(route, dtype=np.intp)
 
-    def _ahead(self, way: list[int]) -> list[int]:
-        """Where one can go on at the end of a way without turning round."""
-        row = slice(*self._graph.indptr[way[-1] : way[-1] + 2])
-        return [place for place in self._graph.indices[row].tolist() if place != way[-2]]
+    def _ahead(self, route: list[int]) -> list[int]:
+        """Return the points that follow the end of a route without a U-turn."""
+        row = slice(*self._graph.indptr[route[-1] : route[-1] + 2])
+        return [point for point in self._graph.indices[row].tolist() if point != route[-2]]
 
 
-def roads_length_m(streets: Streets) -> Array:
-    """Lengths (E,) of the edges."""
+def edge_lengths_m(streets: Streets) -> Array:
+    """Return the lengths (E,) of the edges."""
     node_m = streets.roads.node_m
     return np.asarray(np.hypot(*(node_m[streets.end] - node_m[streets.start]).T))
 
 
 def _streets(roads: Roads) -> Streets:
-    """All edges, of several between the same two points the fastest; in ascending order of their points."""
+    """Return all edges in ascending order of their points; of several between two points only the fastest."""
     entry = roads.segment
     road = roads.road_of[entry]
     speed = np.array([_speed_m_s(name) for name in NAMES])[roads.kind[road]]
@@ -134,7 +139,7 @@ def _speed_m_s(name: str) -> float:
 
 
 def _leg(before: Ints, start: int, end: int) -> list[int]:
-    """The points after `start` up to `end`, from the points before each."""
+    """Return the points after `start` up to `end`; `before` (N,) are predecessors on the fastest paths."""
     found = []
     while end != start and end >= 0:
         found.append(end)

@@ -1,6 +1,6 @@
 """Trips from tables: CSV and Parquet with the columns id, time_s and x_m, y_m or lat_deg, lon_deg.
 
-Further columns `heading_rad` and `speed_mps` are used, others are not looked at. Files are read batch by batch.
+The columns `heading_rad` and `speed_mps` are optional; others are ignored. Files are read in batches.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from emulator.world.trips.samples import DEGREES, METRES, OPTIONAL, Samples
 from vnet.errors import ScenarioError, printable
 
 _LONGEST_LINE = 100_000
+"""Characters of the header line."""
 BATCH_ROWS = 1 << 16
+"""Rows that are read at once."""
 
 
 def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
-    """The samples of a CSV file; rows are counted from the header, which is row 1. Raises ScenarioError."""
+    """Return the samples of a CSV file. Raise ScenarioError, naming the row (the header is 1), for a bad file."""
     with open_csv(path, _LONGEST_LINE) as lines:
         columns = choose_columns(path, next(csv.reader(lines), []))
     types = {name: pa.string() if name == "id" else pa.float64() for name in columns}
@@ -31,7 +33,7 @@ def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
         column_types=types, include_columns=columns, null_values=[], strings_can_be_null=False
     )
     try:
-        # In one thread it knows in which row something is wrong.
+        # With one thread pyarrow's errors name the row.
         reader = pacsv.open_csv(path, pacsv.ReadOptions(use_threads=False), convert_options=convert)
         return _collect(path, reader, columns, first_row=2, window_s=window_s)
     except (OSError, pa.ArrowInvalid) as error:
@@ -39,7 +41,7 @@ def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
 
 
 def read_parquet(path: Path, window_s: tuple[float, float] | None) -> Samples:
-    """The samples of a Parquet file; rows are counted from 1. Raises ScenarioError."""
+    """Return the samples of a Parquet file. Raise ScenarioError, naming the row (from 1), for a bad file."""
     try:
         with pq.ParquetFile(path) as file:
             columns = choose_columns(path, file.schema_arrow.names)
@@ -50,9 +52,9 @@ def read_parquet(path: Path, window_s: tuple[float, float] | None) -> Samples:
 
 
 def choose_columns(path: Path, names: Sequence[str]) -> list[str]:
-    """Which of a file's columns are read: id, time_s, one way of saying where, and what else is of use.
+    """Return the columns of a file that are read: id, time_s, positions in metres or degrees, and optional ones.
 
-    Raises ScenarioError where one is missing, or there twice.
+    Raise ScenarioError if one is missing, or appears twice.
     """
     where = METRES if set(METRES) <= set(names) else DEGREES
     for name in ("id", "time_s", *where):
@@ -77,7 +79,7 @@ def _collect(
     samples = Samples(path, "row", window_s)
     for batch in batches:
         numbers = {name: batch[name].cast(pa.float64()) for name in columns[1:]}
-        place = first_row + samples.taken + np.arange(len(batch), dtype=np.int64)
+        row = first_row + samples.taken + np.arange(len(batch), dtype=np.int64)
         values = {name: np.asarray(column.to_numpy(zero_copy_only=False)) for name, column in numbers.items()}
-        samples.add(batch["id"].cast(pa.string()), place, values)
+        samples.add(batch["id"].cast(pa.string()), row, values)
     return samples

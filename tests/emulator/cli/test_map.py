@@ -74,7 +74,7 @@ def test_what_cannot_be_is_said(
 
 def test_a_file_that_cannot_be_written_is_known_before_the_map_is_read(tmp_path: Path) -> None:
     status, text = vnet_map("convert", tmp_path / "none.npz", tmp_path / "town.shp")
-    assert status == 2 and "town.shp: no kind of map is called so; allowed are *.geojson" in text
+    assert status == 2 and "town.shp: unknown map format; allowed are *.geojson" in text
 
 
 def test_problems_of_a_map_are_found() -> None:
@@ -88,8 +88,8 @@ def test_problems_of_a_map_are_found() -> None:
     for line in lines:
         builder.add("road", [(point, point) for point in line], 0, (1, 1), 3.0)
     builder.add("road", [(1, (0.0, 0.0)), (2, (0.0, 0.0))], 0, (1, 1), 3.0)  # two points at one place
-    found = examine(builder.build(builder.places(), None)).problems
-    assert found["segments under another"] == "1"
+    found = examine(builder.build(builder.coordinates(), None)).problems
+    assert found["duplicate segments"] == "1"
     assert found["segments without length"] == "1"
     assert found["isolated pieces"].startswith("3, 0.3 km") or found["isolated pieces"].startswith("3, ")
     assert any(what.startswith("ends within 1 m") for what in found)
@@ -99,4 +99,4 @@ def test_a_map_without_problems_has_none() -> None:
     builder = RoadsBuilder("ring")
     ring = [(100 * float(np.cos(a)), 100 * float(np.sin(a))) for a in np.linspace(0, 6, 20)]
     builder.add("ring", [(point, point) for point in [*ring, ring[0]]], 0, (1, 1), 3.0)
-    assert examine(builder.build(builder.places(), None)).problems == {}
+    assert examine(builder.build(builder.coordinates(), None)).problems == {}

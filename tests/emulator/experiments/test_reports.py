@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.experiments import figures, reports
-from emulator.experiments.paper import ALPHAS, NETWORKS, load_positions
+from emulator.experiments import network_figures, reports, result_figures
+from emulator.experiments.paper import ALPHAS, load_positions
 from emulator.experiments.tables import with_error
+from emulator.records.paper_values import PAPER_VEHICLES
 
 NETWORK = {"N3": load_positions({"kind": "generated", "vehicles": 24})}
 LONELY = {"one": (np.zeros((1, 2)), np.zeros(1)), "apart": (np.array([[0.0, 0.0], [9e4, 0.0]]), np.zeros(2))}
@@ -23,7 +24,9 @@ def is_picture(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("networks", [NETWORK, LONELY])
-@pytest.mark.parametrize("draw", [figures.degree_histogram, figures.road_angle_histogram, figures.graphs])
+@pytest.mark.parametrize(
+    "draw", [network_figures.degree_histogram, network_figures.road_angle_histogram, network_figures.graphs]
+)
 def test_networks_are_drawn_also_without_edges(tmp_path: Path, draw, networks) -> None:  # type: ignore[no-untyped-def]
     assert is_picture(draw(networks, tmp_path / "picture"))
 
@@ -43,7 +46,9 @@ def series(seed: int, missing: bool = False) -> pa.Table:
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_time_courses_are_drawn_for_one_seed_or_many(tmp_path: Path, seeds: int) -> None:
     found = {name: [series(s, missing=name == "none") for s in range(seeds)] for name in ("optimized", "none")}
-    assert is_picture(figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72}))
+    assert is_picture(
+        result_figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72})
+    )
 
 
 def table1_results() -> list[dict[str, object]]:
@@ -61,7 +66,7 @@ def test_table_one_says_where_the_minimum_is_and_how_far_below_optimized_weights
     text = reports.table1(table1_results())
     assert "smallest at α = 0.5 and largest at α = 0.95" in text
     assert "0.50 ± 0.00 times that of the best constant" in text
-    assert is_picture(figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
+    assert is_picture(result_figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
 
 
 def test_one_seed_has_no_standard_error(tmp_path: Path) -> None:
@@ -74,7 +79,7 @@ def test_one_seed_has_no_standard_error(tmp_path: Path) -> None:
 def test_table_two_puts_the_papers_figures_beside() -> None:
     rows = [
         {"network": n, "sides": sides, "mechanism": m, "seed": 1, "stacked_rmse_m": value, "rmse_m": value}
-        for n in NETWORKS
+        for n in PAPER_VEHICLES
         for sides in (1, 2)
         for m, value in {"centralized": 0.1, "optimized": 0.2, "random": 0.6, "none": 0.9}.items()
     ]
@@ -85,8 +90,8 @@ def test_table_two_puts_the_papers_figures_beside() -> None:
 def test_ratios_to_the_limit_are_drawn(tmp_path: Path) -> None:
     rows = [
         {"network": n, "mechanism": m, "seed": s, "rmse_m": value * s}
-        for n in NETWORKS
+        for n in PAPER_VEHICLES
         for m, value in {"limit": 0.2, "optimized": 0.21, "none": 0.5}.items()
         for s in (1, 2)
     ]
-    assert is_picture(figures.ratio_bars(rows, tmp_path / "ratios"))
+    assert is_picture(result_figures.ratio_bars(rows, tmp_path / "ratios"))

@@ -412,7 +412,7 @@ def windows(before_horizon: ReactiveControl | LimericControl, *ratios: float, fi
 
 def pause_ms(before_horizon: ReactiveControl | LimericControl) -> int:
     """For how long the first sender must pause, if the channel stays as it is."""
-    before_horizon.sends(0, 0, 448_000)
+    before_horizon.record_transmission(0, 0, 448_000)
     return next(ms for ms in range(2000) if before_horizon.next_poll_ns(0, ms * MS) == ms * MS)
 
 
@@ -430,7 +430,7 @@ def test_the_reactive_states_are_reached_one_after_the_other() -> None:
 
 def test_who_is_held_back_asks_again_after_its_next_window() -> None:
     before_horizon = ReactiveControl(EtsiReactive(kind="etsi", pause_ms=(1000,) * 5), BusyRatioMeter(1, 1))
-    before_horizon.sends(0, 0, 448_000)
+    before_horizon.record_transmission(0, 0, 448_000)
     asks_ns = [0]
     while (next_ns := before_horizon.next_poll_ns(0, asks_ns[-1])) > asks_ns[-1]:
         asks_ns.append(next_ns)

@@ -111,7 +111,7 @@ def test_what_sumo_reads_belongs_to_the_run(tmp_path: Path, sumo: Path) -> None:
             "status 1): Error: No such file",
         ),
         (None, "", 0, "SUMO failed (exit status 0)"),
-        (FCD[:300], "", 0, "what SUMO drove: "),
+        (FCD[:300], "", 0, "output of SUMO: "),
         ("<fcd-export/>", "", 0, "no samples"),
     ],
 )

@@ -277,5 +277,5 @@ def test_the_dense_scenario_exercises_the_cap() -> None:
 
 def test_an_exception_for_a_vehicle_that_is_not_there_is_refused() -> None:
     program = {"exceptions": [{"nodes": ["nobody"], "entry": "agents.beacon:main"}]}
-    with pytest.raises(ScenarioError, match="'nobody' is no vehicle of the network; they are "):
+    with pytest.raises(ScenarioError, match="'nobody': no such vehicle; the network has "):
         build_world(Scenario.model_validate({"network": {"vehicles": 3}, "program": program}))

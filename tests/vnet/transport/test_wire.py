@@ -125,8 +125,8 @@ def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
 
 @pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_report])
 def test_what_is_too_large_is_not_even_decoded(decode: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wire, "LARGEST_SAID_BYTES", 10)
-    with pytest.raises(WireError, match="11 bytes at once: at most 10 are read"):
+    monkeypatch.setattr(wire, "LARGEST_MESSAGE_BYTES", 10)
+    with pytest.raises(WireError, match="message of 11 bytes: at most 10 allowed"):
         decode(bytes(11))  # type: ignore[operator]
 
 

@@ -89,7 +89,7 @@ def test_an_origin_that_is_far_away(tmp_path: Path, kind: str) -> None:
 
 
 def test_a_map_of_more_points_than_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roads_module, "MOST_POINTS", 4)
+    monkeypatch.setattr(roads_module, "MAX_POINTS", 4)
     said = refusal(write(tmp_path, "town.osm", maps.osm_xml()))
     assert said == "way 11: more than 4 points; cut out a part first"
 
@@ -173,11 +173,11 @@ BAD_GEOJSON = {
         lines(maps.line([HERE, [-83.72, 42.28]]), maps.line([HERE[::-1], THERE[::-1]])),
         "feature 2: 9,341 km",
     ),
-    "one point": (lines(maps.line([HERE])), "feature 1: its coordinates are no line"),
-    "a point of one number": (lines(maps.line([HERE, [1.0]])), "feature 1: its coordinates are no line"),
-    "text": (lines(maps.line([HERE, ["-83.7", "42"]])), "feature 1: its coordinates are no line"),
-    "null": (lines(maps.line([HERE, [None, 42.0]])), "feature 1: its coordinates are no line"),
-    "a number without end": (lines(maps.line([HERE, [10**400, 42]])), "feature 1: its coordinates are no line"),
+    "one point": (lines(maps.line([HERE])), "feature 1: its coordinates are not a line"),
+    "a point of one number": (lines(maps.line([HERE, [1.0]])), "feature 1: its coordinates are not a line"),
+    "text": (lines(maps.line([HERE, ["-83.7", "42"]])), "feature 1: its coordinates are not a line"),
+    "null": (lines(maps.line([HERE, [None, 42.0]])), "feature 1: its coordinates are not a line"),
+    "a number without end": (lines(maps.line([HERE, [10**400, 42]])), "feature 1: its coordinates are not a line"),
     "NaN": (lines(maps.line([HERE, [float("nan"), 42.0]])), "not a GeoJSON feature collection: "),
     "no length": (maps.collection(maps.line([HERE, HERE])), "no roads"),
     "a class": (
@@ -254,7 +254,7 @@ def test_a_wrong_network_of_sumo(tmp_path: Path, name: str) -> None:
 
 def test_an_origin_for_a_network_that_does_not_say_where_it_is(tmp_path: Path) -> None:
     said = refusal(write(tmp_path, "town.net.xml", maps.sumo_net()), maps.ORIGIN)
-    assert said == "does not say where on the earth its metres are; leave out the origin"
+    assert said == "states no projection of its metres; leave out the origin"
 
 
 # Nodes and edges.
@@ -350,6 +350,6 @@ def test_arrays_that_are_not_what_they_say(tmp_path: Path, write_member: Callabl
 
 def test_geojson_of_a_map_that_is_nowhere(tmp_path: Path) -> None:
     roads = read_roads(write(tmp_path, "town.net.xml", maps.sumo_net()))
-    with pytest.raises(ScenarioError, match="nothing says where on the earth this map is"):
+    with pytest.raises(ScenarioError, match="the projection of this map is unknown"):
         write_roads(roads, tmp_path / "town.geojson")
     assert not (tmp_path / "town.geojson").exists()

@@ -124,7 +124,7 @@ def test_people_drive_on_their_side_of_the_road_and_park_there(tmp_path: Path, s
 
 
 def test_where_nobody_drives_it_is_said(city: Roads) -> None:
-    with pytest.raises(ScenarioError, match="the city: nobody drives there within 0 s"):
+    with pytest.raises(ScenarioError, match="the city: no vehicle is present within 0 s"):
         drives(city, vehicles=3, periods=1)
 
 

@@ -117,7 +117,7 @@ def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> 
 
 
 def test_a_map_of_somewhere_else_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match=r"cross\.geojson: most of what vehicles drive is over 100 m") as error:
+    with pytest.raises(ScenarioError, match=r"cross\.geojson: most positions of vehicles are over 100 m") as error:
         build_world(driving(tmp_path, origin_deg=[42.9, -83.0]))
     assert "\n" not in str(error.value)
 

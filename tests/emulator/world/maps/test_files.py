@@ -161,7 +161,7 @@ def test_properties_of_lines_of_our_own(tmp_path: Path) -> None:
     assert roads.forward.tolist() == [2, 1, 1, 1, 2] and roads.backward.tolist() == [0, 0, 1, 1, 0]
     assert roads.lane_width_m[:2].tolist() == [2.5, 3.5] and len(roads.node_m) == 2
     assert roads.node[-2:].tolist() == [1, 0]
-    assert roads.notes == {"features that are no lines": 2, "ways not for cars": 1}
+    assert roads.notes == {"features that are not lines": 2, "ways not for cars": 1}
 
 
 def test_lines_meet_where_their_points_agree_to_a_centimetre(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ def roads(*lines: Any) -> Roads:
     builder = RoadsBuilder("town")
     for number, (points, lanes) in enumerate(lines):
         builder.add(f"road {number}", [(point, point) for point in points], NUMBER["primary"], lanes, 3.0)
-    return builder.build(builder.places(), None)
+    return builder.build(builder.coordinates(), None)
 
 
 def ends(found: Any, lane: int) -> list[tuple[float, ...]]:
@@ -69,7 +69,7 @@ def test_points_at_one_place_make_no_segment() -> None:
     builder = RoadsBuilder("town")
     points = [(1, (0.0, 0.0)), (2, (50.0, 0.0)), (3, (50.0, 0.0)), (4, (100.0, 0.0))]
     builder.add("road", points, 0, (1, 0), 3.0)
-    found = builder.build(builder.places(), None).lane_map()
+    found = builder.build(builder.coordinates(), None).lane_map()
     assert found.point_m.tolist() == [[0, 0], [50, 0]] and found.length_m.tolist() == [50, 50]
 
 

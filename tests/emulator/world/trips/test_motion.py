@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from emulator.world.trips.clean import Rules, clean
-from emulator.world.trips.motion import Frame, Motion, motion_of
+from emulator.world.trips.motion import Motion, Selection, motion_of
 from emulator.world.trips.samples import Trip
 from vnet.errors import ScenarioError
 
@@ -27,7 +27,7 @@ def trip(
 
 def drive(*trips: Trip, seconds: float = 10.0, start_s: float = 0.0, **frame: object) -> Motion:
     periods = round(seconds * 10) + 1
-    return motion_of(list(trips), Frame(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
+    return motion_of(list(trips), Selection(start_s, periods, TENTH_NS, **frame), RULES)  # type: ignore[arg-type]
 
 
 def x_of(course: Motion, vehicle: int = 0) -> np.ndarray:
@@ -111,7 +111,7 @@ def test_a_jump_too_far_for_the_longest_gap_is_leaving_and_entering() -> None:
 
 def test_what_is_mostly_jumps_is_no_trip() -> None:
     rng = np.random.default_rng(1)
-    with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: wrong units"):
+    with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: check units"):
         drive(trip(np.arange(100) / 10, rng.uniform(0, 1e4, 100)))
 
 
@@ -165,9 +165,9 @@ def test_the_run_begins_where_it_is_told_to() -> None:
 def test_who_is_there_for_less_than_a_second_takes_no_part() -> None:
     course = drive(trip([0, 10], [0, 10]), trip([4, 4.8], [0, 1], name="b"), trip([9.5, 20], [0, 9], name="c"))
     assert course.node_ids == ("a",)
-    with pytest.raises(ScenarioError, match="no vehicle is there for 1 s of 10 s from 0 s"):
+    with pytest.raises(ScenarioError, match="no vehicle is present for 1 s of the 10 s from 0 s"):
         drive(trip([4, 4.8], [0, 1]))
-    with pytest.raises(ScenarioError, match="no vehicle is there"):
+    with pytest.raises(ScenarioError, match="no vehicle is present"):
         drive(trip([50, 60], [0, 1]))
     assert drive(trip([0, 10], [0, 10]), seconds=0.4).node_ids == ("a",), "a short run is as long as it is"
 
@@ -179,7 +179,7 @@ def test_a_disc_is_entered_and_left_and_short_excursions_do_not_count() -> None:
     time_s = np.arange(0, 40.1, 0.1)
     out_and_back = trip(time_s, np.where(np.abs(time_s - 20) < 4, 110.0 - np.abs(time_s - 20) * 5, 90.0))
     assert there(drive(out_and_back, seconds=40, disc=(0.0, 0.0, 100.0))) == (0.0, 40.0)
-    with pytest.raises(ScenarioError, match="no vehicle is there within the disc"):
+    with pytest.raises(ScenarioError, match="no vehicle is present within the disc"):
         drive(through, seconds=40, disc=(0.0, 900.0, 100.0))
 
 
