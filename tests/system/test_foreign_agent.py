@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import AGENT, ROOT
+from tests.support.paths import ROOT
+from tests.system.conftest import AGENT
 from tests.system.test_by_hand import NODES, finish, start_emulator
 
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
@@ -69,7 +70,7 @@ def test_a_run_of_foreign_agents_replays_over_tls_too(tmp_path: Path) -> None:
 def test_a_killed_foreign_agent_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with ExitStack() as stack:
-        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--duration", "60", "--log-format", "json")
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--duration", "20")
         agents = {node: start(stack, FOREIGN, node, endpoint, folder) for node in NODES}
         assert emulator.stderr is not None
         while '"started"' not in (folder / "events.jsonl").read_text():
