@@ -1,7 +1,7 @@
 """Hazard warnings that are forwarded from vehicle to vehicle, with msgpack payloads.
 
-The vehicle `source` (of `[program.options]`, default v01) warns of a hazard at its position. Whoever is warned for the
-first time forwards it once, with one hop more: so it reaches vehicles far beyond the range of the source.
+The vehicle `source` (in `[program.options]`, default v01) warns of a hazard at its position. Whoever is warned for
+the first time forwards it once, with one hop more: so it reaches vehicles far beyond the range of the source.
 Each vehicle reports whether it is warned, over how many hops, and after how many milliseconds:
 
     vnet simulate scenarios/beacon.toml --program docs.examples.hazard:main --set radio.range_m=1500
