@@ -90,10 +90,17 @@ class Lockstep:
         return actions
 
     def receive(self, process_id: str, message: wire.Yield) -> None:
-        """A process has yielded. Raises ProtocolError if it was not owed or speaks for others' nodes."""
+        """A process has yielded.
+
+        Raises ProtocolError if it was not owed, speaks for others' nodes, or asks for the same instant again.
+        """
         process = self._processes[process_id]
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
+        if message.next_timer_ns is not None and message.next_timer_ns <= self.now_ns:
+            raise ProtocolError(
+                f"yield {message.seq} of {process_id}: its next timer is not later than {self.now_ns}"
+            )
         waiting = [*message.waiting_radio, *message.waiting_gnss]
         check_ownership(process.nodes, message.traffic, waiting)
         del self.owed[process_id]

@@ -26,6 +26,7 @@ APART = ("campaign",)
 PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 """Run by this Python, with these arguments first."""
 ONLY_PARSED = {
+    "vnet conformance": "takes a minute; tests/emulator/testing/conformance runs it",
     "vnet emulator": "waits for agents",
     "vnet-agent": "needs an emulator",
     "vnet record": "needs an emulator",

@@ -49,6 +49,11 @@ class OfAnotherProcess(Alters):
         return [*fields[:2], "v02", *fields[3:]] if fields[0] == "Hello" else fields
 
 
+class OfNoNode(Alters):
+    def alter(self, fields: list[Any]) -> list[Any]:
+        return [fields[0], "v99", *fields[2:]] if fields[0] == "Hello" else fields
+
+
 class CannotLoadItsProgram(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
         return [*fields[:7], "no module beacon"] if fields[0] == "Hello" and fields[6] else fields

@@ -1,0 +1,121 @@
+"""Whole runs in which an agent that imports no vnet takes part, beside those of vnet, in both pacings."""
+
+import ast
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+from tests.system.conftest import AGENT
+from tests.system.test_by_hand import NODES, finish, start_emulator
+
+FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py"]
+WRONG = [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_agent"]
+LISTEN = ("--listen", "tcp/127.0.0.1:0")
+
+
+def start(stack: ExitStack, command: list[str], node: str, endpoint: str, folder: Path) -> subprocess.Popen[bytes]:
+    credentials = str(folder / "access" / "credentials" / f"{node}.json")
+    words = [*command, "--connect", endpoint, "--run", "beacon", "--node", node, "--credentials", credentials]
+    agent = subprocess.Popen(words, cwd=ROOT)
+    stack.callback(agent.wait)
+    stack.callback(agent.kill)
+    return agent
+
+
+def test_the_foreign_agent_is_short_and_imports_no_vnet() -> None:
+    text = (ROOT / "docs" / "examples" / "foreign_agent.py").read_text()
+    imports = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {alias.name for node in imports if isinstance(node, ast.Import) for alias in node.names}
+    names |= {str(node.module) for node in imports if isinstance(node, ast.ImportFrom)}
+    assert {name.split(".")[0] for name in names} - sys.stdlib_module_names == {"msgpack", "zenoh"}
+    assert len(text.splitlines()) < 200
+
+
+@pytest.mark.parametrize("pacing", ["lockstep", "realtime"])
+def test_foreign_agents_and_those_of_vnet_take_part_in_one_run(tmp_path: Path, pacing: str) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--pacing", pacing)
+        for node in NODES[:2]:
+            start(stack, AGENT, node, endpoint, folder)
+        foreign = [start(stack, FOREIGN, node, endpoint, folder) for node in NODES[2:]]
+        done = finish(emulator, folder)
+        assert [agent.wait() for agent in foreign] == [0, 0]
+    allowed = {"valid"} if pacing == "lockstep" else {"valid", "unknown"}  # a busy machine may be late
+    assert done.verdict["verdict"] in allowed, done.stdout
+    assert {check["name"] for check in done.verdict["checks"] if check["verdict"] == "unknown"} <= {"kept_up"}
+    sent = {node: len({row["seq"] for row in done.trace() if row["sender"] == node}) for node in NODES}
+    assert set(sent.values()) == {20} if pacing == "lockstep" else min(sent.values()) >= 15
+    received = {row["receiver"] for row in done.trace() if row["sender"] == "v03" and row["outcome"] == "delivered"}
+    assert received == {"v01", "v02", "v04"}
+
+
+def test_a_run_of_foreign_agents_replays_over_tls_too(tmp_path: Path) -> None:
+    fingerprints = []
+    for listen in ("tcp/127.0.0.1:0", "tls/127.0.0.1:0"):
+        folder = tmp_path / listen[:3]
+        with ExitStack() as stack:
+            emulator, endpoint = start_emulator(stack, folder, "--listen", listen)
+            for node in NODES:
+                start(stack, FOREIGN, node, endpoint, folder)
+            fingerprints.append(finish(emulator, folder).fingerprint)
+    assert fingerprints[0] == fingerprints[1]
+
+
+def test_a_killed_foreign_agent_is_named_and_the_others_go_on(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--duration", "20")
+        agents = {node: start(stack, FOREIGN, node, endpoint, folder) for node in NODES}
+        assert emulator.stderr is not None
+        while '"started"' not in (folder / "events.jsonl").read_text():
+            assert emulator.poll() is None
+        agents["v04"].send_signal(signal.SIGKILL)
+        done = finish(emulator, folder)
+    assert done.verdict["verdict"] == "invalid"
+    (died,) = done.events_of("died")
+    assert died["node"] == "v04"
+    assert done.check("agents_alive")["verdict"] == "invalid"
+    assert done.check("progress")["verdict"] == "valid"
+
+
+@pytest.mark.parametrize(
+    ("mistake", "reason"),
+    [
+        ("SaysTextForInteger", "Expected `int`, got `str`"),
+        ("ForgetsItsNonce", "without the nonce of its process"),
+        ("CountsByItself", "yield 1 of v04: expected 0"),
+        ("TimerInThePast", "its next timer is not later than 0"),
+        ("SpeaksForOthers", "speaks for v02, which is not its own"),
+    ],
+)
+def test_a_misbehaving_foreign_agent_ends_the_run_unknown_with_its_name(
+    tmp_path: Path, mistake: str, reason: str
+) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--set", "run.stall_timeout_s=1")
+        for node in NODES[:3]:
+            start(stack, FOREIGN, node, endpoint, folder)
+        start(stack, [*WRONG, mistake], "v04", endpoint, folder)
+        done = finish(emulator, folder)
+    assert done.verdict["verdict"] == "unknown", done.stdout
+    assert reason in done.events_of("refused")[0]["reason"]
+    assert done.events_of("stalled")[0]["node"] == "v04"
+
+
+def test_a_foreign_agent_that_is_refused_ends_with_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        _, endpoint = start_emulator(stack, folder, *LISTEN)
+        credentials = str(folder / "access" / "credentials" / "v01.json")
+        values = ["--connect", endpoint, "--run", "beacon", "--node", "v01", "--credentials", credentials]
+        words = [*WRONG, "OfNoNode", *values]
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr == "v01: refused: 'v99' is not a node of this run\n"
