@@ -10,6 +10,8 @@ from emulator.experiments import figures, reports
 from emulator.experiments.paper import ALPHAS, NETWORKS, load_positions
 from emulator.experiments.tables import with_error
 
+pytestmark = pytest.mark.slow
+
 NETWORK = {"N3": load_positions({"kind": "generated", "vehicles": 24})}
 LONELY = {"one": (np.zeros((1, 2)), np.zeros(1)), "apart": (np.array([[0.0, 0.0], [9e4, 0.0]]), np.zeros(2))}
 

@@ -14,6 +14,8 @@ from emulator.cli.commands import app
 from emulator.experiments import divergence, paper, tempering
 from emulator.records.metrics import anees_band
 
+pytestmark = pytest.mark.slow
+
 TINY: dict[str, Any] = {"n3": {"kind": "generated", "vehicles": 4}}
 
 
