@@ -233,13 +233,17 @@ def _rerun_sinks(sinks: Sinks) -> Iterator[rerun.FileSink | rerun.GrpcServerSink
         )
 
 
+_outliving: list[subprocess.Popen[bytes]] = []
+"""Viewers that stay open after the recording, and after this process: kept here, as nobody waits for their end."""
+
+
 @contextmanager
 def _looked_at(place: ServeAt, spawn: bool) -> Iterator[None]:
     """The web viewer for as long as the block lasts, and a native one if `spawn`."""
     if spawn:
         local = replace(place, address=LOOPBACK) if ipaddress.ip_address(place.address).is_unspecified else place
         native = viewer_command("--connect", local.url, "--memory-limit", VIEWER_MEMORY, "--hide-welcome-screen")
-        subprocess.Popen(native, stdin=subprocess.DEVNULL, start_new_session=True)
+        _outliving.append(subprocess.Popen(native, stdin=subprocess.DEVNULL, start_new_session=True))
     pages = viewer_command(
         *("--serve-web", "--web-viewer-port", str(place.web_port), place.url), bind=place.address
     )

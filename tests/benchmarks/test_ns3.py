@@ -23,6 +23,7 @@ def curve(pairs: list[int], share: list[float]) -> Curve:
     return Curve(np.array(pairs), np.array(share))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fading", [False, True])
 def test_delivery_by_distance_and_the_busy_ratio_are_those_of_ns3(fading: bool, tmp_path: Path) -> None:
     recorded = next(one for one in RECORDED if one["vehicles"] == 50 and one["fading"] == fading)

@@ -25,6 +25,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Page:
     return Page(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_page_is_what_it_says(path: Path, page: Page) -> None:
     page.follow(path.read_text(encoding="utf-8"), str(path.relative_to(ROOT)))

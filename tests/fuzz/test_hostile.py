@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from tests.fuzz.adversarial_inputs import NASTIES
 from tests.fuzz.targets import TARGETS, Target
 
+pytestmark = pytest.mark.slow
+
 LONGEST_CPU_S = 10
 LARGEST_PEAK_BYTES = 50_000_000
 all_targets = pytest.mark.parametrize("target", TARGETS, ids=lambda target: target.name)

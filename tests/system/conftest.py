@@ -19,6 +19,13 @@ TIMEOUT_S = 300
 """Only against hanging for ever; nothing here is judged by how long it takes."""
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark all tests of this folder as slow; pytest hands over those of other folders, too."""
+    for item in items:
+        if item.path.is_relative_to(Path(__file__).parent):
+            item.add_marker(pytest.mark.slow)
+
+
 @dataclass(frozen=True)
 class Finished:
     """A command that has ended, and the folder of its run."""

@@ -23,6 +23,8 @@ from vnet import Fix, Packet
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 100_000_000
 COMMON = np.array([3.0, -2.0])
 OPTIONS = Options(particles=60)

@@ -20,6 +20,8 @@ from vnet import Fix, Packet
 from vnet.errors import ProgramError
 from vnet.roads.lanes import LaneMap
 
+pytestmark = pytest.mark.slow
+
 reals = st.floats(-300, 300)
 names = st.integers(0, 10_000).map(lambda number: short_name(f"v{number}"))
 

@@ -15,6 +15,8 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 TINY = {"kind": "generated", "vehicles": 4}
 
 

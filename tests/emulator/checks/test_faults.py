@@ -19,6 +19,8 @@ from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 NEEDED: dict[str, dict[str, Any]] = {
     "loss": {"probability": 0.5},
     "delay": {"delay_ms": 200.0},

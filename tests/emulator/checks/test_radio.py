@@ -23,6 +23,8 @@ from emulator.world.world import build_world
 from tests.emulator.checks.test_judge import checked, result, verdict
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 LOG_DISTANCE = {"kind": "log_distance", "tx_power_dbm": 33.0}
 Change = Callable[[dict[str, Any], np.ndarray], None]
 """Changes the trace's columns, given which rows arrived."""

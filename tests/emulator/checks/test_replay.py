@@ -21,6 +21,8 @@ from tests.emulator.checks.test_judge import first, four, result, with_names
 from tests.support.paths import ROOT
 from vnet.node import Node
 
+pytestmark = pytest.mark.slow
+
 
 async def throws_dice(node: Node) -> None:
     """Send random bytes that no seed decides, from one vehicle and the third fix on."""

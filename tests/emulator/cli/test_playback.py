@@ -19,6 +19,8 @@ from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from tests.emulator.stream.test_playback import Watched, watch
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:

@@ -28,6 +28,8 @@ from tests.support.motion import along, scenario_of_trips, still, write_trips
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_together
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 ORDERED = "tests.support.fault_programs:minds_the_order"
 TRAFFIC = {
     "v1": [(0, 9, along(0, 10))],

@@ -14,6 +14,8 @@ from vnet import Node
 from vnet.node import Report
 from vnet.transport import wire
 
+pytestmark = pytest.mark.slow
+
 HERE = "tests.emulator.drivers.test_process_faults"
 ORDERED = "tests.support.fault_programs:minds_the_order"
 PERIOD_NS = 200_000_000

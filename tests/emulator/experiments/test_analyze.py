@@ -194,6 +194,7 @@ def test_a_scenario_is_seen_with_its_links_and_its_peer_cap() -> None:
     assert capped["one_way_links"] + 2 * capped["links"] == 12, "everybody hears two"
 
 
+@pytest.mark.slow
 def test_a_network_of_the_published_character() -> None:
     """MODEL 4: 260 rounds to 1 % with constant weights and 99 with Metropolis on N1, which this resembles."""
     found = analyze(Scenario.model_validate({"network": {"vehicles": 50}}))

@@ -14,6 +14,8 @@ from emulator.cli.commands import app
 from emulator.experiments import city
 from tests.emulator.world.maps.test_city_map import driving
 
+pytestmark = pytest.mark.slow
+
 
 def run_small(monkeypatch: pytest.MonkeyPatch, folder: Path, *options: str) -> str:
     monkeypatch.setenv("PYTHONHASHSEED", "0")

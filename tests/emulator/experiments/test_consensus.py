@@ -28,6 +28,8 @@ from emulator.experiments.consensus import (
 from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"kind": "generated", "vehicles": 10}
 
 

@@ -13,6 +13,8 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 
+pytestmark = pytest.mark.slow
+
 ODD: dict[str, dict[str, Any]] = {
     "nobody in range": {"radio": {"range_m": 0.001}},
     "one vehicle": {"network": {"vehicles": 1}},

@@ -11,6 +11,8 @@ from emulator.experiments.paper import ALPHAS, load_positions
 from emulator.experiments.tables import with_error
 from emulator.records.paper_values import PAPER_VEHICLES
 
+pytestmark = pytest.mark.slow
+
 NETWORK = {"N3": load_positions({"kind": "generated", "vehicles": 24})}
 LONELY = {"one": (np.zeros((1, 2)), np.zeros(1)), "apart": (np.array([[0.0, 0.0], [9e4, 0.0]]), np.zeros(2))}
 

@@ -15,6 +15,8 @@ from emulator.experiments import divergence, paper, tempering
 from emulator.records.metrics import anees_band
 from emulator.records.paper_values import PAPER_VEHICLES
 
+pytestmark = pytest.mark.slow
+
 TINY: dict[str, Any] = {"n3": {"kind": "generated", "vehicles": 4}}
 
 

@@ -116,6 +116,7 @@ villains = st.sampled_from(
 QUIET: dict[str, Any] = {"access_jitter_ms": 0.0, "loss": 0.0, "queue_frames": 64, "delivery_tick_us": 0}
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=20), villains, spans, spans)
 @example(

@@ -17,6 +17,8 @@ from emulator.radio.engine import Delivery, Engine
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.scenario import Scenario
 
+pytestmark = pytest.mark.slow
+
 S = 1_000_000_000
 PERIOD_NS = S // 10
 Row = dict[str, Any]

@@ -454,6 +454,7 @@ def test_senders_measure_each_on_its_own_clock() -> None:
     assert set(np.round(seen, 3)) == {round(part / 10, 3) for part in range(11)}
 
 
+@pytest.mark.slow
 def test_limeric_settles_where_its_equation_does() -> None:
     """K senders of airtime a: share* = β (target - K share) / α, as the busy ratio is the sum of all shares."""
     before_horizon = LimericControl(Limeric(kind="limeric"), BusyRatioMeter(1, 1))
@@ -470,6 +471,7 @@ def test_limerics_pause_is_the_airtime_over_the_share_within_bounds() -> None:
         assert pause_ms(before_horizon) == expected_ms
 
 
+@pytest.mark.slow
 def test_a_congested_channel_thins_out_what_is_sent() -> None:
     """Sixty vehicles, a frame of 1 000 bytes every 50 ms each: two thirds more than there is room for."""
     position_m = np.random.default_rng(3).uniform(0, 200, (60, 2))

@@ -162,6 +162,7 @@ def close(one: Any, other: Any) -> bool:
     return bool(one == pytest.approx(other, rel=1e-9, abs=1e-9))
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(traces())
 def test_links_are_as_the_plain_implementation_says(trace: tuple[list[Row], np.ndarray, bool]) -> None:

@@ -25,6 +25,8 @@ from emulator.report.write import key_figures, write_report
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
 
+pytestmark = pytest.mark.slow
+
 EVIL = "<script>alert(1)</script>"
 
 

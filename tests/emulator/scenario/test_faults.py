@@ -202,6 +202,7 @@ def same(one: FaultPlan, other: FaultPlan) -> bool:
     ]
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.lists(written_faults(), max_size=5), st.data())
 def test_a_plan_as_it_is_written_down_is_the_same_plan_whatever_was_healed(

@@ -257,6 +257,7 @@ def test_a_table_that_is_none(copied: Path, name: str) -> None:
     assert f"{name}.parquet: has no column" in refused(copied)
 
 
+@pytest.mark.slow
 def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None:
     rewrite = {name: pq.read_table(copied / f"{name}.parquet") for name in ("trace", "states", "metrics")}
 

@@ -24,6 +24,8 @@ from emulator.testing.matrix import column_of, count_verdicts, page
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError, ScenarioError, VnetError
 
+pytestmark = pytest.mark.slow
+
 
 def planted(program: str) -> Scenario:
     return Scenario.model_validate(

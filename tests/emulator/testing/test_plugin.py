@@ -10,6 +10,8 @@ import pytest
 
 from tests.support.paths import ROOT
 
+pytestmark = pytest.mark.slow
+
 pytest_plugins = "pytester"
 
 BEACON = ROOT / "scenarios" / "beacon.toml"

@@ -19,6 +19,8 @@ from emulator.testing.strategies import faults
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 SMALL: dict[str, dict[str, Any]] = {"run": {"duration_s": 6.0, "settle_s": 1.0}, "network": {"vehicles": 6}}
 QUIET = settings(
     deadline=None,

@@ -48,6 +48,7 @@ def late(values: list[float | None]) -> float:
     return float(np.mean([value for value in values[-10:] if value is not None]))
 
 
+@pytest.mark.slow
 def test_it_finds_the_common_error_as_well_as_cooperation_does(told: list[dict[str, Any]]) -> None:
     rmse = late([period["figures"]["common_error_rmse_m"] for period in told[1:]])
     assert late(steps(told)) < 1.3 * rmse

@@ -238,6 +238,7 @@ with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
 """
 
 
+@pytest.mark.slow
 def test_a_recording_whose_writer_was_killed_can_be_read_and_repaired(tmp_path: Path) -> None:
     path = tmp_path / "torn.rrd"
     done = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=ROOT)

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from emulator.world.networks import Network, generate_network, load_network
 from vnet.errors import ScenarioError
 
+pytestmark = pytest.mark.slow
+
 RANGE_M = 3000.0
 HEADER = "id,x_m,y_m,heading_rad\n"
 

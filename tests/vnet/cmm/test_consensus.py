@@ -93,6 +93,7 @@ def test_all_find_the_mean_and_no_mass_is_lost(loss: float) -> None:
     assert net.errors().max() < 1e-3 * spread
 
 
+@pytest.mark.slow
 def test_under_a_peer_cap_only_those_who_hear_take_a_share() -> None:
     """A receiver-side cap makes hearing one-way: a sender that split over all in range would lose mass."""
     rng = np.random.default_rng(5)

@@ -194,6 +194,7 @@ def crossing_error(vehicles: int, parallel: bool, seed: int) -> float:
     return float(np.sum((rbpf.estimate_m - common) ** 2))
 
 
+@pytest.mark.slow
 def test_more_road_directions_make_a_smaller_error() -> None:
     """MODEL 8: the squared error falls with the number of vehicles; parallel roads leave one direction open."""
     few, many = (np.mean([crossing_error(n, False, seed) for seed in range(12)]) for n in (3, 24))

@@ -340,6 +340,7 @@ def is_no_array(file: zipfile.ZipFile) -> None:
     file.writestr("node_lon_deg.npy", b"hello")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write_member", [claims_much, is_much, is_no_array])
 def test_arrays_that_are_not_what_they_say(tmp_path: Path, write_member: Callable[[zipfile.ZipFile], None]) -> None:
     np.savez(tmp_path / "town.npz", **maps.arrays(node_lon_deg=None))

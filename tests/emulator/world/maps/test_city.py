@@ -27,6 +27,8 @@ from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 100_000_000
 FASTEST_M_S = 29.0 * 1.05
 

@@ -76,6 +76,7 @@ def test_lanes_may_lie_aside(tmp_path: Path) -> None:
     assert moved == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Path) -> None:
     """And without it they cannot."""
     figures = {}
