@@ -47,7 +47,7 @@ from emulator.terminal.summary import print_checks, print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError, TransportError, VnetError
-from vnet.runtime.host import fix_hash_seed
+from vnet.runtime.environment import fix_hash_seed
 from vnet.transport.access import Access, is_tls
 from vnet.transport.certificates import certifier
 from vnet.transport.credentials import Credentials

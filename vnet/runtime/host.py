@@ -11,17 +11,17 @@ import contextlib
 import contextvars
 import importlib
 import inspect
-import os
-import sys
 import traceback
 import weakref
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from vnet.errors import ProgramError
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
+from vnet.runtime.own_packages import name_clash
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -39,28 +39,24 @@ def load_program(entry: str) -> Program:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
-        raise ProgramError(f"program.entry = {entry!r}: cannot import: {_one_line(error)}") from error
+        raise _load_error(entry, f"cannot import: {_one_line(error)}") from error
     program = getattr(module, name, None)
     if program is None:
-        raise ProgramError(f"program.entry = {entry!r}: module {module_name} has no {name!r}")
+        raise _load_error(entry, f"module {module_name} has no {name!r}")
     if not asyncio.iscoroutinefunction(program):
         raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
     return program  # type: ignore[no-any-return]
 
 
+def _load_error(entry: str, reason: str) -> ProgramError:
+    """Error of a program that is not found; it names a file that bears the name of one of vnet's own packages."""
+    clash = name_clash(entry.partition(":")[0], Path.cwd())
+    return ProgramError(f"program.entry = {entry!r}: {reason}" + (f"; {clash}" if clash else ""))
+
+
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
     """The program of each node that is welcome. Raises ProgramError."""
     return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
-
-
-def fix_hash_seed(module: str) -> None:
-    """Start this command (`python -m module`) again with a fixed hash seed, unless it has one.
-
-    Programs that iterate over sets of strings must come out the same in every process and every run.
-    """
-    if os.environ.get("PYTHONHASHSEED") != "0":
-        arguments = [sys.executable, "-P", "-m", module, *sys.argv[1:]]
-        os.execve(sys.executable, arguments, {**os.environ, "PYTHONHASHSEED": "0"})
 
 
 class Host:
