@@ -30,9 +30,7 @@ def test_a_program_in_a_file_that_vnet_s_own_package_hides(
     )
 
 
-def test_a_module_of_a_package_that_vnet_s_own_hides(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "agents").mkdir()
     (tmp_path / "agents" / "__init__.py").touch()
     (tmp_path / "agents" / "mine.py").write_text(PROGRAM)
