@@ -37,7 +37,7 @@ AGENT_ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Exit:
-    """How a process ended."""
+    """End of a process: its status and the last lines of its log."""
 
     status: int
     log_tail: str

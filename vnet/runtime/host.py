@@ -152,13 +152,13 @@ class Host:
                 task.cancel()
 
     def restart(self, welcome: wire.Welcome) -> None:
-        """Run a node's program anew, as another incarnation (simulated)."""
+        """Run a node's program again, as another incarnation (simulated)."""
         node = self.nodes[welcome.node] = self._node(welcome)
         self._active[node.id] = True
         self._start(node)
 
     def pause(self, nodes: Iterable[str]) -> None:
-        """From now on these nodes stand still, and no others: their callbacks wait (simulated)."""
+        """Pause these nodes from now on, and no others: their callbacks wait (simulated)."""
         self._paused = set(nodes)
         self._hold()
 
@@ -177,14 +177,14 @@ class Host:
             self._clocks.pop(clock.node, None)
             if clock.is_wrong:
                 self._clocks[clock.node] = clock
-        loop.clock_error_of = self._bend_of_task if self._clocks else _no_bend
+        loop.clock_error_of = self._clock_error_of_task if self._clocks else _no_clock_error
 
-    def _bend_of_task(self) -> wire.ClockError | None:
+    def _clock_error_of_task(self) -> wire.ClockError | None:
         node = _current_node.get()
         return None if node is None else self._clocks.get(node.id)
 
     def _shown_ns(self, node: str, time_ns: int) -> int:
-        """What the clock of `node` showed at `time_ns`, as it went then."""
+        """Time that the clock of `node` showed at `time_ns`, as it went then."""
         for clock_error in reversed(self._past_clocks.get(node, ())):
             if clock_error.since_ns <= time_ns:
                 return max(clock_error.shown_ns(time_ns), 0)
@@ -201,13 +201,13 @@ class Host:
             self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
 
     def take_traffic(self) -> wire.Traffic:
-        """Everything that the nodes have handed over since the last call."""
+        """Return everything that the nodes have enqueued since the last call."""
         traffic = wire.Traffic(self._frames, self._reports, self._endings)
         self._frames, self._reports, self._endings = [], [], []
         return traffic
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
-        """What the process has to say when nothing is left to do at this instant (lockstep)."""
+        """Return the yield of the process when nothing is left to do at this instant (lockstep)."""
         nodes = self.nodes.values()
         return wire.Yield(
             nonce,
@@ -250,15 +250,15 @@ class Host:
                 self.end(node.id, "spun", str(spin), self.stacks(node.id))
 
     def _runs(self, node: Node) -> bool:
-        """Whether its program goes on, and is not what is left of an earlier incarnation."""
+        """Return whether its program goes on, and is not what is left of an earlier incarnation."""
         return self.nodes[node.id] is node and self._active[node.id]
 
     def stacks(self, node: str) -> str:
-        """Where the tasks of a node stand, as text."""
+        """Stacks of the tasks of a node, as text."""
         lines = []
         for task in self._tasks_of(self.nodes[node]):
             lines.append(f"task {task.get_name()}:")
-            lines += [f"  {place}" for place in _standing(task)]
+            lines += [f"  {place}" for place in _suspended_at(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
@@ -307,15 +307,15 @@ class Host:
         return task
 
 
-def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
-    """Where a suspended task stands, from its outermost coroutine inwards."""
+def _suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
+    """Lines at which a suspended task waits, from its outermost coroutine inwards."""
     coroutine: Any = task.get_coro()
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
         coroutine = coroutine.cr_await
 
 
-def _no_bend() -> wire.ClockError | None:
+def _no_clock_error() -> wire.ClockError | None:
     """All clocks are right."""
     return None
 

@@ -35,7 +35,7 @@ REALTIME_AGENT_NICE = 10
 
 
 class ProcessState(StrEnum):
-    """What a process of agents is doing, as far as the emulator knows."""
+    """State of a process of agents, as far as the emulator knows."""
 
     RUNNING = "running"
     PAUSED = "paused"
@@ -121,7 +121,7 @@ class Supervisor:
         if state is not ProcessState.DEAD:
             process.death = None
 
-    # What the run has them do.
+    # On the order of the run.
 
     def launch(self, nodes: Sequence[str]) -> None:
         """Start the process of these nodes."""
@@ -201,7 +201,7 @@ class Supervisor:
         """Wait for those that have been told to end."""
         await asyncio.gather(*self._ending)
 
-    # What becomes of them by themselves.
+    # Without an order.
 
     @contextmanager
     def watching_children(self) -> Iterator[None]:
