@@ -5,6 +5,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from vnet.runtime.environment import use_one_blas_thread
+
+use_one_blas_thread()  # as in the commands, whose results some tests compare with those of this process
+
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:
