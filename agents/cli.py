@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import faulthandler
 import fcntl
 import os
@@ -15,14 +14,9 @@ from typing import Annotated
 
 import typer
 
-from agents.host import run_agent
 from vnet.errors import ProgramError, VnetError
-from vnet.runtime.host import fix_hash_seed
-from vnet.transport.credentials import Credentials
-from vnet.transport.keys import is_segment
-from vnet.transport.session import quiet_zenoh
-
-_PR_SET_PDEATHSIG = 1
+from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -44,8 +38,15 @@ def agent(
     ] = 60.0,
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
+    from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
+    from vnet.transport.credentials import Credentials
+    from vnet.transport.keys import is_segment
+    from vnet.transport.session import quiet_zenoh
+
     faulthandler.register(signal.SIGUSR1)
-    _go_on_without_parent()
+    # An emulator that is killed cannot continue the agents that it has paused; once continued, they find that they
+    # are orphans, and end.
+    signal_at_parent_death(signal.SIGCONT)
     _leave_terminal()
     sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -61,16 +62,6 @@ def agent(
         sys.exit(2 if isinstance(error, ProgramError) else 3)
     except KeyboardInterrupt:
         sys.exit(130)
-
-
-def _go_on_without_parent() -> None:
-    """Have the kernel continue this process when the one that started it dies.
-
-    An emulator that is killed while its agents stand still (the fault `pause`) cannot; they then find that they are
-    orphans, and end.
-    """
-    with contextlib.suppress(OSError, AttributeError):  # Linux only
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT)
 
 
 def _leave_terminal() -> None:
@@ -90,6 +81,7 @@ def _leave_terminal() -> None:
 
 def main() -> None:
     """The console script."""
+    use_one_blas_thread()
     fix_hash_seed("agents.cli")
     app()
 

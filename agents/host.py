@@ -211,7 +211,7 @@ class _Attachment:
 
     @property
     def patience_s(self) -> float:
-        """How long to wait for an emulator that is gone: longer if it has said so before it went."""
+        """Seconds to wait for an emulator that is gone: longer if it has announced it."""
         return max(self.orphan_timeout_s, self._patience_until - time.monotonic())
 
     def _wait_as_orphan(self) -> None:

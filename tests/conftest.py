@@ -6,6 +6,10 @@ from typing import Any
 
 import pytest
 
+from vnet.runtime.environment import use_one_blas_thread
+
+use_one_blas_thread()  # as in the commands, whose results some tests compare with those of this process
+
 
 @pytest.fixture
 def default_signals() -> Iterator[None]:

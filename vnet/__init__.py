@@ -1,5 +1,18 @@
-"""vnet: what vehicle programs and the emulator agree on. A program needs only `from vnet import Node`."""
+"""vnet: what vehicle programs and the emulator agree on. A program needs only `from vnet import Node`.
 
-from vnet.node import Fix, Node, Packet
+These names are imported at their first use: whatever must come before numpy, which they need, can come after vnet.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vnet.node import Fix, Node, Packet
 
 __all__ = ["Fix", "Node", "Packet"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module("vnet.node"), name)

@@ -125,9 +125,6 @@ def _run_all(cells: list[Cell], store: Path, live: bool) -> Iterator[Cell]:
             run_cell(cell, store, live=True)
             yield cell
         return
-    # One thread of linear algebra a process: there is a process for each core already.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     pool = ProcessPoolExecutor(max_workers=os.cpu_count())
     try:
         futures = {pool.submit(run_cell, cell, store): cell for cell in cells}

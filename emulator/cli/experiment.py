@@ -16,7 +16,7 @@ from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
-from vnet.runtime.host import fix_hash_seed
+from vnet.runtime.environment import fix_hash_seed
 
 app = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, and vnet's own.")
 FOLDER = Path("runs/experiments")

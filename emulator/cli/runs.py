@@ -50,7 +50,7 @@ from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError, VnetError
-from vnet.runtime.host import fix_hash_seed
+from vnet.runtime.environment import fix_hash_seed
 from vnet.transport.session import quiet_zenoh
 
 

@@ -19,7 +19,7 @@ from emulator.cli.options import (
     load,
 )
 from emulator.terminal.console import one_line_errors
-from vnet.runtime.host import fix_hash_seed
+from vnet.runtime.environment import fix_hash_seed
 
 
 def analyze(

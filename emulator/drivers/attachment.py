@@ -1,7 +1,7 @@
-"""How the emulator is attached to Zenoh: its session, its keys, and who is there.
+"""The emulator's attachment to Zenoh: its session, its keys, and the nodes that are connected.
 
-All of it can be closed and opened anew in the middle of a run (the fault `emulator_restart`): what a run is made of
-lives elsewhere.
+All of it can be closed and opened again in the middle of a run (the fault `emulator_restart`): the state of a run
+is kept elsewhere.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vnet.transport.session import open_client, open_router, router_endpoint
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """How a live run is attached.
+    """Options of a live run's attachment.
 
     `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the
     run); `launch` starts the agents; `record` is where a recorder process writes its recording, or None.
@@ -110,7 +110,7 @@ class Attachment:
         self._on_query(keys.verb_of(str(query.key_expr)), query)
 
     def knows(self, node: str) -> bool:
-        """Whether there is a key for this node."""
+        """Return whether there is a key for this node."""
         return node in self._rx
 
     def send(self, node: str, message: wire.EmulatorMessage) -> None:
@@ -118,9 +118,9 @@ class Attachment:
         self._rx[node].put(wire.encode(message))
 
     def is_watched(self, stream: str) -> bool:
-        """Whether somebody observes this stream."""
+        """Return whether somebody observes this stream."""
         return bool(self._observers[stream].matching_status.matching)  # type: ignore[attr-defined]
 
     def publish(self, stream: str, message: dict[str, Any]) -> None:
-        """Tell those who watch."""
+        """Publish a message to observers."""
         self._observers[stream].put(wire.encode_observation(message))

@@ -1,6 +1,6 @@
 """Emulation: one run's engine, world and records, without any transport.
 
-The drivers (live over Zenoh, or simulated in one process) bring what nodes hand over and take what is due;
+The drivers (live over Zenoh, or simulated in one process) bring what nodes enqueue and take what is due;
 everything that must be the same in both happens here.
 """
 
@@ -32,7 +32,7 @@ from vnet.units import NS_PER_S
 
 @dataclass(frozen=True)
 class PeriodView:
-    """What happened up to the end of a period, for progress lines and observers."""
+    """State of a run at the end of a period, for progress lines and observers."""
 
     instant: Instant
     reports: list[Report]
@@ -42,7 +42,7 @@ class PeriodView:
 
 @dataclass(frozen=True)
 class ProcessActions:
-    """What faults and trips do to processes from an instant on.
+    """Effects of faults and trips on processes from an instant on.
 
     `stop`: nodes whose programs end now, and whether they are killed; `start`: nodes that are started, for the
     first time or again; `paused`: all nodes that are paused; `clocks`: the errors of all clocks; `restarts`: of the
@@ -90,7 +90,7 @@ class Emulation:
         self._arrived: list[Delivery] = []
 
     def _nodes_at(self, period: int) -> Nodes:
-        """What the selectors of faults look at in a period."""
+        """Nodes as the selectors of faults see them in a period."""
         world = self.world
         degree = self._in_range(period).sum(axis=0)
         return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
@@ -102,11 +102,11 @@ class Emulation:
         return self._connectivity.in_range(position_m, distances_m(position_m))
 
     def _component(self, period: int) -> NDArray[np.intp]:
-        """Which connected component each vehicle belongs to."""
+        """Connected component of each vehicle."""
         return components(self.world.position_m(period), self.scenario.radio.range_m, self._in_range(period))
 
     def _absent(self, period: int) -> set[str]:
-        """Who is not in the network."""
+        """Vehicles that are not in the network."""
         there = self.world.present(period).tolist()
         return {node for node, present in zip(self.world.node_ids, there, strict=True) if not present}
 
@@ -121,11 +121,11 @@ class Emulation:
 
     @property
     def emulated_ns(self) -> int:
-        """How far the run has come, in whole periods."""
+        """Emulated time of all periods that are complete, in ns."""
         return min(self._period * self.world.period_ns, self.duration_ns)
 
     def welcome(self, node: str, nonce: bytes) -> wire.Welcome:
-        """All that `node` is told; nothing in it says anything about the truth."""
+        """Welcome of `node`: all that it learns from the emulator; nothing in it says anything about the truth."""
         scenario = self.scenario
         incarnation = self.incarnation[node]
         program = scenario.program.of(node)
@@ -147,7 +147,7 @@ class Emulation:
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
-        """What nodes hand over at `time_ns`: frames to the engine in node order, reports, endings."""
+        """Take what nodes enqueue at `time_ns`: frames to the engine in node order, reports, endings."""
         frames: dict[str, list[bytes]] = {}
         endings: list[wire.Ending] = []
         for part in traffic:
@@ -187,7 +187,7 @@ class Emulation:
     # Faults, and vehicles that enter and leave.
 
     def next_change_ns(self) -> int | None:
-        """When next a fault starts or ends, or a vehicle enters or leaves."""
+        """Return when next a fault starts or ends, or a vehicle enters or leaves."""
         return self._next_change_ns
 
     def _find_next_change_ns(self) -> int | None:
@@ -197,7 +197,7 @@ class Emulation:
     def act(self, time_ns: int, starts_at_once: bool = True) -> ProcessActions:
         """Let the faults of `time_ns` act on links and senders, and vehicles enter and leave.
 
-        Returns what processes are to suffer. The caller has taken all that arrived before `time_ns`. Without
+        Returns what is to be done to processes. The caller has taken all that arrived before `time_ns`. Without
         `starts_at_once` nodes that start are up only when it says that they `come_back`.
         """
         self.close_periods(time_ns)
@@ -290,7 +290,7 @@ class Emulation:
         self.engine.look_ahead(time_ns, [self.number[node] for node in nodes])
 
     def fix_time_ns(self, period: int) -> int | None:
-        """When the fix of a period is due; None after the end of the run."""
+        """Time at which the fix of a period is due; None after the end of the run."""
         time_ns = period * self.world.period_ns
         return time_ns if time_ns < self.duration_ns else None
 

@@ -86,7 +86,7 @@ class Membership:
         return [node for node in self._node_ids if node in self._members]
 
     def speaks_for(self, process_id: str, nonce: bytes) -> bool:
-        """Whether a message on the `tx` of `process_id` with this nonce is its process's own."""
+        """Return whether a message on the `tx` of `process_id` with this nonce is its process's own."""
         member = self._members.get(process_id)
         return member is not None and member.nonce == nonce and member.process_id == process_id
 
@@ -111,7 +111,7 @@ class Membership:
         return list(groups.values())
 
     def describe(self, node: str) -> str:
-        """Where the process of a node runs."""
+        """Process id and host of a node's process, for messages."""
         member = self._members[node]
         return f"process {member.pid} on {member.host}"
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vnet.errors import VnetError
+from vnet.runtime.environment import ONE_BLAS_THREAD
 from vnet.transport.access import Access, node_user
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import default_time_slice
@@ -36,7 +37,7 @@ AGENT_ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Exit:
-    """How a process ended."""
+    """End of a process: its status and the last lines of its log."""
 
     status: int
     log_tail: str
@@ -102,7 +103,7 @@ class Launcher:
                     pass_fds=[read_end],
                     process_group=None if own_session else 0,
                     start_new_session=own_session,
-                    env={**os.environ, **environment},
+                    env={**ONE_BLAS_THREAD, **os.environ, **environment},
                 )
         except OSError as error:
             raise VnetError(f"cannot start the process of {name}: {error.strerror}") from None

@@ -35,7 +35,7 @@ class _Process:
 
     @property
     def running(self) -> list[str]:
-        """The nodes that do not stand still."""
+        """Nodes that are not paused."""
         return [node for node in self.nodes if node not in self.paused]
 
     def take_packets(self) -> list[wire.WirePacket]:
@@ -82,10 +82,10 @@ class Lockstep:
             self._act(0)
         if first := [process_id for process_id, process in self._processes.items() if process.running]:
             return self._grant(first)
-        return self._go_on()  # all are dead or stand still
+        return self._go_on()  # all are dead or paused
 
     def take_actions(self) -> list[ProcessActions]:
-        """What processes suffer at this instant, before the grants are given."""
+        """Return what is to be done to processes at this instant, before the grants are given."""
         actions, self._actions = self._actions, []
         return actions
 
@@ -158,7 +158,7 @@ class Lockstep:
         emulation.look_ahead(min(time_ns for time_ns in stops_ns if time_ns is not None), waiting)
 
     def _hold(self, next_ns: int) -> bool:
-        """Whether what comes next lies beyond the horizon; all that lies before it is then done and recorded."""
+        """Return whether what comes next lies beyond the horizon; all before it is then done and recorded."""
         self.held = self.horizon_ns is not None and next_ns >= self.horizon_ns
         if self.horizon_ns is not None and self.held:
             self._collect_packets(self.horizon_ns - 1)
@@ -182,9 +182,9 @@ class Lockstep:
             process.paused = paused
             for clock in actions.clocks:
                 if clock.node in process.next_fix:
-                    self._bend(process, clock)
+                    self._apply_clock_error(process, clock)
 
-    def _bend(self, process: _Process, clock: wire.ClockError) -> None:
+    def _apply_clock_error(self, process: _Process, clock: wire.ClockError) -> None:
         if clock.is_wrong or clock.node in process.affected:
             process.clocks.append(clock)
             process.affected.add(clock.node)
@@ -211,7 +211,7 @@ class Lockstep:
         self._woken.add(process_id)
 
     def _wake_ns(self, process: _Process, by_radio: bool = True) -> int | None:
-        """When a process must run next: its next timer, or what its nodes' tasks wait for.
+        """Time at which a process must run next: its next timer, or what its nodes' tasks wait for.
 
         With or without what is on its way to them.
         """

@@ -1,4 +1,4 @@
-"""How much memory the processes of a live run take in its course, for the check that none of them grows."""
+"""Memory of the processes of a live run, sampled for the check that none of them grows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from emulator.records.run_folder import RunFolder
 
 SAMPLES = 40
-"""A run, so many times; a process that is started anew begins a new series."""
+"""A run, so many times; a process that is started again begins a new series."""
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
 
 

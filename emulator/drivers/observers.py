@@ -1,4 +1,4 @@
-"""The messages to those who watch a run that is on."""
+"""The messages of a running emulation to its observers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Messages:
 
     def __init__(self, emulation: Emulation) -> None:
         self._emulation = emulation
-        self._told_events = 0
+        self._sent_events = 0
         self._scene: dict[str, Any] = {}
         self._scenario: Scenario | None = None
         self.begin()
@@ -38,7 +38,7 @@ class Messages:
         self._seen = len(engine.trace)
 
     def scene(self) -> dict[str, Any]:
-        """What does not change."""
+        """Scene: what does not change in a run."""
         if self._scenario is not self._emulation.scenario:  # faults are planned while a run is on
             self._scenario = self._emulation.scenario
             world = RecordedWorld.of(self._emulation.world)
@@ -71,12 +71,12 @@ class Messages:
         trace = self._emulation.engine.trace
         number = np.concatenate([self._undecided, np.arange(self._seen, len(trace))])
         rows = np.concatenate([trace.rows(self._undecided), trace.rows(slice(self._seen, len(trace)))])
-        # In real time a frame of the next period may have been sent by now, and its fate be known.
+        # In real time a frame of the next period may have been sent by now, and its outcome be known.
         self._undecided = number[(rows["outcome"] == Outcome.pending) | (decided_ns(rows) >= end_ns)]
         self._seen = len(trace)
         return rows
 
     def _events(self) -> list[Event]:
-        events = self._emulation.folder.events[self._told_events :]
-        self._told_events += len(events)
+        events = self._emulation.folder.events[self._sent_events :]
+        self._sent_events += len(events)
         return events

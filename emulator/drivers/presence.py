@@ -1,4 +1,4 @@
-"""Which vehicles are in the network and run their programs: one state a node, and nothing else.
+"""Presence of vehicles and of their programs: one state a node, and nothing else.
 
 Faults stop and start programs, vehicles enter and leave, and programs end by themselves. Pure: it is told what
 happens, and says what follows.
@@ -12,7 +12,7 @@ from enum import StrEnum
 
 
 class NodeState(StrEnum):
-    """Where a node is in its life."""
+    """State of a node, from before its vehicle enters to the end of its program."""
 
     NEW = "new"
     """Its vehicle has not entered the network yet, and its program has never been started."""
@@ -44,7 +44,7 @@ _OUTSIDE = {_S.NEW, _S.OUTSIDE, _S.ENTERING, _S.ENDED_OUTSIDE}
 
 @dataclass(frozen=True)
 class Changes:
-    """What follows for nodes, in the order of their numbers: who is stopped, has left, and is to be started."""
+    """Nodes that are stopped, have left and are to be started, in the order of their numbers."""
 
     stopped: list[str]
     left: list[str]
@@ -64,7 +64,7 @@ class Presence:
         return self._states[node]
 
     def is_outside(self, node: str) -> bool:
-        """Whether a vehicle is not in the network: it has not entered yet, or has left."""
+        """Return whether a vehicle is not in the network: it has not entered yet, or has left."""
         return self._states[node] in _OUTSIDE
 
     def _put(self, node: str, state: NodeState) -> None:
@@ -105,5 +105,5 @@ class Presence:
         return True
 
     def has_ended(self, node: str) -> bool:
-        """Whether a program has ended by itself: it is not started again."""
+        """Return whether a program has ended by itself: it is not started again."""
         return self._states[node] in (_S.ENDED, _S.ENDED_OUTSIDE)

@@ -1,4 +1,4 @@
-"""What both pacings ask of the messages of a process, and how they encode packets."""
+"""Rules of both pacings for the messages of a process, and the encoding of packets."""
 
 from __future__ import annotations
 

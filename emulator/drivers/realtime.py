@@ -63,7 +63,7 @@ class RealTime:
         }
 
     def next_time_ns(self) -> int | None:
-        """When `due` must be called next: the next arrival, fix or fault."""
+        """Time at which `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
             self._emulation.fix_time_ns(self._next_period),
@@ -91,7 +91,7 @@ class RealTime:
 
     @property
     def all_final(self) -> bool:
-        """Whether every process that lives has said its last words."""
+        """Return whether every living process has sent its last message."""
         return not self._awaited
 
     def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
@@ -108,7 +108,7 @@ class RealTime:
             self._emulation.engine.lose(delivery)
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
-        """What has become due by `now_ns`, by process."""
+        """Return what has become due by `now_ns`, by process."""
         while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
             self._collect(change_ns - 1)
             self._act(change_ns)
@@ -122,7 +122,7 @@ class RealTime:
         }
 
     def take_actions(self) -> list[ProcessActions]:
-        """What processes suffer by now."""
+        """Return what is to be done to processes by now."""
         actions, self._actions = self._actions, []
         return actions
 
@@ -144,7 +144,7 @@ class RealTime:
                 self._affected.add(clock.node)
 
     def returned(self, now_ns: int, process_id: str) -> wire.Batch:
-        """A process that was started anew is ready; returns the batch that starts it."""
+        """Take a process that was started again and is ready; returns the batch that starts it."""
         self._emulation.come_back(self._nodes[process_id], now_ns)
         self._batch_seq[process_id] = self._frames_seq[process_id] = 0
         self._unacknowledged[process_id].clear()
@@ -207,7 +207,7 @@ class RealTime:
 
 
 def _late(counts: Sequence[int]) -> int:
-    """How many deliveries of a lateness histogram are over the limit."""
+    """Number of deliveries of a lateness histogram over the limit."""
     return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
 
 

@@ -6,7 +6,6 @@ It is Zenoh's own router, run from Python with the configuration that `vnet acce
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import socket
 import sys
@@ -18,11 +17,11 @@ import zenoh
 
 from emulator.drivers.launch import Launcher
 from vnet.errors import TransportError
+from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.transport.access import Access
 
 ROUTER = "router"
 START_TIMEOUT_S = 15.0
-ORPHAN_POLL_S = 0.5
 
 
 class SeparateRouter:
@@ -49,13 +48,12 @@ class SeparateRouter:
 
 def main(config: str) -> None:
     """Be the router until SIGTERM, or until the emulator is gone."""
-    emulator = os.getppid()
     over = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: over.set())
+    signal_at_parent_death(signal.SIGTERM)
     with zenoh.open(zenoh.Config.from_file(config)):
-        while os.getppid() == emulator and not over.wait(ORPHAN_POLL_S):
-            pass
+        over.wait()
 
 
 if __name__ == "__main__":

@@ -76,7 +76,7 @@ class _Simulation:
         self._process_of = node_ids[0]
         self._emulation = emulation
         self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
-        self._gate = before_horizon or (lambda lockstep: None)
+        self._before_horizon = before_horizon or (lambda lockstep: None)
         self._seq = 0
         self.interrupted = False
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
@@ -90,7 +90,7 @@ class _Simulation:
         asyncio.set_event_loop(self.loop)
         try:
             self._host.start(self.loop, self._programs)
-            self._gate(self._lockstep)
+            self._before_horizon(self._lockstep)
             self.loop.start_at(self._take(self._lockstep.start()))
             while True:
                 try:
@@ -112,7 +112,7 @@ class _Simulation:
         self._lockstep.receive(self._process_of, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
         grants = self._lockstep.step()
         while self._lockstep.held:
-            self._gate(self._lockstep)
+            self._before_horizon(self._lockstep)
             grants = self._lockstep.step()
         return self._take(grants)
 

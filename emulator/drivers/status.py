@@ -44,12 +44,12 @@ class FaultState:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """How a run gets on.
+    """Status of a run.
 
     `phase` is "starting", "joining" (`missing` are the vehicles that are awaited, `join_timeout_s` how long),
     "running" or "judging"; `absent` are those that have not entered yet, or have left. Seconds are emulated ones,
     but for `remaining_s`, `idle_s` (since a period last ended), `wall_s` (since the command began) and
-    `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts pairs of a frame and a receiver so far,
+    `join_timeout_s`, which are of wall clock. `frames_by_outcome` counts attempted receptions so far,
     `frames_per_s` those of the last emulated second. Figures are those of the last period, and None where programs
     report nothing of the kind; `over_time` has their means in `BINS` equal parts of the run.
     """
@@ -81,12 +81,12 @@ class Snapshot:
     absent: tuple[str, ...] = ()
 
     def never_reported(self, figure: str) -> bool:
-        """Whether no program has reported anything of this kind yet."""
+        """Return whether no program has reported anything of this kind yet."""
         return not any(value is not None for value in self.over_time[figure])
 
 
 class Course:
-    """What has been seen of a run so far. `clock` gives the seconds of the wall clock."""
+    """Observed course of a run so far. `clock` gives the seconds of the wall clock."""
 
     def __init__(self, emulation: Emulation, clock: Callable[[], float] = time.monotonic) -> None:
         self._emulation = emulation
@@ -130,11 +130,11 @@ class Course:
         return self._clock() - self._began_s
 
     def news(self, after: int = 0) -> list[Event]:
-        """What has happened, but for the first `after` events of the run."""
+        """Events of the run, but for the first `after` events of the run."""
         return [event for event in self._emulation.folder.events[after:] if event.kind not in FOR_THE_CHECKS]
 
     def snapshot(self, now_ns: int | None = None) -> Snapshot:
-        """How the run gets on at this emulated instant, or at the end of its last period."""
+        """Status of the run at this emulated instant, or at the end of its last period."""
         emulation = self._emulation
         run = emulation.scenario.run
         factor = self._real_time_factor()
@@ -174,7 +174,7 @@ class Course:
         return (self._emulation.emulated_ns - first_ns) / NS_PER_S / max(self._period_ended_s - first_s, 1e-9)
 
     def _rates(self) -> dict[str, float]:
-        """Decided pairs an emulated second, by outcome."""
+        """Decided receptions an emulated second, by outcome."""
         (first_ns, before), (last_ns, after) = self._counts[0], self._counts[-1]
         changes = {outcome.name: after[outcome] - before[outcome] for outcome in Outcome if outcome.value}
         over_s = max(last_ns - first_ns, 1) / NS_PER_S

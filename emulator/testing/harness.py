@@ -91,15 +91,15 @@ class RunHarness:
 
     @property
     def events(self) -> list[Event]:
-        """What has happened: joins, deaths, crashes, faults."""
+        """Events so far: joins, deaths, crashes, faults."""
         return list(self._emulation.folder.events)
 
     def states(self) -> pa.Table:
-        """What each vehicle believed and what was true, a row for each vehicle and period so far."""
+        """Estimates and truth of each vehicle, a row for each vehicle and period so far."""
         return self._emulation.metrics.states_table()
 
     def trace(self) -> pa.Table:
-        """What became of each frame at each receiver so far."""
+        """Outcome of each frame at each receiver so far."""
         return self._emulation.engine.trace.to_table()
 
     def halves(self) -> list[list[str]]:
@@ -110,7 +110,7 @@ class RunHarness:
 
     @property
     def reproduce(self) -> str:
-        """The command that runs the same again."""
+        """The command that reproduces the run."""
         return f"vnet {self._run.command} {shlex.quote(str(self.folder / SCENARIO_FILE))}"
 
     # Its course.
@@ -278,7 +278,7 @@ def _fails(check: CheckResult, allow_unknown: bool) -> bool:
 
 
 def _too_slow(checks: Sequence[CheckResult], within_s: float) -> list[CheckResult]:
-    """Of those that measured how long the network took to recover (`recovered_s`), the ones that are too long."""
+    """Checks that measured a recovery (`recovered_s`) longer than `within_s`, as failures."""
     slow = []
     for check in checks:
         longest_s = float(np.max(check.figures["recovered_s"], initial=0.0))

@@ -1,6 +1,6 @@
-"""A run that goes on only so far as it is told: on a thread of its own, simulated or live, in lockstep.
+"""A run that goes on up to the horizon that it is given: on a thread of its own, simulated or live, in lockstep.
 
-Whoever steps it may look at its emulation, and plan faults, while it stands still.
+Whoever steps it may look at its emulation, and plan faults, while it is held.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class SteppedRun(ABC):
 
     @property
     def started(self) -> bool:
-        """Whether `start` was called."""
+        """Return whether `start` was called."""
         return self._thread.ident is not None
 
     def start(self) -> Future[None]:
-        """Get ready for time 0. The future, here and in `go`, says when the run stands still or is over."""
+        """Get ready for time 0. The future, here and in `go`, is done when the run is held or over."""
         self._thread.start()
         return self.stands
 
@@ -53,7 +53,7 @@ class SteppedRun(ABC):
 
     @abstractmethod
     def _drive(self) -> None:
-        """Run to the end, waiting at the gate (on the run's thread)."""
+        """Run to the end, waiting at each horizon (on the run's thread)."""
 
     def _run(self) -> None:
         try:
@@ -79,9 +79,9 @@ class SimulatedRun(SteppedRun):
         self._orders.put(horizon_ns)
 
     def _drive(self) -> None:
-        simulate(self.emulation, self._gate)
+        simulate(self.emulation, self._before_horizon)
 
-    def _gate(self, lockstep: Lockstep) -> None:
+    def _before_horizon(self, lockstep: Lockstep) -> None:
         self.stands.set_result(None)
         lockstep.horizon_ns = self._orders.get()
 
@@ -99,9 +99,9 @@ class SteppedLiveRun(SteppedRun):
         self._loop.call_soon_threadsafe(self._next.set_result, horizon_ns)
 
     def _drive(self) -> None:
-        asyncio.run(run_live(self.emulation, self._options, before_horizon=self._gate))
+        asyncio.run(run_live(self.emulation, self._options, before_horizon=self._before_horizon))
 
-    async def _gate(self, lockstep: Lockstep) -> None:
+    async def _before_horizon(self, lockstep: Lockstep) -> None:
         self._loop = asyncio.get_running_loop()
         self._next: asyncio.Future[int | None] = self._loop.create_future()
         self.stands.set_result(None)

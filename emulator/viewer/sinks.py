@@ -251,7 +251,7 @@ def _looked_at(place: ServeAt, spawn: bool) -> Iterator[None]:
         yield
 
 
-TIED = [sys.executable, "-P", "-m", "emulator.viewer.die_with_parent"]
+TIED = [sys.executable, "-P", "-m", "vnet.runtime.die_with_parent"]
 """Before a command: it ends with the process that starts it, however that ends."""
 
 

@@ -1,8 +1,12 @@
 """Whole runs of programs that behave and misbehave, live and simulated."""
 
+import subprocess
+from pathlib import Path
+
 import pytest
 
-from tests.system.conftest import Finished, Vnet
+from tests.support.paths import ROOT
+from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet
 
 OPTIONS = ["--duration", "2", "--set", "network.vehicles=4", "--set", "run.stall_timeout_s=3"]
 
@@ -99,3 +103,18 @@ def test_a_recording_is_written_beside_the_run(vnet: Vnet) -> None:
         done = vnet(command, "scenarios/beacon.toml", "--duration", "1", "--rerun", "save")
         assert done.status == 0, done.stderr + done.stdout
         assert (done.folder / "recording.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("command", ["run", "simulate"])
+@pytest.mark.parametrize("package", ["agents", "emulator"])
+def test_a_program_that_a_package_of_vnet_s_own_hides_is_named_in_one_line(
+    command: str, package: str, tmp_path: Path
+) -> None:
+    file = tmp_path / f"{package}.py"
+    file.write_text("async def main(node):\n    pass\n")
+    scenario = str(ROOT / "scenarios" / "beacon.toml")
+    arguments = [command, scenario, "--program", f"{package}:main", "--out", "run", "--quiet", *OPTIONS]
+    done = subprocess.run([*VNET, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=TIMEOUT_S)
+    assert done.returncode != 0
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.endswith(f"{package} is a package of vnet's own: rename {file}\n")

@@ -11,18 +11,18 @@ import contextlib
 import contextvars
 import importlib
 import inspect
-import os
-import sys
 import traceback
 import weakref
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from vnet.errors import ProgramError
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
+from vnet.runtime.own_packages import name_clash
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -40,28 +40,24 @@ def load_program(entry: str) -> Program:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
-        raise ProgramError(f"program.entry = {entry!r}: cannot import: {_one_line(error)}") from error
+        raise _load_error(entry, f"cannot import: {_one_line(error)}") from error
     program = getattr(module, name, None)
     if program is None:
-        raise ProgramError(f"program.entry = {entry!r}: module {module_name} has no {name!r}")
+        raise _load_error(entry, f"module {module_name} has no {name!r}")
     if not asyncio.iscoroutinefunction(program):
         raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
     return program  # type: ignore[no-any-return]
 
 
+def _load_error(entry: str, reason: str) -> ProgramError:
+    """Error of a program that is not found; it names a file that bears the name of one of vnet's own packages."""
+    clash = name_clash(entry.partition(":")[0], Path.cwd())
+    return ProgramError(f"program.entry = {entry!r}: {reason}" + (f"; {clash}" if clash else ""))
+
+
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
     """The program of each node that is welcome. Raises ProgramError."""
     return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
-
-
-def fix_hash_seed(module: str) -> None:
-    """Start this command (`python -m module`) again with a fixed hash seed, unless it has one.
-
-    Programs that iterate over sets of strings must come out the same in every process and every run.
-    """
-    if os.environ.get("PYTHONHASHSEED") != "0":
-        arguments = [sys.executable, "-P", "-m", module, *sys.argv[1:]]
-        os.execve(sys.executable, arguments, {**os.environ, "PYTHONHASHSEED": "0"})
 
 
 class Host:
@@ -157,13 +153,13 @@ class Host:
                 task.cancel()
 
     def restart(self, welcome: wire.Welcome) -> None:
-        """Run a node's program anew, as another incarnation (simulated)."""
+        """Run a node's program again, as another incarnation (simulated)."""
         node = self.nodes[welcome.node] = self._node(welcome)
         self._active[node.id] = True
         self._start(node)
 
     def pause(self, nodes: Iterable[str]) -> None:
-        """From now on these nodes stand still, and no others: their callbacks wait (simulated)."""
+        """Pause these nodes from now on, and no others: their callbacks wait (simulated)."""
         self._paused = set(nodes)
         self._hold()
 
@@ -182,14 +178,14 @@ class Host:
             self._clocks.pop(clock.node, None)
             if clock.is_wrong:
                 self._clocks[clock.node] = clock
-        loop.clock_error_of = self._bend_of_task if self._clocks else _no_bend
+        loop.clock_error_of = self._clock_error_of_task if self._clocks else _no_clock_error
 
-    def _bend_of_task(self) -> wire.ClockError | None:
+    def _clock_error_of_task(self) -> wire.ClockError | None:
         node = _current_node.get()
         return None if node is None else self._clocks.get(node.id)
 
     def _shown_ns(self, node: str, time_ns: int) -> int:
-        """What the clock of `node` showed at `time_ns`, as it went then."""
+        """Time that the clock of `node` showed at `time_ns`, as it went then."""
         for clock_error in reversed(self._past_clocks.get(node, ())):
             if clock_error.since_ns <= time_ns:
                 return max(clock_error.shown_ns(time_ns), 0)
@@ -206,13 +202,13 @@ class Host:
             self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
 
     def take_traffic(self) -> wire.Traffic:
-        """Everything that the nodes have handed over since the last call."""
+        """Return everything that the nodes have enqueued since the last call."""
         traffic = wire.Traffic(self._frames, self._reports, self._endings)
         self._frames, self._reports, self._endings = [], [], []
         return traffic
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
-        """What the process has to say when nothing is left to do at this instant (lockstep)."""
+        """Return the yield of the process when nothing is left to do at this instant (lockstep)."""
         nodes = self.nodes.values()
         return wire.Yield(
             nonce,
@@ -255,15 +251,15 @@ class Host:
                 self.end(node.id, "spun", str(spin), self.stacks(node.id))
 
     def _runs(self, node: Node) -> bool:
-        """Whether its program goes on, and is not what is left of an earlier incarnation."""
+        """Return whether its program goes on, and is not what is left of an earlier incarnation."""
         return self.nodes[node.id] is node and self._active[node.id]
 
     def stacks(self, node: str) -> str:
-        """Where the tasks of a node stand, as text."""
+        """Stacks of the tasks of a node, as text."""
         lines = []
         for task in self._tasks_of(self.nodes[node]):
             lines.append(f"task {task.get_name()}:")
-            lines += [f"  {place}" for place in _standing(task)]
+            lines += [f"  {place}" for place in _suspended_at(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
@@ -313,15 +309,15 @@ class Host:
         return task
 
 
-def _standing(task: asyncio.Task[Any]) -> Iterator[str]:
-    """Where a suspended task stands, from its outermost coroutine inwards."""
+def _suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
+    """Lines at which a suspended task waits, from its outermost coroutine inwards."""
     coroutine: Any = task.get_coro()
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
         coroutine = coroutine.cr_await
 
 
-def _no_bend() -> wire.ClockError | None:
+def _no_clock_error() -> wire.ClockError | None:
     """All clocks are right."""
     return None
 

@@ -74,7 +74,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         return super().call_at(self._own_when(when), callback, *args, context=context)
 
     def _own_when(self, when: float) -> float:
-        """When, on the loop's own clock, the clock of the task that asks shows `when`."""
+        """Time on the loop's own clock at which the clock of the task that asks shows `when`."""
         clock_error = self.clock_error_of()
         return when if clock_error is None else self.own_time() + (when - self.time()) / (1 + clock_error.rate)
 
@@ -102,13 +102,13 @@ class VirtualTimeLoop(SkewedLoop):
         return self._now_ns
 
     def start_at(self, time_ns: int) -> None:
-        """Set the clock before anything runs: a process that is started anew joins late."""
+        """Set the clock before anything runs: a process that is started again joins late."""
         self._now_ns = time_ns
 
     def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
         """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
 
-        Timers that became due meanwhile are due when they are let go: after what has come in by then, in order.
+        Timers that became due meanwhile are due when they are released: after what has come in by then, in order.
         """
         ready = asyncio_internals.ready_queue(self)
         if not isinstance(ready, _HoldingQueue):
@@ -140,7 +140,7 @@ class VirtualTimeLoop(SkewedLoop):
         self.run_until_complete(main)
 
     def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
-        """What the selector does instead of sleeping."""
+        """Yield, in place of the selector's sleep."""
         if timeout is not None and timeout <= 0:
             self._count_round()
             return poll(0)
@@ -212,7 +212,7 @@ class VirtualTimeLoop(SkewedLoop):
 
 
 class _HoldingQueue(deque[asyncio.Handle]):
-    """The loop's queue of callbacks that are ready, but for those of programs that stand still."""
+    """The loop's queue of callbacks that are ready, but for those of programs that are paused."""
 
     def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
         super().__init__(ready)
@@ -226,7 +226,7 @@ class _HoldingQueue(deque[asyncio.Handle]):
             super().append(handle)
 
     def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
-        """Hold what `holds` says, and let go of the rest in the order in which it came; returns timers let go."""
+        """Hold what `holds` says, and release the rest in the order in which it came; returns its timers."""
         waiting, held = list(self), self._held
         self.clear()
         self._holds, self._held = holds, []

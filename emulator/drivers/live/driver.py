@@ -1,4 +1,4 @@
-"""What the drivers of both pacings have in common: faults are applied to processes in one order."""
+"""The base of the drivers of both pacings: faults are applied to processes in one order."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ class LiveSession:
 
     @property
     def endpoint(self) -> str:
-        """Where agents and operators connect."""
+        """Endpoint to which agents and operators connect."""
         return self._attachment.endpoint
 
     def close(self) -> None:

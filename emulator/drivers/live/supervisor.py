@@ -21,6 +21,7 @@ from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.signals import gets_signals, signals_handled
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
+from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport import wire
 
 DEATH_GRACE_S = 0.3
@@ -34,7 +35,7 @@ REALTIME_AGENT_NICE = 10
 
 
 class ProcessState(StrEnum):
-    """What a process of agents is doing, as far as the emulator knows."""
+    """State of a process of agents, as far as the emulator knows."""
 
     RUNNING = "running"
     PAUSED = "paused"
@@ -120,7 +121,7 @@ class Supervisor:
         if state is not ProcessState.DEAD:
             process.death = None
 
-    # What the run has them do.
+    # On the order of the run.
 
     def launch(self, nodes: Sequence[str]) -> None:
         """Start the process of these nodes."""
@@ -200,7 +201,7 @@ class Supervisor:
         """Wait for those that have been told to end."""
         await asyncio.gather(*self._ending)
 
-    # What becomes of them by themselves.
+    # Without an order.
 
     @contextmanager
     def watching_children(self) -> Iterator[None]:
@@ -233,8 +234,10 @@ class Supervisor:
         elif self._processes:
             self._died(name, how=how.how, log_tail=how.log_tail)
         else:
-            last = how.log_tail.splitlines()[-1:] or ["its log is empty"]
-            self.failure = VnetError(f"agent {name} ended before the start ({how.how}): {last[0]}")
+            last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
+            if "No module named" in last and (foreign := foreign_on_path("agents")):
+                last = f"{last}; {foreign}"
+            self.failure = VnetError(f"agent {name} ended before the start ({how.how}): {last}")
             self._changes.set()
 
     def disconnected(self, node: str) -> None:

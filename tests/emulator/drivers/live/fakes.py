@@ -1,22 +1,45 @@
 """What surrounds the parts of a live run, without processes and without Zenoh: it notes what it is told to do."""
 
 import signal
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+import pytest
 
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import Exit
+from emulator.drivers.live import lockstep_driver, realtime_driver, reconnection
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
 from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.access import Access
+from vnet.units import NS_PER_S
 
 IDS = ["v01", "v02", "v03", "v04"]
 ALONE = [[node] for node in IDS]
+
+
+def in_virtual_time(main: Coroutine[Any, Any, None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run `main` on a loop that skips all waiting; the drivers take their clock from it."""
+    loop = VirtualTimeLoop(skip_to)
+    clock = SimpleNamespace(monotonic_ns=lambda: loop.now_ns, monotonic=lambda: loop.now_ns / NS_PER_S)
+    for module in (lockstep_driver, realtime_driver, reconnection):
+        monkeypatch.setattr(module, "time", clock)
+    try:
+        loop.run_until_complete(main)
+    finally:
+        loop.close()
+
+
+def skip_to(next_timer_ns: int | None) -> int:
+    assert next_timer_ns is not None, "it waits for nothing that will come"
+    return next_timer_ns
 
 
 class FakeLauncher:

@@ -1,0 +1,255 @@
+"""The drivers of both pacings, against processes that only answer."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from emulator.drivers.live.driver import Driver, Parts
+from emulator.drivers.live.inbox import Inbox, Refusals
+from emulator.drivers.live.lockstep_driver import LockstepDriver
+from emulator.drivers.live.realtime_driver import RealTimeDriver
+from emulator.drivers.live.reconnection import Reconnection
+from emulator.drivers.live.waiting import Stalled
+from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
+from vnet.transport import wire
+
+MS = 1_000_000
+RUN = {"duration_s": 0.6, "settle_s": 0.1, "stall_timeout_s": 1.0, "join_timeout_s": 1.0}
+Answer = Callable[[str, Any], wire.AgentMessage | None]
+
+
+class Play:
+    """A driver on a stage. What processes say to a message, by `answer`, comes in through the inbox."""
+
+    def __init__(self, kind: type[Driver], answer: Answer, **stage: Any) -> None:
+        pacing = "lockstep" if kind is LockstepDriver else "realtime"
+        stage["run"] = {**RUN, **stage.get("run", {})}
+        self.stage = Stage(pacing=pacing, **stage)
+        self.stage.join(begin=False)
+        self.refusals = Refusals("run", self.stage.emulation.folder, lambda: 0)
+        self.inbox = Inbox(
+            self.stage.members, self.refusals, self.stage.changes, lambda node: None, lambda verb, query: None
+        )
+        common: dict[str, Any] = {
+            "emulation": self.stage.emulation,
+            "members": self.stage.members,
+            "supervisor": self.stage.supervisor,
+            "launcher": self.stage.launcher,
+            "attachment": self.stage.attachment,
+            "inbox": self.inbox,
+        }
+        reconnection = Reconnection(**common, options=self.stage.options, time_ns=lambda: self.driver.time_ns)
+        parts = Parts(**common, reconnection=reconnection, changes=self.stage.changes)
+        self.driver = kind(parts, self.stage.members.processes())
+        self.answer = answer
+        self.stage.attachment.on_send = self.respond
+
+    def respond(self, node: str, message: wire.EmulatorMessage) -> None:
+        said = self.answer(node, message)
+        if said is not None:
+            self.inbox.put_message(node, wire.encode(said))
+
+    def sent(self, kind: type) -> list[tuple[str, Any]]:
+        return [(node, message) for node, message in self.stage.attachment.sent if isinstance(message, kind)]
+
+
+def yields(node: str, message: Any, nonce: bytes = b"1") -> wire.AgentMessage | None:
+    """A process in lockstep with a timer every 100 ms."""
+    if isinstance(message, wire.StackRequest):
+        return wire.StackDump(nonce, f"{node} is here")
+    if not isinstance(message, wire.Grant):
+        return None
+    frames = [wire.Frame(node, b"x")] if node == "v01" else []
+    return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), wire.Traffic(frames))
+
+
+def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
+    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
+    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
+
+
+def test_lockstep_runs_to_the_end_grant_by_grant(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        play = Play(LockstepDriver, yields)
+        await play.driver.run()
+        grants = play.sent(wire.Grant)
+        assert [node for node, _ in grants] == IDS * 6
+        assert [grant.time_ns for node, grant in grants if node == "v02"] == [n * 100 * MS for n in range(6)]
+        assert len(play.stage.emulation.metrics.rows) == 3
+        assert len(play.stage.emulation.engine.trace) == 6 * 3
+        assert play.driver.time_ns == 500 * MS
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_death_is_told_at_the_barrier_that_the_process_does_not_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if node == "v02" and isinstance(message, wire.Grant) and message.time_ns == 200 * MS:
+                play.stage.launcher.dies(play.stage.supervisor, "v02")
+                return None
+            return yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        await play.driver.run()
+        (died,) = [event for event in play.stage.emulation.folder.events if event.kind == "died"]
+        assert (died.node, died.time_ns, died.details["how"]) == ("v02", 200 * MS, "SIGSEGV")
+        assert [node for node, _ in play.sent(wire.Grant)].count("v01") == 6
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        returning: list[str] = []
+
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            return yields(node, message, b"2" if node == "v02" and returning else b"1")
+
+        play = Play(LockstepDriver, answer, faults=[fault("kill", 0.15, 0.2, "v02")])
+        start = play.stage.launcher.start_agent
+
+        def start_and_join(*arguments: Any, **more: Any) -> None:
+            start(*arguments, **more)
+            returning.append("v02")
+            play.stage.members.hello("v02", hello("v02", nonce=b"2"))
+
+        play.stage.launcher.start_agent = start_and_join  # type: ignore[method-assign]
+        await play.driver.run()
+        times = [(grant.seq, grant.time_ns // MS) for node, grant in play.sent(wire.Grant) if node == "v02"]
+        assert times == [(0, 0), (1, 100), (0, 350), (1, 450), (2, 550)]
+        assert play.stage.launcher.done == [("kill", "v02"), ("start", "v02")]
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_process_that_does_not_come_back_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        play = Play(LockstepDriver, yields, faults=[fault("restart", 0.15, 0.2, "v02")])
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+        assert (stalled.node, stalled.details["error"]) == ("v02", "has not come back within 1 s")
+        assert play.sent(wire.End) == [("v02", wire.End(None, "restarted by a fault"))]
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_process_that_does_not_yield_ends_the_run_with_its_stack(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            stuck = isinstance(message, wire.Grant) and message.time_ns == 200 * MS
+            return None if stuck and node in ("v02", "v03") else yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        assert play.stage.events("stalled") == [("stalled", "v02"), ("stalled", "v03")]
+        where = {e.node: e.details["where"] for e in play.stage.emulation.folder.events if e.kind == "stalled"}
+        assert where == {"v02": "v02 is here", "v03": "v03 is here"}
+        assert play.stage.launcher.done == [("stack", "v02"), ("stack", "v03")]
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_a_restart_of_the_emulator_is_announced_and_ends_when_all_have_answered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        asked: list[str] = []
+
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if isinstance(message, wire.StackRequest):
+                asked.append(node)
+                if asked.count(node) == 1 and node == "v03":
+                    return None  # not connected yet
+            return yields(node, message)
+
+        play = Play(LockstepDriver, answer, faults=[fault("emulator_restart", 0.2, 0.1, down_s=0.01)])
+        await play.driver.run()
+        assert [node for node, _ in play.sent(wire.Await)] == IDS
+        assert play.stage.attachment.done == ["close", "open"]
+        assert asked.count("v03") == 2
+        assert play.stage.events("emulator_restarted") == [("emulator_restarted", None)]
+        assert not play.stage.supervisor.reconnecting
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_a_message_of_the_other_pacing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        play = Play(LockstepDriver, yields)
+        play.inbox.put_message("v01", wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic())))
+        await play.driver.run()
+        assert play.stage.events("refused") == [("refused", "v01")]
+
+    in_virtual_time(run(), monkeypatch)
+
+
+# Real time, on a clock that only the test moves.
+
+
+def frames(node: str, message: Any) -> wire.AgentMessage | None:
+    """A process in real time that acknowledges every batch, and says its last words when it is told to end."""
+    if isinstance(message, wire.Batch):
+        sent = [wire.Frame(node, b"x")] if message.fixes else []
+        return wire.Frames(b"1", message.seq, message.seq + 1, [], wire.Traffic(sent))
+    return None
+
+
+def test_real_time_sends_what_is_due_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        play = Play(RealTimeDriver, frames)
+        await play.driver.run()
+        batches = play.sent(wire.Batch)
+        for node in IDS:
+            seqs = [batch.seq for each, batch in batches if each == node]
+            assert seqs == list(range(len(seqs)))
+            fixes = [fix.time_ns for each, batch in batches if each == node for fix in batch.fixes]
+            assert fixes == [0, 200 * MS, 400 * MS]
+        assert play.driver.time_ns >= play.stage.emulation.duration_ns
+        assert play.stage.events("died", "stalled", "refused") == []
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_real_time_a_death_is_told_at_once_and_nobody_waits_for_last_words_of_the_dead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if node == "v02" and isinstance(message, wire.Batch) and message.seq == 1:
+                play.stage.launcher.dies(play.stage.supervisor, "v02")
+            return frames(node, message)
+
+        play = Play(RealTimeDriver, answer)
+        await play.driver.run()
+        assert play.stage.events("died") == [("died", "v02")]
+        assert not play.stage.emulation.up["v02"]
+        for node in ("v01", "v03", "v04"):
+            seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
+            last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
+            play.inbox.put_message(node, wire.encode(last))
+        before_ns = play.driver.time_ns
+        await play.driver.finish(3600.0)
+        assert play.driver.time_ns == before_ns
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_real_time_a_process_that_says_no_last_words_is_waited_for_until_the_deadline(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        play = Play(RealTimeDriver, frames)
+        await play.driver.run()
+        before_ns = play.driver.time_ns
+        await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 1.0)
+        assert play.driver.time_ns - before_ns == 1000 * MS
+
+    in_virtual_time(run(), monkeypatch)

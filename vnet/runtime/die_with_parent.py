@@ -1,0 +1,53 @@
+"""A signal for a process when the one that started it ends: a parent that is killed leaves nothing behind.
+
+`python -m vnet.runtime.die_with_parent COMMAND …` becomes COMMAND, and ends when its parent does (on Linux;
+elsewhere COMMAND just runs).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+
+PR_SET_PDEATHSIG = 1
+POLL_S = 0.5
+"""Seconds between two looks for the parent, on systems that do not tell."""
+
+
+def signal_at_parent_death(number: signal.Signals) -> None:
+    """Have this process sent a signal when the one that started it ends.
+
+    On Linux the kernel sends it, to a stopped process too; elsewhere a thread of this process does.
+    """
+    parent = os.getppid()
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError, AttributeError):  # a C library without prctl
+            ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, number)
+            if os.getppid() != parent:  # it has ended meanwhile
+                os.kill(os.getpid(), number)
+            return
+    threading.Thread(target=_watch, args=(parent, number), daemon=True).start()
+
+
+def _watch(parent: int, number: signal.Signals) -> None:
+    while os.getppid() == parent:
+        time.sleep(POLL_S)
+    os.kill(os.getpid(), number)
+
+
+def main(command: list[str]) -> None:
+    """Become `command`."""
+    for number in (signal.SIGTERM, signal.SIGINT):  # whatever it was that started this may ignore them
+        signal.signal(number, signal.SIG_DFL)
+    if sys.platform == "linux":  # elsewhere the thread would not survive
+        signal_at_parent_death(signal.SIGTERM)
+    os.execv(command[0], command)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

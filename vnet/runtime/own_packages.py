@@ -1,0 +1,49 @@
+"""vnet's own top-level packages, and files of a user's that bear the same names.
+
+Both cannot be imported in one process: whichever is found hides the other. These functions name the file for the
+one line of an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+
+OWN = ("agents", "emulator", "vnet")
+ROOT = Path(__file__).resolve().parents[2]
+"""The folder that holds vnet's own packages."""
+
+
+def foreign_on_path(package: str, path: Sequence[str] | None = None) -> str:
+    """Name what `path` (default: `sys.path`) has in place of one of vnet's own packages; "" if nothing."""
+    if package not in OWN:
+        return ""
+    found = _file_of(PathFinder.find_spec(package, path))
+    if found is None or found.parent == ROOT / package:
+        return ""
+    return f"{package}: found {found}, which is not vnet's package of this name: rename it"
+
+
+def _file_of(spec: ModuleSpec | None) -> Path | None:
+    if spec is None:
+        return None
+    folders = list(spec.submodule_search_locations or ())
+    file = spec.origin or (f"{folders[0]}/__init__.py" if folders else None)
+    return None if file is None else Path(file).resolve()
+
+
+def name_clash(module: str, folder: Path) -> str:
+    """Name the file that shares its name with the package of `module`, of which one cannot be imported; "" if none.
+
+    Either something else has been found in place of vnet's own package, or vnet's own hides the one in `folder`.
+    """
+    package = module.partition(".")[0]
+    if package not in OWN:
+        return ""
+    if foreign := foreign_on_path(package):
+        return foreign
+    for file in (folder / f"{package}.py", folder / package / "__init__.py"):
+        if file.exists() and file.resolve().parent != ROOT / package:
+            return f"{package} is a package of vnet's own: rename {file}"
+    return ""
