@@ -9,10 +9,10 @@ import pytest
 
 from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
 from agents.cooperative.attacker import Attack, Attacker
+from agents.cooperative.estimator import Estimator, usable
 from agents.cooperative.fix_table import CAPACITY, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name
 from agents.cooperative.options import Options
-from agents.cooperative.program import Estimator, usable
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
