@@ -37,7 +37,7 @@ from vnet.units import NS_PER_S
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 EPOCH_LEAP = 20
-"""Epochs between two frames of an attack on the epochs: more than honest vehicles start in seconds."""
+"""Number of epochs by which each frame of the lie `epoch` is ahead: more than a leap's largest penalty."""
 _NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
 """Values of a non-finite estimate and covariance, in turns."""
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))

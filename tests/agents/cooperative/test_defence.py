@@ -1,4 +1,4 @@
-"""What the cooperative program does with liars, copies, replays, floods, restarts and partitions."""
+"""The cooperative program against attackers, copies, replays, floods, restarts and partitions."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -216,7 +216,7 @@ def test_frames_of_the_past_are_old_or_stale() -> None:
 
 
 def test_ghosts_are_copies() -> None:
-    """Whether they send the same bytes or put their own names to them."""
+    """Be it that they send the same bytes or put their own names to them."""
     town, quiet = Town(), Town()
 
     def ghosts(packet: Packet) -> list[Packet]:
