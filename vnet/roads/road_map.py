@@ -97,7 +97,16 @@ class RoadMap:
         segment = segment[grid.order]
         east_m, north_m = self.point_m[segment].T.copy()
         to_east, to_north = self.direction[segment].T.copy()
-        return _Index(grid, step_m / 2, segment, east_m, north_m, to_east, to_north, self.length_m[segment])
+        return _Index(
+            grid=grid,
+            half_m=step_m / 2,
+            segment=segment,
+            east_m=east_m,
+            north_m=north_m,
+            to_east=to_east,
+            to_north=to_north,
+            length_m=self.length_m[segment],
+        )
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
