@@ -1,8 +1,8 @@
-"""Plain consensus: each vehicle holds one fixed input, and all look for the mean of all inputs.
+"""The averaging program: mean consensus of fixed inputs, one a vehicle, without a filter.
 
-One round and one broadcast a period, and no filter around it: what is measured is the consensus alone. A round
-takes the newest frame of each peer that has come since the last, so that with a latency below a period and no loss
-round t is step t of the linear iteration.
+One round and one broadcast a period, so that the consensus is measured alone. A round takes the newest frame of
+each peer since the last round: with a latency below a period and no loss, round t is step t of the linear
+iteration.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         return parsed
 
     def is_silent(self, node: str, time_ns: int) -> bool:
-        """Whether `node` is away at `time_ns`."""
+        """Tell whether `node` is away at `time_ns`."""
         if node not in self.silent:
             return False
         from_s, to_s = self.silent[node]
@@ -60,17 +60,19 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Averager:
-    """The consensus of one vehicle with the fixed input `value` (2,), without any radio of its own."""
+    """The consensus of one vehicle with the fixed input `value` (2,), without any radio of its own.
+
+    rejected: number of frames that could not be decoded.
+    """
 
     def __init__(self, node_id: str, rule: str, value: Array) -> None:
         self.value = value
         self.consensus: Consensus = _consensus(short_name(node_id), rule)
         self.rejected = 0
-        """Frames that could not be read."""
         self._newest_ns: dict[str, int] = {}
 
     def round(self, packets: Iterable[Packet]) -> bytes:
-        """One round with the newest frame of each peer; returns the frame to broadcast."""
+        """Do one round with the newest frame of each peer; returns the frame to broadcast."""
         shares: dict[str, Share] = {}
         for packet in packets:
             sender = short_name(packet.sender)
@@ -90,13 +92,13 @@ def _consensus(name: str, rule: str) -> Consensus:
 
 
 def encode(share: Share) -> bytes:
-    """A share as the bytes of a frame."""
+    """Encode a share as the bytes of a frame."""
     frame = AveragingFrame(share.epoch, share.running_sum, sorted(share.out_neighbours), sorted(share.heard))
     return msgspec.msgpack.encode(frame)
 
 
 def decode(payload: bytes) -> Share:
-    """The share in a frame. Raises ValueError for bytes that are none, or numbers that are not finite."""
+    """Decode the share in a frame. Raises ValueError for other bytes, and for numbers that are not finite."""
     frame = msgspec.msgpack.decode(payload, type=AveragingFrame)  # its errors are ValueErrors
     if not all(map(math.isfinite, frame.running_sum)) or frame.epoch < 0:
         raise ValueError("numbers out of bounds")
@@ -104,7 +106,7 @@ def decode(payload: bytes) -> Share:
 
 
 async def main(node: Node) -> None:
-    """Average until the run ends; away while `silent`, and afresh (with the same input) on return."""
+    """Average until the run ends; a vehicle that has been `silent` starts again with the same input."""
     options = Options.parse(node.options)
     value = node.rng.standard_normal(2)
     averager = Averager(node.id, options.rule, value)
@@ -119,7 +121,7 @@ async def main(node: Node) -> None:
 
 
 def _report(node: Node, averager: Averager, size: int) -> None:
-    """The input is the `common_error_m` of the metrics, so that they find out how far the mean is off."""
+    """Report the input as the `common_error_m` of the metrics, so that they compare the mean with its mean."""
     values: dict[str, Any] = {"common_error_m": averager.value, "bytes": size, "rejected": averager.rejected}
     mean_m = averager.consensus.mean_m
     if mean_m is not None:

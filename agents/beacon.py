@@ -1,7 +1,7 @@
-"""The smallest useful program: say where you are, hear who is around.
+"""The smallest useful program: broadcast the own position, count the neighbours.
 
-Each vehicle broadcasts its raw GNSS fix ten times a second and keeps the latest fix of everybody it hears.
-Its report is its own fix, and the number of neighbours heard in the last second. `docs/tutorial.md` builds
+Each vehicle broadcasts its raw GNSS fix ten times a second and remembers the vehicles that it receives.
+Its report is its own fix, and the number of neighbours received in the last second. `docs/tutorial.md` builds
 this file from nothing.
 """
 
@@ -12,16 +12,16 @@ import struct
 from vnet import Fix, Node
 
 FRAME = struct.Struct("<dd")  # east and north in metres
-FRESH_NS = 1_000_000_000
+FRESH_NS = 1_000_000_000  # a neighbour was received within this time
 
 
 def encode(fix: Fix) -> bytes:
-    """A fix as the 16 bytes of a frame."""
+    """Encode a fix as the 16 bytes of a frame."""
     return FRAME.pack(*fix.position_m)
 
 
 def decode(payload: bytes) -> tuple[float, float] | None:
-    """The position in a frame; None for bytes that are none, which the radio may well bring."""
+    """Decode the position in a frame; None for other bytes, which the radio may well deliver."""
     return FRAME.unpack(payload) if len(payload) == FRAME.size else None
 
 

@@ -14,7 +14,7 @@ from vnet import Packet
 from vnet.types import Array
 
 STALE_PERIODS = 3
-"""Age in periods beyond which a frame is stale: two relays, and one period for the work."""
+"""Age in periods beyond which a frame is stale: the radio takes less than one, a late vehicle another."""
 EPOCH_MARGIN = 10
 """Epochs by which a frame may be ahead of one a period since the start, the most that a network begins. A frame
 that claims more is absurd, and its epoch would spread."""

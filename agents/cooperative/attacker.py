@@ -1,18 +1,18 @@
-"""A vehicle that cooperates honestly inside, and lies in what it broadcasts: what the others must withstand.
+"""An attacker: a vehicle that cooperates honestly inside, and broadcasts false frames, which others must withstand.
 
-`[[program.exceptions]]` makes one of some vehicles. Its options are those of `agents.cooperative`, and
+`[[program.exceptions]]` makes some vehicles attackers. Their options are those of `agents.cooperative`, and
 
-`lie`: what is said.
-    `offset`: its own fix, its estimate and its running sums are shifted by `offset_m`.
-    `overconfident`: its estimate is shifted by `offset_m`, and said to be known to the millimetre.
-    `sums`: its running sums alone are shifted by `offset_m`.
-    `relay`: fixes of others that it passes on are shifted by `offset_m`, and said to be brand new.
+`lie`: what is false in the frames.
+    `offset`: the own fix, estimate and running sums are shifted by `offset_m`.
+    `overconfident`: the estimate is shifted by `offset_m`, with a deviation of a millimetre.
+    `sums`: the running sums alone are shifted by `offset_m`.
+    `relay`: relayed fixes are shifted by `offset_m`, and claim to be new.
     `epoch`: each frame starts a new epoch of the consensus, `EPOCH_LEAP` ahead of the last.
-    `non_finite`: its estimate and covariance are NaN and infinite in turns.
-    `absurd`: huge estimates, negative covariances, and fixes at the end of the world, in turns.
-    `random`: bytes drawn at random, as long as a frame.
+    `non_finite`: estimate and covariance are NaN and infinite in turns.
+    `absurd`: huge estimates, negative covariances, and fixes 20 000 km away, in turns.
+    `random`: random bytes, as long as a frame.
 `offset_m`: [east, north] in metres.
-`from_s`: honest before that time of the run.
+`from_s`: time of the run before which the frames are honest.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ import numpy as np
 from msgspec import Meta
 
 from agents import options as parsing
+from agents.cooperative.estimator import Estimator
 from agents.cooperative.frame import COMMON_LIMIT_M, CooperativeFrame, encode
 from agents.cooperative.options import Options
-from agents.cooperative.program import Estimator, cooperate
+from agents.cooperative.program import cooperate
 from vnet import Fix, Node
 from vnet.types import Array
 from vnet.units import NS_PER_S
@@ -36,17 +37,18 @@ from vnet.units import NS_PER_S
 Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
 EPOCH_LEAP = 20
-"""Epochs between two frames of an attack on the epochs: more than honest vehicles start in seconds."""
+"""Number of epochs by which each frame of the lie `epoch` is ahead: more than a leap's largest penalty."""
 _NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
+"""Values of a non-finite estimate and covariance, in turns."""
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))
-"""Estimate in metres, variance in m², and shift of the fix in centimetres."""
+"""Absurd frames, in turns: estimate in metres, variance in m², and position of the fix in centimetres."""
 
 
 class Attack(msgspec.Struct, frozen=True, kw_only=True):
     """The attacker's own options."""
 
     lie: Literal["offset", "overconfident", "sums", "relay", "epoch", "non_finite", "absurd", "random"] = "offset"
-    """What is false in its frames; see the module's text."""
+    """The fields that are false; see the module's text."""
     offset_m: tuple[Finite, Finite] = (50.0, 0.0)
     """Shift (east, north) of what is false."""
     from_s: Finite = 0.0
@@ -70,7 +72,7 @@ class Attacker(Estimator):
     sent = 0
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
-        """What to broadcast together with the newest fix."""
+        """Return the bytes to broadcast with the newest fix, at most `max_payload`."""
         honest = self.compose(fix, max_payload)
         if fix.time_ns < self.attack.from_s * NS_PER_S:
             return encode(honest)
@@ -80,7 +82,7 @@ class Attacker(Estimator):
         return encode(self.falsify(honest))
 
     def falsify(self, frame: CooperativeFrame) -> CooperativeFrame:
-        """The frame, as the lie has it."""
+        """Return the frame as the attack changes it."""
         offset_m = np.array(self.attack.offset_m)
         match self.attack.lie:
             case "offset":
@@ -113,7 +115,7 @@ class Attacker(Estimator):
 
 
 def _shifted(running_sum: tuple[float, float, float], offset_m: Array) -> tuple[float, float, float]:
-    """Sums whose ratio is off by `offset_m`, as far as that may be said at all."""
+    """Return sums whose ratio is off by `offset_m`, within the bounds of a frame."""
     s_x, s_y, w = running_sum
     s_x, s_y = np.clip([s_x + w * offset_m[0], s_y + w * offset_m[1]], -COMMON_LIMIT_M * w, COMMON_LIMIT_M * w)
     return float(s_x), float(s_y), w

@@ -55,11 +55,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     fusion: Literal["optimized", "random", "metropolis", "max-degree", "constant", "none"] = "optimized"
     """Rule of the fusion weights; `none` fuses nothing."""
     exchange: Literal["estimates", "particles"] = "estimates"
-    """Whether fusion moves the cloud towards the neighbours' estimates, or mixes particles, as the paper does."""
+    """Fusion moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper."""
     relay: bool = True
-    """Whether a frame passes on the newest fixes of others."""
+    """If true, a frame relays the newest fixes of others."""
     consensus: Literal["ratio", AveragingRule, "exact"] = "ratio"
-    """How the network's mean is found. `exact` takes it from everybody's frame, so that all must hear all."""
+    """Algorithm that finds the mean of all estimates. `exact` averages all frames, so that all must hear all."""
     alpha: Share = 0.5
     """Weight of the vehicle itself, if `fusion = "constant"`."""
     self_floor: Share = 0.0
@@ -87,17 +87,17 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     start_sigma_m: Deviation = 0.0
     """Standard deviation of the first particles; 0 means `common_sigma_m`."""
     one_sided: bool = False
-    """Whether lanes are bounded on their right only, as the paper's."""
+    """If true, lanes are bounded on their right only, as in the paper."""
     separate_map_update: bool = False
-    """Whether the map weights the particles after fusion, of all vehicles and in full, as in the paper."""
+    """If true, the map weights the particles after fusion, for all vehicles and in full, as in the paper."""
     two_frames: bool = False
-    """Whether estimates follow in a frame of their own, once the fixes have been filtered, as in the paper."""
+    """If true, estimates follow in a frame of their own, once the fixes have been filtered, as in the paper."""
     hears: dict[str, list[str]] = {}
     """Neighbours of each vehicle (ids by id), if `consensus = "exact"`: only their frames are fused."""
     slots: Annotated[int, Meta(ge=1, le=1000)] = 2
     """Number of slots of the period in which vehicles send; each draws one for good."""
     defence: bool = True
-    """Whether frames and estimates that contradict the majority are rejected."""
+    """If true, frames and estimates that contradict the majority are rejected."""
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:

@@ -122,7 +122,7 @@ def emulate(folder: Path, options: dict[str, object], duration_s: float = 3.0) -
 
 
 def frames_by_period(emulation: Emulation, node: str) -> list[int]:
-    """How many frames a node sent in each period."""
+    """Number of frames that a node sent, by period."""
     rows = emulation.engine.trace.to_table().to_pylist()
     sent = {(row["sender"], row["seq"]): row["sent_ns"] // PERIOD_NS for row in rows}
     periods = [period for (sender, _), period in sent.items() if sender == node]

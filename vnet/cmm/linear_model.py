@@ -1,4 +1,4 @@
-"""The paper's linear model of a network of filters, x(t+1) = A x(t) + w(t): closed forms to hold results against.
+"""The paper's linear model of a network of filters, x(t+1) = A x(t) + w(t): closed forms to compare results with.
 
 Row i of A holds vehicle i's fusion weights, w its filter's own noise. With A 1 = 1 the mean of all estimates is a
 random walk that no fusion bounds; what fusion does bound are the deviations from it.
@@ -14,9 +14,10 @@ from vnet.types import Array
 
 
 def steady_state_covariance(transition: Array, noise: Array) -> Array:
-    """Covariance P (N, N) that stays, P = A P Aᵀ + Q, for `transition` A and the covariance `noise` Q of w.
+    """Return the covariance P (N, N) of the steady state, P = A P Aᵀ + Q, for `transition` A and the covariance
+    `noise` Q of w.
 
-    The discrete Lyapunov equation. Raises VnetError where no such P exists: a spectral radius of 1 or more.
+    The discrete Lyapunov equation. Raises VnetError if no such P exists: for a spectral radius of 1 or more.
     """
     radius = float(np.abs(np.linalg.eigvals(transition)).max())
     if radius >= 1 - 1e-12:
@@ -25,10 +26,10 @@ def steady_state_covariance(transition: Array, noise: Array) -> Array:
 
 
 def deviation_covariance(weights: Array, noise: Array) -> Array:
-    """Steady covariance (N, N) of x_i − x̄ for fusion weights with rows that add up to 1.
+    """Return the steady covariance (N, N) of x_i − x̄ for fusion weights with rows that add up to 1.
 
     With D = I − 11ᵀ/N the deviations y = D x follow y(t+1) = D A y(t) + D w(t), because A 1 = 1. Raises VnetError
-    for other row sums, and for a network in which information does not reach everybody.
+    for other row sums, and for a network in which information does not reach every vehicle.
     """
     sums = weights.sum(axis=1)
     if not np.allclose(sums, 1.0):
@@ -39,7 +40,7 @@ def deviation_covariance(weights: Array, noise: Array) -> Array:
 
 
 def convergence_factor(weights: Array) -> float:
-    """By what factor a round of x(t+1) = A x(t) brings the estimates together in the long run.
+    """Return the factor by which a round of x(t+1) = A x(t) contracts the deviations in the long run.
 
     The second-largest |eigenvalue| of A (Xiao and Boyd 2004); ρ(A − 11ᵀ/N) is the same only for doubly
     stochastic A.

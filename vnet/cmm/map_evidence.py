@@ -45,7 +45,7 @@ class MapEvidence:
 
     @property
     def drives(self) -> bool:
-        """Whether vehicles drive on this map, so that their lanes are sought at each update."""
+        """True if vehicles drive on this map, so that their lanes are sought at each update."""
         return self.matcher.drives
 
     def first_lanes(self, position_m: Array, heading_rad: float | None, gate_m: float) -> Rows:
@@ -122,7 +122,7 @@ class MapEvidence:
         alike = np.cos(along_rad - table["anchor_rad"][rows])
         alike = np.where(np.isnan(table["heading_rad"][rows]), np.abs(alike), alike)  # on the same road, either way
         turned = ~(alike > np.cos(TURN_RAD))  # NaN, so true, where it is seen for the first time
-        sure = ~(turned & (driven_m <= STAND_M))  # who stands has not turned: another lane seems nearer for once
+        sure = ~(turned & (driven_m <= STAND_M))  # one that stands has not turned: another lane seems nearer
         rows, middle_m, along_rad = rows[sure], middle_m[sure], along_rad[sure]
         driven_m, turned = driven_m[sure], turned[sure]
         new = np.where(driven_m > STAND_M, driven_m / self._lateral_m, 0.0)

@@ -9,7 +9,7 @@ fifth of the filter's time: log P is off by less than 2·10⁻⁶ for s up to 10
 lane it is exact, in the log domain, so that it neither underflows nor cancels: a filter whose particles all score
 exactly 0 has lost its way for good.
 
-On the map of a city a vehicle has several candidates, `MOST_LANES` at most, which are sought anew as it drives: the
+On the map of a city a vehicle has several candidates, `MAX_LANES` at most, which are sought again as it drives: the
 lanes near where it is believed to be that fit its heading. They are hypotheses that exclude each other, so their
 probabilities add up; that it is off every road, on a parking lot or on a road that the map does not have, is one
 more:
@@ -28,35 +28,34 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from vnet.roads.lanes import LaneMap
-from vnet.roads.road_map import RoadMap
+from vnet.roads.road_map import HEADING_TOLERANCE_RAD, RoadMap
 from vnet.types import Array
 
 FAR_SIGMAS = 5.0
-"""Beyond this many deviations outside the lane, the difference of two Φ would lose its digits."""
+"""Deviations outside the lane beyond which log P is exact: the difference of two Φ would lose its digits."""
 
 MIN_MAP_LOG_LIKELIHOOD = -6.0
 """Least log-likelihood of being on the road that programs use: a truncated likelihood, so that a vehicle whose
 fixes are false says the same of all hypotheses and cannot outvote the others (Huber and Ronchetti 2009,
 redescending M-estimators). On a wide lane −6 is reached 2.8 deviations beyond its edge."""
 
-STEPS, REACH = 128, 9
-"""The table of Φ: so many steps in a deviation; beyond so many deviations it says 0 or 1, true to 10⁻¹⁸.
+STEPS = 128
+"""Steps of the table of Φ in a deviation. A finer table drops out of the processor's cache between two steps of the
+filter, and is then no faster than the exact Φ."""
+REACH = 9
+"""Deviations beyond which the table is 0 or 1, true to 10⁻¹⁸."""
 
-A table of finer steps drops out of the processor's cache between two steps of the filter, and is then no faster
-than the exact Φ.
-"""
-
-MOST_LANES = 4
-"""A vehicle of a city has so many candidates at most: the nearest."""
+MAX_LANES = 4
+"""Number of candidates of a vehicle in a city, the nearest: one direction of a road has no more."""
 OFF_ROAD_WITHIN_M = 15.0
-"""Vehicles off the road are anywhere within this of one: parking lots are no deeper, as a rule."""
+"""Distance (m) from a road within which vehicles off the road are: parking lots are no deeper, as a rule."""
 
 OFF_MAP_M = 30.0
-"""A vehicle further from every lane that fits is not on this map: its road says nothing about the common error."""
+"""Distance (m) from every lane that fits beyond which a vehicle is not on this map: its road is no evidence."""
 
 
 def log_on_lane(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
-    """log P(on the lane) for offsets (..., K) and deviations that broadcast against them; metres."""
+    """Return log P(on the lane) for offsets (..., K) and deviations that broadcast against them; metres."""
     near = np.abs(offset_m)
     np.subtract(half_width_m, near, out=near)
     near /= sigma_m
@@ -74,7 +73,7 @@ def log_on_lane(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
 
 
 def _parabolas() -> tuple[Array, Array, Array]:
-    """The parabolas through Φ at the start, the middle and the end of each step of the table, by powers."""
+    """Return the parabolas through Φ at the start, the middle and the end of each step of the table, by powers."""
     value = ndtr(np.arange(-2 * STEPS * REACH, 2 * STEPS * REACH + 1) / (2 * STEPS))
     start, middle, end = value[:-1:2], value[1::2], value[2::2]
     slope, bend = 4 * middle - 3 * start - end, 2 * (start - 2 * middle + end)
@@ -86,20 +85,20 @@ _START, _SLOPE, _BEND = _parabolas()
 
 
 def normal_cdf(x: Array) -> Array:
-    """Φ(x) by table: off by less than 5·10⁻⁷ of its value for x ≥ −FAR_SIGMAS, and less than 2·10⁻⁹ anywhere."""
-    place = x + REACH
-    place *= STEPS
-    step = place.astype(np.intp)
-    place -= step
+    """Return Φ(x) by table, off by less than 2·10⁻⁹, and for x ≥ −FAR_SIGMAS by less than 5·10⁻⁷ of its value."""
+    fraction = x + REACH
+    fraction *= STEPS
+    step = fraction.astype(np.intp)
+    fraction -= step
     value = _BEND.take(step, mode="clip")
     for coefficient in (_SLOPE, _START):
-        value *= place
+        value *= fraction
         value += coefficient.take(step, mode="clip")
     return np.asarray(value)
 
 
 def log_left_of_edge(offset_m: Array, sigma_m: Array, half_width_m: float) -> Array:
-    """log P(not beyond the right-hand edge): the paper bounds a lane by the half-plane n·(p − p_lane) < h only."""
+    """Return log P(not beyond the right-hand edge): the paper's lane is the half-plane n·(p − p_lane) < h."""
     return np.asarray(log_ndtr((half_width_m - offset_m) / sigma_m))
 
 
@@ -108,9 +107,10 @@ def candidate_lanes(
     position_m: Array,
     heading_rad: float | None,
     gate_m: float,
-    heading_tolerance_rad: float = 0.35,
+    heading_tolerance_rad: float = HEADING_TOLERANCE_RAD,
 ) -> NDArray[np.intp]:
-    """Lanes that a vehicle may be on: within `gate_m` of `position_m` (2,), and fitting its heading if known.
+    """Return the lanes that a vehicle may be on: within `gate_m` of `position_m` (2,), and fitting its heading if
+    known.
 
     Without a heading all lanes within the gate compete. With none in the gate, the nearest that fits, unless even
     that is too far away to be the vehicle's.
@@ -133,20 +133,22 @@ Rows = NDArray[np.intp]
 
 
 class Matcher(Protocol):
-    """What a filter asks of a map: which lanes a vehicle may be on, and how likely it is to be on one.
+    """The interface of a map to a filter: the lanes that a vehicle may be on, and its likelihood of being on one.
 
-    `drives` says whether vehicles drive, so that their lanes are sought anew; `heading_rad` are the lanes'.
+    drives: whether vehicles drive, so that their lanes are sought at each update.
+    heading_rad: (L,), the headings of the lanes.
     """
 
     drives: bool
     heading_rad: Array
 
     def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
-        """Lanes within gates (m,) of (m, 2) that fit headings (m,), NaN if unknown: rows and lanes, by row."""
+        """Seek lanes within gates (m,) of (m, 2) that fit headings (m,), NaN if unknown: rows and lanes, by row."""
         ...
 
     def log_likelihood(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
-        """log P(on a road) of `count` vehicles, (count, K); `row` (E,), `lane` (E,) are their candidates, by row.
+        """Return log P(on a road) of `count` vehicles, (count, K); `row` (E,), `lane` (E,) are their candidates, by
+        row.
 
         Positions (E, 2, K) and covariances (E, 2, 2) are the vehicles' of each candidate. Without a candidate: 0.
         """
@@ -154,9 +156,9 @@ class Matcher(Protocol):
 
 
 class StraightLanes:
-    """Matches vehicles that stand to straight lanes (`LaneMap`): each keeps the candidates of its first fix.
+    """Matching of vehicles that stand to straight lanes (`LaneMap`): each keeps the candidates of its first fix.
 
-    `one_sided` lanes are bounded on their right only; no lane says less than `min_map_log_likelihood`.
+    `one_sided` lanes are bounded on their right only; no log-likelihood is below `min_map_log_likelihood`.
     """
 
     drives = False
@@ -190,7 +192,7 @@ class StraightLanes:
 
 
 class CityRoads:
-    """Matches vehicles that drive to the map of a city (`RoadMap`); `off_road` is the share of those on no road."""
+    """Matching of vehicles that drive to the map of a city (`RoadMap`); the share `off_road` is on no road."""
 
     drives = True
 
@@ -201,14 +203,14 @@ class CityRoads:
         self._off_road = off_road / (1 - off_road) / OFF_ROAD_WITHIN_M
 
     def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
-        """See `Matcher`; of each lane only its nearest segment, as if it went on."""
+        """See `Matcher`; of each lane only its nearest segment counts, as if it had no end."""
         row, segment, _ = self._roads.near(position_m, heading_rad, gate_m)
         number = row * self._lanes + self._roads.lane[segment]
         _, first = np.unique(number, return_index=True)  # the nearest: they come by row, and then by distance
         first.sort()
         row, segment = row[first], segment[first]
-        place = np.arange(len(row)) - np.searchsorted(row, row)
-        return row[place < MOST_LANES], segment[place < MOST_LANES]
+        is_near = np.arange(len(row)) - np.searchsorted(row, row) < MAX_LANES
+        return row[is_near], segment[is_near]
 
     def log_likelihood(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
         """See `Matcher`."""
@@ -225,14 +227,14 @@ class CityRoads:
 
 
 def matcher(lanes: LaneMap | RoadMap, one_sided: bool, min_map_log_likelihood: float, off_road: float) -> Matcher:
-    """What matches vehicles to a map of this kind."""
+    """Return the matching for a map of this kind."""
     if isinstance(lanes, RoadMap):
         return CityRoads(lanes, off_road)
     return StraightLanes(lanes, one_sided, min_map_log_likelihood)
 
 
 def _across(normal: Array, offset_m: Array, position_m: Array, covariance_m2: Array) -> tuple[Array, Array]:
-    """Signed offsets (E, K) from lanes with normals (E, 2) and n·p (E,), and their deviations (E, 1)."""
+    """Return signed offsets (E, K) from lanes with normals (E, 2) and n·p (E,), and their deviations (E, 1)."""
     normal = normal[:, None, :]
     offset = (normal @ position_m)[:, 0]
     offset -= offset_m[:, None]
@@ -241,7 +243,7 @@ def _across(normal: Array, offset_m: Array, position_m: Array, covariance_m2: Ar
 
 
 def _by_row(add: np.ufunc, score: Array, row: Rows, count: int, nothing: float = 0.0) -> Array:
-    """Scores (E, K) added up by row (E,), (count, K); `nothing` where a row has none."""
+    """Add scores (E, K) up by row (E,), (count, K); `nothing` where a row has none."""
     result = np.full((count, score.shape[1]), nothing)
     if len(row):
         first = np.flatnonzero(np.diff(row, prepend=-1))  # entries of a row stand together

@@ -67,9 +67,9 @@ class RbpfConfig:
     start_sigma_m: float | None = None
     """Deviation of the first particles, if not `common_sigma_m`."""
     one_sided: bool = False
-    """Whether lanes are bounded on the right only, as the paper's."""
+    """If set, lanes are bounded on the right only, as the paper's."""
     separate_map_update: bool = False
-    """Whether a step leaves the map to `update_from_map`, as the paper's."""
+    """If set, a step leaves the map to `update_from_map`, as the paper's."""
     min_map_log_likelihood: float = -np.inf
     """Least log-likelihood of being on a straight road: see `MIN_MAP_LOG_LIKELIHOOD`."""
     off_road: float = 0.1

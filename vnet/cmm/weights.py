@@ -1,4 +1,4 @@
-"""Fusion weights: how much of each neighbour's estimate a vehicle takes over (MODEL 5).
+"""Fusion weights: the share of each neighbour's estimate that a vehicle takes over (MODEL 5).
 
 `OptimizedWeights` minimizes the paper's objective, the distance of the fused estimate to the network's mean, with a
 ridge that says how uncertain each estimate is itself.
@@ -17,8 +17,9 @@ from vnet.errors import VnetError
 from vnet.types import Array
 
 RIDGE_FLOOR_M2 = 0.01
-MOST_SOLVERS = 64
-"""A flood of senders would have one set up for every number of neighbours, and kept."""
+"""Least ridge (m²): an estimate that claims to be exact does not take all the weight."""
+MAX_SOLVERS = 64
+"""Number of solvers that are kept, one for each number of neighbours: a flood of senders would need hundreds."""
 
 
 class OptimizedWeights:
@@ -37,7 +38,7 @@ class OptimizedWeights:
         self._solvers: dict[int, osqp.OSQP] = {}
 
     def solve(self, estimates_m: Array, covariances_m2: Array, mean_m: Array) -> Array:
-        """Weights (n,) for estimates (n, 2), the vehicle's own first, with covariances (n, 2, 2).
+        """Return weights (n,) for estimates (n, 2), the vehicle's own first, with covariances (n, 2, 2).
 
         Raises VnetError for a covariance that is not positive definite.
         """
@@ -61,7 +62,7 @@ class OptimizedWeights:
 
     def _solver(self, count: int) -> osqp.OSQP:
         if count not in self._solvers:
-            if len(self._solvers) >= MOST_SOLVERS:
+            if len(self._solvers) >= MAX_SOLVERS:
                 self._solvers.clear()
             rows, columns = _upper_triangle(count)
             hessian = sp.csc_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
@@ -75,14 +76,14 @@ class OptimizedWeights:
 
 
 def no_fusion_weights(count: int) -> Array:
-    """Everything on the vehicle itself, the first of (count,)."""
+    """Return weights (count,) with everything on the vehicle itself, the first."""
     weights = np.zeros(count)
     weights[0] = 1.0
     return weights
 
 
 def constant_weights(count: int, alpha: float) -> Array:
-    """α on the vehicle itself, the rest in equal parts on its neighbours: the paper's ring. (count,)
+    """Return α on the vehicle itself, the rest in equal parts on its neighbours: the paper's ring. (count,)
 
     Raises VnetError for an α outside 0 … 1.
     """
@@ -96,19 +97,19 @@ def constant_weights(count: int, alpha: float) -> Array:
 
 
 def metropolis_weights(degree: int, neighbour_degrees: Sequence[int]) -> Array:
-    """1 / (1 + max(d_i, d_j)) on neighbour j, the rest on oneself: (1 + n,). Degrees leave out the node itself.
+    """Return 1 / (1 + max(d_i, d_j)) for neighbour j and the rest for the vehicle itself: (1 + n,), its own first.
 
-    The paper's A_ij = 1 / max(d_i, d_j) counts it in, and is the same. Doubly stochastic on an undirected graph
-    (Xiao and Boyd 2004).
+    Degrees do not count the vehicle itself; the paper's do, so that its A_ij = 1 / max(d_i, d_j) is the same.
+    Doubly stochastic on an undirected graph (Xiao and Boyd 2004).
     """
     others = [1 / (1 + max(degree, other)) for other in neighbour_degrees]
     return np.array([1 - sum(others), *others])
 
 
 def max_degree_weights(count: int, max_degree: int) -> Array:
-    """1 / (1 + d_max) on each neighbour, the rest on oneself: (count,). `max_degree` is that of the whole network.
+    """Return 1 / (1 + d_max) for each neighbour and the rest for the vehicle itself: (count,), its own first.
 
-    Raises VnetError where the vehicle itself has more neighbours than that.
+    `max_degree` is that of the whole network. Raises VnetError if the vehicle itself has more neighbours.
     """
     if max_degree < count - 1:
         raise VnetError(f"max_degree = {max_degree}: at least the vehicle's own {count - 1} neighbours expected")
@@ -118,13 +119,13 @@ def max_degree_weights(count: int, max_degree: int) -> Array:
 
 
 def random_weights(count: int, rng: np.random.Generator) -> Array:
-    """Uniformly random weights (count,) that add up to 1, as the paper's random fusion."""
+    """Draw uniformly random weights (count,) that add up to 1, as the paper's random fusion."""
     weights = rng.random(count)
     return np.asarray(weights / weights.sum())
 
 
 def largest_remainder(weights: Array, total: int) -> Array:
-    """Whole numbers (n,) that add up to `total`, in proportion to `weights` (Hamilton's method)."""
+    """Return whole numbers (n,) that add up to `total`, in proportion to `weights` (Hamilton's method)."""
     exact = weights * total
     counts = np.floor(exact).astype(np.intp)
     order = np.argsort(-(exact - counts), kind="stable")
@@ -133,7 +134,7 @@ def largest_remainder(weights: Array, total: int) -> Array:
 
 
 def check_covariances(covariances_m2: Array) -> None:
-    """Raises VnetError unless all of (n, 2, 2) are positive definite."""
+    """Raise VnetError unless all of (n, 2, 2) are positive definite."""
     a, b, d = covariances_m2[:, 0, 0], covariances_m2[:, 0, 1], covariances_m2[:, 1, 1]
     good = (a > 0) & (a * d - b * b > 0)
     if not np.all(good):
@@ -156,7 +157,7 @@ _SETTINGS = {
 
 
 def _upper_triangle(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the upper triangle in the order of OSQP's data: column by column."""
+    """Return rows and columns of the upper triangle in the order of OSQP's data: column by column."""
     rows, columns = np.triu_indices(count)
     order = np.lexsort((rows, columns))
     return rows[order], columns[order]

@@ -1,1 +1,1 @@
-"""Roads as vehicles know them: straight lanes, and the map of a city with its index."""
+"""Digital maps of the vehicles: straight lanes, and the map of a city with its index."""

@@ -1,4 +1,4 @@
-"""Points sorted by the squares of a grid, so that those in many boxes are found by a few operations on arrays.
+"""Points sorted by the squares of a grid, so that a few operations on arrays find those in many boxes.
 
 A k-d tree (scipy's) finds them as well, and takes eight times as long for the boxes of 1000 vehicles in a city: it
 makes a Python list for each.
@@ -15,7 +15,10 @@ Ints = NDArray[np.intp]
 
 
 class Grid:
-    """Points (P, 2) in squares of `side_m`. Their places are within 10⁹ m."""
+    """Points (P, 2) in squares of `side_m`; coordinates are within 10⁹ m.
+
+    order: (P,), the indices of the points, sorted by square.
+    """
 
     def __init__(self, point_m: Array, side_m: float) -> None:
         self._side_m = side_m
@@ -27,13 +30,14 @@ class Grid:
         self._number = number[self.order]
 
     def _cell(self, position_m: Array) -> Array:
-        """Columns and rows (n, 2), still as fractions."""
+        """Return columns and rows (n, 2) as whole floats, also outside the grid."""
         return np.asarray(np.floor((position_m - self._low_m) / self._side_m))
 
     def find(self, low_m: Array, high_m: Array) -> tuple[Ints, Ints]:
-        """The points in the squares that boxes from `low_m` to `high_m` (M, 2) touch: all in them, and some beside.
+        """Find the points in the squares that boxes from `low_m` to `high_m` (M, 2) touch: all inside, and some
+        beside.
 
-        Returns pairs of a box and a place in `order`, by box. A box that is not a number holds none.
+        Returns pairs of a box and an index into `order`, by box. A box that is not a number holds none.
         """
         last = np.array([self._columns, self._rows]) - 1
         first = np.nan_to_num(np.maximum(self._cell(low_m), 0), nan=1.0, posinf=np.inf)
@@ -49,7 +53,7 @@ class Grid:
 
 
 def _ranges(label: Ints, start: Ints, end: Ints) -> tuple[Ints, Ints]:
-    """All integers from `start` (n,) to `end` (n,), each after the `label` (n,) of its range."""
+    """Return all integers from `start` (n,) to `end` (n,), each after the `label` (n,) of its range."""
     count = np.maximum(end - start, 0)
     until = np.cumsum(count)
     total = int(until[-1]) if len(until) else 0

@@ -1,4 +1,4 @@
-"""The digital map as vehicles know it: straight lanes, unlabelled.
+"""The digital map of vehicles on straight roads: lanes without labels.
 
 A lane is the straight line through a point with a direction of travel (MODEL 1). Positions are metres in a
 local east-north frame; headings are radians counter-clockwise from east, in [0, 2π).
@@ -18,8 +18,8 @@ from vnet.types import Array
 class LaneMap:
     """All lanes of an area: `point_m` (L, 2), `heading_rad` (L,), and the half-width available to a centre.
 
-    `half_width_m` is how far a vehicle's centre may be from the lane's centre line: (3.5 - 1.8) / 2 = 0.85 m
-    for a 3.5 m lane and a 1.8 m car.
+    `half_width_m` is the largest distance of a vehicle's centre from the lane's centre line: (3.5 - 1.8) / 2 =
+    0.85 m for a 3.5 m lane and a 1.8 m car.
     """
 
     point_m: Array
@@ -50,7 +50,7 @@ class LaneMap:
         return np.asarray(across_m - self.offset_m[lane])
 
     def to_wire(self) -> list[float | list[float]]:
-        """A plain form for a message; `from_wire` restores it bit by bit."""
+        """Return a plain form for a message; `from_wire` restores it bit by bit."""
         return [self.point_m.ravel().tolist(), self.heading_rad.tolist(), self.half_width_m]
 
     @classmethod

@@ -1,7 +1,7 @@
-"""The digital map of a city as vehicles know it: directed lanes, cut into straight segments.
+"""The digital map of a city: directed lanes, cut into straight segments.
 
 Positions are metres in a local east-north frame; headings are radians counter-clockwise from east, in [0, 2π).
-A map says nothing about who drives where. Programs get the part of it around the scenario's area.
+A map does not tell where vehicles are. Programs get the part of it around the scenario's area.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
 INDEX_STEP_M = 40.0
-"""The index holds a point for at least every so many metres of a segment."""
-MOST_INDEXED = 1_000_000
-"""About so many points besides one a segment are in the index; it is coarser where more would be needed."""
+"""Distance (m) between two points of the index on a segment: a square or two."""
+MAX_INDEXED = 1_000_000
+"""Number of points in the index besides one a segment: 64 MB. It is coarser for a map that would need more."""
 SQUARE_M = 25.0
-"""The side of the index's squares."""
+"""Side (m) of the index's squares: about the distance within which lanes are sought."""
 HEADING_TOLERANCE_RAD = 0.35
-"""A lane fits a vehicle whose heading differs by no more than this."""
+"""Difference (rad) of the headings of a vehicle and its lane: 20°, more than in a lane change."""
 FARTHEST_M = 1e8
-"""No place is further from the origin, and no segment longer, in a map that comes in a message."""
+"""Largest coordinate and length (m) in a map that comes in a message: twice the circumference of the Earth."""
 TAG = "roads"
-"""What a map's plain form says it is."""
-MOST_CLASSES = 255
-LONGEST_CLASS = 64
+"""Tag of a map's plain form."""
+MAX_CLASSES = 255
+"""Number of road classes in a map: their index is one byte."""
+MAX_CLASS_LENGTH = 64
+"""Characters of a class's name."""
 _COLUMNS = {
     "point_m": "<f8",
     "heading_rad": "<f8",
@@ -41,7 +43,7 @@ _COLUMNS = {
     "road": "<i4",
     "lane": "<i4",
 }
-"""How each column is written into a message."""
+"""Number format of each column in a message."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +51,10 @@ class RoadMap:
     """All lanes of an area as S segments.
 
     `point_m` (S, 2) is where a segment begins, `heading_rad` (S,) the direction of travel, `length_m` (S,) > 0;
-    `half_width_m` (S,) is how far a vehicle's centre may be from the lane's centre line. `kind` (S,) is the road's
-    class, an index into `classes`; `one_way` (S,) whether the road has no lane the other way; `road` and `lane`
-    (S,) number roads and lanes, each lane of a road by a number of its own. `sigma_m` is how far, as a
-    deviation, true lanes stray from the map's.
+    `half_width_m` (S,) is the largest distance of a vehicle's centre from the lane's centre line. `kind` (S,) is
+    the road's class, an index into `classes`; `one_way` (S,) is true if the road has no lane the other way; `road`
+    and `lane` (S,) number roads and lanes, each lane of a road by a number of its own. `sigma_m` is the standard
+    deviation of true lanes from the map's.
     """
 
     point_m: Array
@@ -86,34 +88,43 @@ class RoadMap:
 
     @cached_property
     def _index(self) -> _Index:
-        step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MOST_INDEXED)
+        step_m = max(INDEX_STEP_M, float(self.length_m.sum()) / MAX_INDEXED)
         pieces = np.maximum(1, np.ceil(self.length_m / step_m)).astype(np.intp)
-        whose = np.repeat(np.arange(len(self)), pieces)
-        number = np.arange(len(whose)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        along_m = (number + 0.5) / pieces[whose] * self.length_m[whose]
-        grid = Grid(self.point_m[whose] + along_m[:, None] * self.direction[whose], SQUARE_M)
-        whose = whose[grid.order]
-        east_m, north_m = self.point_m[whose].T.copy()
-        to_east, to_north = self.direction[whose].T.copy()
-        return _Index(grid, step_m / 2, whose, east_m, north_m, to_east, to_north, self.length_m[whose])
+        segment = np.repeat(np.arange(len(self)), pieces)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        along_m = (number + 0.5) / pieces[segment] * self.length_m[segment]
+        grid = Grid(self.point_m[segment] + along_m[:, None] * self.direction[segment], SQUARE_M)
+        segment = segment[grid.order]
+        east_m, north_m = self.point_m[segment].T.copy()
+        to_east, to_north = self.direction[segment].T.copy()
+        return _Index(
+            grid=grid,
+            half_m=step_m / 2,
+            segment=segment,
+            east_m=east_m,
+            north_m=north_m,
+            to_east=to_east,
+            to_north=to_north,
+            length_m=self.length_m[segment],
+        )
 
     def near(
         self, position_m: Array, heading_rad: Array, reach_m: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-        """All segments within `reach_m` (M,) of positions (M, 2) that fit their headings (M,), NaN if unknown.
+        """Find all segments within `reach_m` (M,) of positions (M, 2) that fit their headings (M,), NaN if unknown.
 
         Returns pairs of a row and a segment, by row and then by distance, and the distances in metres. A position
         that is NaN has none.
         """
         index = self._index
         margin_m = (reach_m + index.half_m)[:, None]
-        row, place = index.grid.find(position_m - margin_m, position_m + margin_m)
-        turn = index.to_east[place] * np.cos(heading_rad)[row] + index.to_north[place] * np.sin(heading_rad)[row]
+        row, point = index.grid.find(position_m - margin_m, position_m + margin_m)
+        turn = index.to_east[point] * np.cos(heading_rad)[row] + index.to_north[point] * np.sin(heading_rad)[row]
         fits = np.flatnonzero(~(turn < np.cos(HEADING_TOLERANCE_RAD)))  # NaN fits
-        row, place = row[fits], place[fits]
-        distance_m = index.distance_m(position_m[:, 0][row], position_m[:, 1][row], place)
+        row, point = row[fits], point[fits]
+        distance_m = index.distance_m(position_m[:, 0][row], position_m[:, 1][row], point)
         within = np.flatnonzero(distance_m <= reach_m[row])
-        row, segment, distance_m = row[within], index.whose[place[within]], distance_m[within]
+        row, segment, distance_m = row[within], index.segment[point[within]], distance_m[within]
         order = np.lexsort((segment, distance_m, row))
         row, segment, distance_m = row[order], segment[order], distance_m[order]
         new = np.ones(len(row), dtype=np.bool_)  # a long segment is found by several of its points
@@ -121,7 +132,7 @@ class RoadMap:
         return row[new], segment[new], distance_m[new]
 
     def within(self, low_m: Array, high_m: Array) -> RoadMap:
-        """The segments that touch the box from `low_m` to `high_m` (2,); roads and lanes keep their numbers."""
+        """Return the part of the map that touches the box from `low_m` to `high_m` (2,), with the same numbers."""
         end_m = self.point_m + self.length_m[:, None] * self.direction
         kept = touch_box(self.point_m, end_m, low_m, high_m)
         columns: dict[str, Any] = {name: getattr(self, name)[kept] for name in _COLUMNS}
@@ -130,7 +141,7 @@ class RoadMap:
     # Messages.
 
     def to_wire(self) -> dict[str, Any]:
-        """A plain form for a message; `from_wire` restores it bit by bit."""
+        """Return a plain form for a message; `from_wire` restores it bit by bit."""
         columns = {name: getattr(self, name).astype(kind).tobytes() for name, kind in _COLUMNS.items()}
         return {"tag": TAG, "classes": list(self.classes), "sigma_m": self.sigma_m, **columns}
 
@@ -140,9 +151,9 @@ class RoadMap:
         if not isinstance(data, dict) or data.keys() != {"tag", *(field.name for field in fields(cls))}:
             raise ValueError("no road map")
         classes, sigma_m = data["classes"], data["sigma_m"]
-        if data["tag"] != TAG or not isinstance(classes, list) or len(classes) > MOST_CLASSES:
+        if data["tag"] != TAG or not isinstance(classes, list) or len(classes) > MAX_CLASSES:
             raise ValueError("a road map without its tag or classes")
-        if not all(isinstance(name, str) and len(name) <= LONGEST_CLASS for name in classes):
+        if not all(isinstance(name, str) and len(name) <= MAX_CLASS_LENGTH for name in classes):
             raise ValueError("a road map's classes are no names")
         if type(sigma_m) is not float or not 0 <= sigma_m < np.inf:
             raise ValueError(f"sigma_m = {sigma_m!r:.50}: a positive number is needed")
@@ -153,7 +164,7 @@ class RoadMap:
         return roads
 
     def _check(self) -> None:
-        """Raises ValueError where a column is not what the class says."""
+        """Raise ValueError if a column is not what the class says."""
         if any(len(getattr(self, name)) != len(self) for name in _COLUMNS):
             raise ValueError("columns of a road map differ in length")
         right = {
@@ -178,26 +189,26 @@ def map_from_wire(data: Any) -> LaneMap | RoadMap:
 
 @dataclass(frozen=True)
 class _Index:
-    """Points on the segments in the order of a grid (P,): whose each is, and again what is known of that segment.
+    """Points on the segments (P,) in the order of a grid, each with its segment's number and geometry.
 
-    What is near each other on the map is near each other in these arrays; a segment's end is at most `half_m` from
+    Points near each other on the map are near each other in these arrays. A segment's end is at most `half_m` from
     one of its points.
     """
 
     grid: Grid
     half_m: float
-    whose: NDArray[np.intp]
+    segment: NDArray[np.intp]
     east_m: Array
     north_m: Array
     to_east: Array
     to_north: Array
     length_m: Array
 
-    def distance_m(self, east_m: Array, north_m: Array, place: NDArray[np.intp]) -> Array:
-        """How far positions (n,) are from the whole segments at `place` (n,)."""
-        east_m, north_m = east_m - self.east_m[place], north_m - self.north_m[place]
-        to_east, to_north = self.to_east[place], self.to_north[place]
-        along_m = np.minimum(np.maximum(east_m * to_east + north_m * to_north, 0.0), self.length_m[place])
+    def distance_m(self, east_m: Array, north_m: Array, point: NDArray[np.intp]) -> Array:
+        """Return the distances (n,) of positions (n,) from the whole segments of the points `point` (n,)."""
+        east_m, north_m = east_m - self.east_m[point], north_m - self.north_m[point]
+        to_east, to_north = self.to_east[point], self.to_north[point]
+        along_m = np.minimum(np.maximum(east_m * to_east + north_m * to_north, 0.0), self.length_m[point])
         return np.asarray(np.hypot(east_m - along_m * to_east, north_m - along_m * to_north))
 
 
@@ -209,7 +220,7 @@ def _column(name: str, data: object) -> NDArray[Any]:
 
 
 def touch_box(start_m: Array, end_m: Array, low_m: Array, high_m: Array) -> NDArray[np.bool_]:
-    """Which segments from `start_m` to `end_m` (n, 2) have a point in the box from `low_m` to `high_m` (2,)."""
+    """Find segments from `start_m` to `end_m` (n, 2) that touch the box from `low_m` to `high_m` (2,): a mask."""
     middle_m, half_m = (np.asarray(low_m) + high_m) / 2, (np.asarray(high_m) - low_m) / 2
     centre_m, reach_m = (start_m + end_m) / 2 - middle_m, (end_m - start_m) / 2
     # Two convex shapes are apart only if they are along an axis of the box, or across the segment.

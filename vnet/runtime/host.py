@@ -34,9 +34,15 @@ _current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vne
 """On whose behalf code runs: a node, in one of its incarnations."""
 
 
+RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
+"""New names of modules with a program, by the old."""
+
+
 def load_program(entry: str) -> Program:
     """Import `package.module:function`. Raises ProgramError with the reason in one line."""
     module_name, _, name = entry.partition(":")
+    if module_name in RENAMED_MODULES:
+        raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
     try:
         module = importlib.import_module(module_name)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""What the cooperative program does with liars, copies, replays, floods, restarts and partitions."""
+"""The cooperative program against attackers, copies, replays, floods, restarts and partitions."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,10 +10,10 @@ import pytest
 
 from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
 from agents.cooperative.attacker import Attack, Attacker
+from agents.cooperative.estimator import Estimator, usable
 from agents.cooperative.fix_table import CAPACITY, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, decode, encode, short_name
 from agents.cooperative.options import Options
-from agents.cooperative.program import Estimator, usable
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
@@ -221,7 +221,7 @@ def test_frames_of_the_past_are_old_or_stale() -> None:
 
 
 def test_ghosts_are_copies() -> None:
-    """Whether they send the same bytes or put their own names to them."""
+    """Be it that they send the same bytes or put their own names to them."""
     town, quiet = Town(), Town()
 
     def ghosts(packet: Packet) -> list[Packet]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from vnet.cmm.fusion import condition_on
-from vnet.cmm.map_matching import MOST_LANES, OFF_ROAD_WITHIN_M, CityRoads
+from vnet.cmm.map_matching import MAX_LANES, OFF_ROAD_WITHIN_M, CityRoads
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -53,7 +53,7 @@ def test_lanes_that_do_not_fit_the_heading_are_no_candidates() -> None:
 
 def test_of_parallel_lanes_the_nearest_are_candidates() -> None:
     row, lane = CityRoads(PARALLEL, 0.05).seek(np.array([[0.0, 3.0]]), np.array([EAST]), np.array([25.0]))
-    assert row.tolist() == [0] * MOST_LANES
+    assert row.tolist() == [0] * MAX_LANES
     assert lane.tolist() == [1, 0, 2, 3]
 
 

@@ -11,7 +11,7 @@ from vnet.cmm.consensus import AveragingConsensus, ConsensusConfig, RatioConsens
 from vnet.errors import VnetError
 
 Hears = Callable[[int, int, int], bool]
-"""Whether, in a round, a receiver hears a sender: (round, sender, receiver)."""
+"""A rule of reception: (round, sender, receiver) to true or false."""
 
 
 class Net:

@@ -15,7 +15,7 @@ K = 5
 TAU_S = 20.0
 EAST = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
 NORTH_M = np.linspace(-2.0, 2.0, K)
-"""How far north of the lane each particle puts the first vehicle."""
+"""Distance north of the lane at which each particle puts the first vehicle."""
 
 
 def scene(vehicles: int = 1, least: float = -np.inf) -> tuple[MapEvidence, Tracks, CommonErrorParticles]:

@@ -1,4 +1,4 @@
-"""One who contradicts all others moves nobody."""
+"""A vehicle that contradicts all others moves no estimate."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_who_knows_little_and_says_so_is_inside() -> None:
 
 
 def error_with_one_off_its_road(by_m: float, min_map_log_likelihood: float) -> float:
-    """How far the common error is off when one of eight vehicles has a receiver that is off by `by_m`."""
+    """Error of the common error's estimate when one of eight vehicles has a receiver that is off by `by_m`."""
     rng = np.random.default_rng(3)
     point, heading = rng.uniform(0, 3000, (8, 2)), np.linspace(0, np.pi, 8, endpoint=False)
     lanes = LaneMap(point, heading, 0.85)

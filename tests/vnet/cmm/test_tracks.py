@@ -16,7 +16,7 @@ FORGET_S = 1.0
 
 
 class Vehicle:
-    """What the tracks should hold of one vehicle; `mark` is a number of its own in each of its fields."""
+    """The expected record of one vehicle; `mark` is a number of its own in each of its fields."""
 
     def __init__(self, mark: float, lanes: list[int], particles: int) -> None:
         self.mark = mark

@@ -1,0 +1,278 @@
+"""The estimator of one vehicle: filter, consensus and fusion, fed with frames and fixes, and the frame it composes.
+
+It has neither input nor output of its own: `program` brings the packets and the time. The mathematics is
+`vnet.cmm`'s; here is what a vehicle does with it, and with what others send.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from agents.cooperative.admission import Admission
+from agents.cooperative.fix_table import FixTable
+from agents.cooperative.frame import (
+    MAX_DEGREE,
+    MAX_HEARD,
+    PARTICLE_BYTES,
+    POSITION_LIMIT_M,
+    RELAY_LIMIT,
+    RELAYED,
+    CooperativeFrame,
+    centimetres,
+    encode,
+    name_of_code,
+    room,
+    short_name,
+)
+from agents.cooperative.options import Options
+from vnet import Fix, Packet
+from vnet.cmm.consensus import (
+    AveragingConsensus,
+    Consensus,
+    ConsensusConfig,
+    DirectMean,
+    RatioConsensus,
+    Share,
+)
+from vnet.cmm.fusion import Cloud, fuse, shift
+from vnet.cmm.rbpf import Observation, Rbpf
+from vnet.cmm.robust import near_the_median
+from vnet.cmm.weights import (
+    OptimizedWeights,
+    constant_weights,
+    max_degree_weights,
+    metropolis_weights,
+    no_fusion_weights,
+    random_weights,
+)
+from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
+from vnet.units import NS_PER_S
+
+MASS_GATE_SIGMAS = 5.0
+"""Gate of the consensus, in deviations of the common error: mass further from the own estimate is implausible."""
+MIN_SIGMA_M = 1.0
+"""Deviation (m) of the common error below which the gate does not shrink: estimates scatter all the same."""
+MIN_VARIANCE_M2 = 1e-6
+"""Variance (m²) added to that of an estimate, so that the covariance of a collapsed cloud stays positive."""
+
+
+class Estimator:
+    """The state of one vehicle's cooperation.
+
+    rbpf, consensus: the particle filter and the mean consensus.
+    fused_m: (2,), the estimate of the common error right after the latest fusion.
+    weights: the latest fusion weights by node id, the vehicle's own included.
+    imported: number of hypotheses that the latest period imported from neighbours.
+    """
+
+    def __init__(
+        self, node_id: str, options: Options, lanes: LaneMap | RoadMap, rng: np.random.Generator, period_ns: int
+    ) -> None:
+        self.name = short_name(node_id)
+        self._admission = Admission(self.name, period_ns, options.two_frames)
+        self.rbpf = Rbpf(options.filter_config(), lanes, rng)
+        self.consensus = _consensus(options, self.name, self.rejected)
+        self.fused_m = self.rbpf.estimate_m
+        self.weights: dict[str, float] = {}
+        self.imported = 0
+        self._node_id = node_id
+        self._options = options
+        self._rng = rng
+        self._period_ns = period_ns
+        self._since_fusion_s = 0.0
+        self._now_ns = -period_ns
+        self._covariance_m2 = np.eye(2)
+        self._frames: dict[str, CooperativeFrame] = {}
+        self._fixes = FixTable(int(self.name, 16), period_ns)
+        self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
+        self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
+        self._largest_degree = 0
+        self._sent = self._estimate()
+        self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
+
+    @property
+    def rejected(self) -> Counter[str]:
+        """Number of frames and shares of others that were not used, by reason."""
+        return self._admission.rejected
+
+    # What comes in.
+
+    def read(self, packets: Iterable[Packet], now_ns: int) -> None:
+        """Take in packets from the radio; those that cannot be used are counted by reason."""
+        admitted = dict(self._admission.admit(packets, now_ns))
+        heard = [(int(sender, 16), frame) for sender, frame in admitted.items() if self._is_neighbour(sender)]
+        forged = self._fixes.learn(heard)
+        for code in forged:
+            self.rejected["forged"] += 1
+            del admitted[name_of_code(code)]
+        self._frames |= admitted
+
+    def _is_neighbour(self, sender: str) -> bool:
+        return self._neighbours is None or sender in self._neighbours
+
+    def filter(self, own: Fix) -> None:
+        """Take all fixes that have come, up to the time of the vehicle's `own`."""
+        dt_s = max(0, own.time_ns - self._now_ns) / NS_PER_S
+        self._since_fusion_s += dt_s
+        self._now_ns = max(self._now_ns, own.time_ns)
+        self._fixes.forget(own.time_ns - round(self.rbpf.config.memory_s * NS_PER_S))
+        if np.isfinite(own.covariance_m2).all():
+            self._covariance_m2 = own.covariance_m2
+        observations = dict(self._fixes.observations(own.time_ns, self._covariance_m2))
+        if usable(own):
+            observations[self.name] = Observation(own.position_m, own.covariance_m2, own.heading_rad)
+        self.rbpf.step(dt_s, observations)
+
+    def position(self, own: Fix) -> tuple[Array, Array]:
+        """Position (2,) of the vehicle and its covariance (2, 2); NaN as long as no fix tells it."""
+        if self.name in self.rbpf.vehicles:
+            return self.rbpf.position_m(self.name)
+        # The filter has forgotten a vehicle whose own fixes have been outliers for seconds.
+        return own.position_m - self.rbpf.estimate_m, own.covariance_m2 + self.rbpf.estimate_covariance_m2
+
+    # Agreement with the neighbours.
+
+    def agree(self) -> None:
+        """Do one round of consensus, and fuse, with the senders of the frames since the last round."""
+        # After a pause there are frames of before it: of senders that have been forgotten since.
+        fresh = {sender: frame for sender, frame in sorted(self._frames.items()) if sender in self._admission.ids}
+        everybody, self._frames = self._plausible(fresh), {}
+        frames = {sender: frame for sender, frame in everybody.items() if self._is_neighbour(sender)}
+        self._take_round(everybody if self._options.consensus == "exact" else frames)
+        degrees = [frame.largest_degree for frame in frames.values()]
+        self._largest_degree = max([self._largest_degree, len(self._share.heard), *degrees])
+        self.imported = 0
+        self.fused_m = self._fuse(frames) if frames and self._fusion_is_due() else self.rbpf.estimate_m
+        if self._options.separate_map_update:
+            self.rbpf.update_from_map()
+
+    def _plausible(self, frames: dict[str, CooperativeFrame]) -> dict[str, CooperativeFrame]:
+        """Return the frames without outliers: estimates that are not where most are. Decided again each period."""
+        if not frames or not self._options.defence:
+            return frames
+        inside = near_the_median(*self._sent_estimates(frames), self._options.common_sigma_m)[1:].tolist()
+        if all(inside):
+            return frames
+        self.rejected["outlier"] += inside.count(False)
+        return {sender: frame for (sender, frame), good in zip(frames.items(), inside, strict=True) if good}
+
+    def _take_round(self, frames: Mapping[str, CooperativeFrame]) -> None:
+        """Do a round of consensus with the shares in `frames`."""
+        shares = {
+            sender: Share(frame.epoch, frame.running_sum, frame.out_neighbours, frame.names_heard)
+            for sender, frame in frames.items()
+        }
+        self._share = self.consensus.round(self.rbpf.estimate_m, shares)
+
+    def _fusion_is_due(self) -> bool:
+        """Tell whether the fusion interval is over, and begin the next one if so."""
+        half_period_s = self._period_ns / 2 / NS_PER_S
+        if self._since_fusion_s < self._options.fusion_interval_s - half_period_s:
+            return False
+        self._since_fusion_s = 0.0
+        return True
+
+    def _fuse(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+        """Fuse with the neighbours; returns the estimate (2,) right afterwards.
+
+        Their estimates are a period old, and are compared with this vehicle's own of the same time.
+        """
+        weights = self._fusion_weights(frames)
+        ids = [self._node_id, *(self._admission.ids[sender] for sender in frames)]
+        self.weights = dict(zip(ids, weights.tolist(), strict=True))
+        if self._options.exchange == "particles":
+            clouds = [Cloud(frame.cloud_m, _known(sender, frame)) for sender, frame in frames.items()]
+            fused_m, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
+            return fused_m
+        offset = np.array([frame.estimate_m for frame in frames.values()]) - self._sent[0]
+        shift(self.rbpf, weights[1:] @ offset)
+        return self.rbpf.estimate_m
+
+    def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> Array:
+        """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
+        count = 1 + len(frames)
+        match self._options.fusion:
+            case "none":
+                return no_fusion_weights(count)
+            case "random":
+                return random_weights(count, self._rng)
+            case "constant":
+                return constant_weights(count, self._options.alpha)
+            case "metropolis":
+                return metropolis_weights(len(frames), [len(frame.heard) for frame in frames.values()])
+            case "max-degree":
+                return max_degree_weights(count, max(self._largest_degree, len(frames)))
+            case _:
+                estimates, covariances = self._sent_estimates(frames)
+                mean = self.consensus.mean_m
+                mean = estimates.mean(axis=0) if mean is None else mean
+                return self._optimized.solve(estimates, covariances, mean)
+
+    def _sent_estimates(self, frames: Mapping[str, CooperativeFrame]) -> tuple[Array, Array]:
+        """Estimates (1 + n, 2) and covariances (1 + n, 2, 2) as they were sent, the vehicle's own first."""
+        estimates = np.array([self._sent[0], *(frame.estimate_m for frame in frames.values())])
+        return estimates, np.array([self._sent[1], *(frame.covariance_m2 for frame in frames.values())])
+
+    def _estimate(self) -> tuple[Array, Array]:
+        """Estimate (2,) of the common error and its covariance (2, 2), as they are sent."""
+        return self.rbpf.estimate_m, self.rbpf.estimate_covariance_m2 + MIN_VARIANCE_M2 * np.eye(2)
+
+    # What goes out.
+
+    def frame(self, fix: Fix, max_payload: int) -> bytes:
+        """Return the bytes to broadcast with the newest fix, at most `max_payload`."""
+        frame = self.compose(fix, max_payload)
+        self._admission.claim(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
+        return encode(frame)
+
+    def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
+        """Compose the frame with the newest fix: names, then particles, then relays, while `max_payload` lasts."""
+        share = self._share
+        self._sent = self._estimate()
+        heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
+        left = room(len(heard), max_payload)
+        mixes = self._options.exchange == "particles" and self._options.fusion != "none"
+        particles = min(self._options.particles, left // PARTICLE_BYTES) if mixes else 0
+        relays = min(RELAY_LIMIT, (left - PARTICLE_BYTES * particles) // RELAYED.itemsize)
+        return CooperativeFrame(
+            fix_time_ns=fix.time_ns,
+            fix_m=fix.position_m,
+            heading_rad=fix.heading_rad,
+            estimate_m=self._sent[0],
+            covariance_m2=self._sent[1],
+            epoch=share.epoch,
+            running_sum=share.running_sum,
+            heard=heard,
+            cloud_m=self.rbpf.sample(particles),
+            relayed=self._fixes.freshest(fix.time_ns, relays if self._options.relay else 0),
+            largest_degree=min(self._largest_degree, MAX_DEGREE),
+            name=self.name,
+        )
+
+
+def usable(fix: Fix) -> bool:
+    """Tell whether a fix can be filtered and sent: receivers fail, too."""
+    numbers = [*fix.position_m, *fix.covariance_m2.ravel(), fix.heading_rad or 0.0]
+    return bool(np.isfinite(numbers).all() and np.abs(fix.position_m).max() <= POSITION_LIMIT_M)
+
+
+def _known(sender: str, frame: CooperativeFrame) -> frozenset[str]:
+    """Names of the vehicles whose fixes are in the sender's cloud."""
+    return frame.names_heard | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
+
+
+def _consensus(options: Options, name: str, rejected: Counter[str]) -> Consensus:
+    gate_m = MASS_GATE_SIGMAS * max(MIN_SIGMA_M, options.common_sigma_m) if options.defence else np.inf
+    config = ConsensusConfig(gate_m=gate_m)
+    match options.consensus:
+        case "ratio":
+            return RatioConsensus(name, config, rejected)
+        case "exact":
+            return DirectMean(current=options.two_frames)
+        case rule:
+            return AveragingConsensus(name, rule, config, rejected)
