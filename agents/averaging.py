@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec import Meta
 
+from agents import options as parsing
 from agents.cooperative.frame import short_name
 from vnet import Node, Packet
-from vnet.cmm.consensus import AVERAGING_RULES, AveragingConsensus, Consensus, RatioConsensus, Share
-from vnet.errors import ProgramError
+from vnet.cmm.consensus import AveragingConsensus, AveragingRule, Consensus, RatioConsensus, Share
 from vnet.types import Array
 from vnet.units import NS_PER_S
-
-RULES = ("ratio", *AVERAGING_RULES)
 
 
 class AveragingFrame(msgspec.Struct, array_like=True):
@@ -33,28 +31,24 @@ class AveragingFrame(msgspec.Struct, array_like=True):
     heard: list[str]
 
 
-@dataclass(frozen=True)
-class Options:
-    """`rule` of the consensus, and who is `silent` when: [from_s, to_s) by node id, in seconds of the run."""
+Seconds = Annotated[float, Meta(ge=-1e9, le=1e9)]
 
-    rule: str = "ratio"
-    silent: dict[str, list[float]] = field(default_factory=dict)
+
+class Options(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of the averaging program."""
+
+    rule: Literal["ratio", AveragingRule] = "ratio"
+    """Rule of the consensus."""
+    silent: dict[str, tuple[Seconds, Seconds]] = {}
+    """Absences by node id: [from_s, to_s) of the run."""
 
     @classmethod
     def parse(cls, options: Mapping[str, Any]) -> Options:
-        """Options from a scenario. Raises ProgramError that names the key, the value and what is allowed."""
-        allowed = [f.name for f in fields(cls)]
-        for key in options:
-            if key not in allowed:
-                raise ProgramError(f"program.options.{key}: unknown; allowed: {', '.join(allowed)}")
-        parsed = cls(**options)
-        if parsed.rule not in RULES:
-            raise ProgramError(f"program.options.rule = {parsed.rule!r}: allowed: {', '.join(RULES)}")
-        if not isinstance(parsed.silent, dict):
-            raise ProgramError(f"program.options.silent = {parsed.silent!r}: a table of [from_s, to_s] expected")
-        for node, span in parsed.silent.items():
-            if not _is_span(span):
-                raise ProgramError(f"program.options.silent.{node} = {span!r}: [from_s, to_s] expected, from first")
+        """Convert the options of a scenario. Raises ProgramError with the key, the value and what is allowed."""
+        parsed = parsing.parse(options, cls)
+        for node, (from_s, to_s) in parsed.silent.items():
+            if from_s > to_s:
+                raise parsing.refuse(f"silent.{node}", [from_s, to_s], "[from_s, to_s] expected, the earlier first")
         return parsed
 
     def is_silent(self, node: str, time_ns: int) -> bool:
@@ -63,11 +57,6 @@ class Options:
             return False
         from_s, to_s = self.silent[node]
         return from_s <= time_ns / NS_PER_S < to_s
-
-
-def _is_span(span: object) -> bool:
-    numbers = isinstance(span, (list, tuple)) and all(type(x) in (int, float) and math.isfinite(x) for x in span)
-    return numbers and len(span) == 2 and span[0] <= span[1]  # type: ignore[arg-type,index]
 
 
 class Averager:

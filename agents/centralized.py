@@ -107,7 +107,7 @@ def _result(rbpf: Rbpf, time_ns: int) -> Result:
     x, y = rbpf.estimate_m.tolist()
     a, b, c, d = rbpf.estimate_covariance_m2.ravel().tolist()
     weight = rbpf.weight
-    place = np.round(100 * (rbpf.mean[:, :2] @ weight)).astype(int).tolist()
+    place = np.round(100 * (rbpf.tracks.mean[:, :2] @ weight)).astype(int).tolist()
     where = {vehicle: (p[0], p[1]) for vehicle, p in zip(rbpf.vehicles, place, strict=True)}
     return Result(time_ns, (x, y), (a, b, c, d), where)
 

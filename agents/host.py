@@ -80,7 +80,7 @@ def run_agent(
 
 
 class _Attachment:
-    """The process's keys: what it says goes out on its lead's `tx`, what it is told comes in one queue."""
+    """The process's keys: it sends on the `tx` of its first node, and receives in one queue."""
 
     def __init__(self, session: zenoh.Session, run: str, nodes: Sequence[str], stack: ExitStack) -> None:
         self.nodes = list(nodes)

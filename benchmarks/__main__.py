@@ -105,7 +105,7 @@ STALL_S = 0.03
 
 
 class StallWatch:
-    """How long the machine itself stood still: a thread that sleeps a millisecond and finds far more gone.
+    """Pauses of the machine itself: a thread that sleeps a millisecond and finds far more gone.
 
     On a shared virtual machine such stalls, which are not ours, decide the tail of any latency.
     """
@@ -229,7 +229,7 @@ def bench_city_rbpf(particles: int = 500, vehicles: int = 10, lanes: int = 4, st
 
 
 def bench_dashboard() -> Figures:
-    """What the picture of a run with 50 vehicles costs: taking a snapshot, and a redraw at 100 × 30."""
+    """Cost of the live picture of a run with 50 vehicles: taking a snapshot, and a redraw at 100 × 30."""
     from benchmarks import dashboard
 
     return dashboard.measure()
@@ -284,7 +284,7 @@ def main() -> None:
     names = sys.argv[1:] or list(BENCHMARKS)
     for name in names:
         if name not in BENCHMARKS:
-            sys.exit(f"{name}: no benchmark is called so; there are {', '.join(BENCHMARKS)}")
+            sys.exit(f"{name}: no such benchmark; there are {', '.join(BENCHMARKS)}")
     table = Table("benchmark", "figure", "value")
     results = {}
     for name in names:

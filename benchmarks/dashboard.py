@@ -1,4 +1,4 @@
-"""What it costs to show a run in a terminal: all that its thread does, and what it takes of the run's own."""
+"""Cost of showing a run in a terminal: the CPU time of its thread, and the time taken from the run's own."""
 
 import statistics
 import tempfile

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from typing import Any
 
 import numpy as np
 from filterpy.monte_carlo import systematic_resample
@@ -31,8 +32,9 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
+from vnet.cmm.common_error import systematic
 from vnet.cmm.map_matching import candidate_lanes, log_on_lane
-from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
+from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
@@ -146,13 +148,15 @@ class PerParticle:
         self.log_weight = np.zeros(PARTICLES)
 
 
-def _process_noise(heading_rad: float) -> Array:
+def _process_noise(heading_rad: float | None) -> Array:
     """White acceleration over a step along the lane, a hundredth of it across, (4, 4)."""
+    assert heading_rad is not None, "every fix of the benchmark has a heading"
     along = np.array([np.cos(heading_rad), np.sin(heading_rad)])
     across = np.array([-along[1], along[0]])
     shape = CONFIG.acceleration_m2_s4 * (np.outer(along, along) + 0.01 * np.outer(across, across))
     push = np.array([DT_S**2 / 2, DT_S])
-    return np.kron(np.outer(push, push), shape)
+    noise: Array = np.kron(np.outer(push, push), shape).astype(float)
+    return noise
 
 
 def _inverse_2x2(matrix: Array) -> tuple[Array, Array]:
@@ -284,6 +288,7 @@ class OwnBias:
         self._roads, self._rng, self._every_step = roads, rng, every_step
         self._common_m = CONFIG.common_sigma_m * rng.standard_normal((2, PARTICLES))
         self._log_weight = np.zeros(PARTICLES)
+        self._weight: Array
         self._weigh()
 
     def step(self, fix_m: Array) -> None:
@@ -352,14 +357,14 @@ def compare() -> dict[str, float]:
     for _ in range(WARM_UP + STEPS):
         seen, measured_m = fixes(), BIAS_M + rng.normal(size=2)
         fix_m = np.concatenate([fix.position_m for fix in seen.values()])
-        times_us["rbpf"].append(_time_us(lambda seen=seen: (ours.step(DT_S, seen), ours.estimate_m)))
-        times_us["per_particle"].append(_time_us(lambda seen=seen: (plain.step(seen), plain.estimate_m)))
+        times_us["rbpf"].append(_time_us(_advance, ours, DT_S, seen))
+        times_us["per_particle"].append(_time_us(_advance, plain, seen))
         for name, each in bias.items():
             z = measured_m if "bare" in name else fix_m
-            times_us[name].append(_time_us(lambda each=each, z=z: (each.step(z), each.estimate_m)))
+            times_us[name].append(_time_us(_advance, each, z))
         weight = rng.dirichlet(np.ones(PARTICLES))
-        times_us["resample"].append(_time_us(lambda w=weight: systematic(w, PARTICLES, rng)))
-        times_us["filterpy_resample"].append(_time_us(lambda w=weight: systematic_resample(w)))
+        times_us["resample"].append(_time_us(systematic, weight, PARTICLES, rng))
+        times_us["filterpy_resample"].append(_time_us(systematic_resample, weight))
         apart_m = max(apart_m, float(np.linalg.norm(ours.estimate_m - plain.estimate_m)))
     errors_m = {name: float(np.linalg.norm(each.estimate_m - BIAS_M)) for name, each in bias.items()}
     return _figures(times_us) | {
@@ -369,9 +374,16 @@ def compare() -> dict[str, float]:
     }
 
 
-def _time_us(step: Callable[[], object]) -> float:
+def _advance(estimator: Any, *arguments: object) -> Array:
+    """Advance an estimator, of whichever kind, by one step and return its estimate."""
+    estimator.step(*arguments)
+    estimate_m: Array = estimator.estimate_m
+    return estimate_m
+
+
+def _time_us(step: Callable[..., object], *arguments: object) -> float:
     started = time.perf_counter()
-    step()
+    step(*arguments)
     return (time.perf_counter() - started) * 1e6
 
 

@@ -1,4 +1,4 @@
-"""What finding the lanes near vehicles costs, on a city's streets."""
+"""Cost of finding the lanes near vehicles on a city's streets."""
 
 import statistics
 import time
@@ -20,10 +20,8 @@ def city(seed: int = 0) -> Roads:
     bend_m = rng.normal(scale=3.0, size=(steps, steps, 2))
     builder = RoadsBuilder("city")
     for street in range(0, steps, PIECES):
-        for along in (lambda k, street=street: (k, street), lambda k, street=street: (street, k)):
-            points = [
-                (cell := along(k), tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for k in range(steps)
-            ]
+        for cells in ([(k, street) for k in range(steps)], [(street, k) for k in range(steps)]):
+            points = [(cell, tuple(np.array(cell) * BLOCK_M / PIECES + bend_m[cell])) for cell in cells]
             builder.add(f"street {street}", points, NUMBER["residential"], (1, 1), 3.0)
     return builder.build(builder.coordinates(), None)
 

@@ -1,4 +1,4 @@
-"""What observing costs: the observer of a run of 50 vehicles at 10 Hz, in real time, as a process of its own.
+"""Cost of observing: the observer of a run of 50 vehicles at 10 Hz, in real time, as a process of its own.
 
 The messages are those of a simulated run, published over Zenoh at the pace of the wall clock; the observer saves
 and serves them. What it does in the beginning is not counted. Others compute at the lowest priority meanwhile, as a
@@ -37,7 +37,7 @@ LEASE_MS = 60_000
 LOWEST = 19
 """Priority."""
 BEGINNING_S = 5.0
-"""What is not counted: the start of the process, and of the drawing."""
+"""Warm-up that is not counted: the start of the process, and of the drawing."""
 
 
 def measure(vehicles: int = 50, duration_s: float = 35.0) -> dict[str, float]:
@@ -122,7 +122,7 @@ def _cpu_s(pid: int) -> float:
 
 
 def _limit_share(told: list[tuple[str, dict[str, Any]]]) -> float:
-    """What the line of the limit takes of it, at 10 Hz."""
+    """Share of it that the line of the bound takes, at 10 Hz."""
     limit = Limit(told[0][1])
     limit.step(told[1][1])
     periods = [message for stream, message in told[2:] if stream == "period"]

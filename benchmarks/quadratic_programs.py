@@ -3,12 +3,13 @@
 min ‖Σ a_j x_j − x̄‖² + Σ λ_j a_j² with Σ a = 1, 0 ≤ a ≤ 1, as in `vnet.cmm.weights`, for 10, 20 and 30 neighbours.
 Timed is the whole way from estimates to weights, which is the same for all but for the solver: checking the
 covariances, the Hessian, the solver, clipping. `_update` sets the solver up once and gives it each new Hessian,
-`_fresh` sets it up anew for every problem. All take turns problem by problem. Needs the extra `bench`.
+`_fresh` sets it up again for every problem. All take turns problem by problem. Needs the extra `bench`.
 """
 
 import statistics
 import time
 from collections.abc import Callable
+from functools import partial
 
 import clarabel
 import daqp
@@ -105,6 +106,11 @@ def weights_by(solve: Callable[[Array], Array]) -> Weights:
     return weights
 
 
+def _solve_fresh(kind: type[Daqp | Piqp | Clarabel], hessian: Array) -> Array:
+    """Solve with a solver that has kept nothing from the last problem."""
+    return kind().solve(hessian)
+
+
 def contenders() -> dict[str, Weights]:
     """By name; what is in use comes first."""
     result: dict[str, Weights] = {
@@ -113,7 +119,7 @@ def contenders() -> dict[str, Weights]:
     }
     for name, kind in (("daqp", Daqp), ("piqp", Piqp), ("clarabel", Clarabel)):
         result[f"{name}_update"] = weights_by(kind().solve)
-        result[f"{name}_fresh"] = weights_by(lambda hessian, kind=kind: kind().solve(hessian))
+        result[f"{name}_fresh"] = weights_by(partial(_solve_fresh, kind))
     return result
 
 

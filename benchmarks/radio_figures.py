@@ -1,4 +1,4 @@
-"""How long the radio's figures take: python -m benchmarks.radio_figures."""
+"""Time to compute the radio's figures: python -m benchmarks.radio_figures."""
 
 import math
 import time

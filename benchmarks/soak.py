@@ -60,7 +60,7 @@ def make_scenario(minutes: float, seed: int) -> Scenario:
 
 
 def slope_kb_per_min(event: Event) -> float:
-    """How fast a process's memory grew, by least squares over the last two thirds of its samples."""
+    """Growth rate of a process's memory, by least squares over the last two thirds of its samples."""
     time_s, rss_kb = (np.array(event.details[name], dtype=float) for name in ("time_s", "rss_kb"))
     kept = slice(len(time_s) // 3, None)
     return float(np.polyfit(time_s[kept], rss_kb[kept], 1)[0]) * 60

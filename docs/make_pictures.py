@@ -41,7 +41,7 @@ MENU = 36
 LARGEST_BYTES = 300_000
 START_TIMEOUT_S = 60.0
 SETTLE_S = 4.0
-"""How long a viewer may take to have drawn everything."""
+"""Time that a viewer may take to draw everything."""
 WEB_SETTLE_S = 25.0
 
 
@@ -106,7 +106,7 @@ def page_pictures(page: Path, out: Path) -> None:
                 browser.look(page.resolve().as_uri(), size, dark)
                 time.sleep(1.0)
                 name = f"{page.stem}-{width}-{'dark' if dark else 'light'}.png"
-                put(browser.picture(whole=True), out / name)
+                put(browser.picture(entire=True), out / name)
 
 
 class Browser:
@@ -139,13 +139,13 @@ class Browser:
         self._chrome("Emulation.setEmulatedMedia", {"features": [scheme]})
         self._ask("POST", f"/session/{self._session}/url", {"url": url})
 
-    def picture(self, whole: bool = False) -> bytes:
-        """What is seen, or the `whole` page, as a PNG."""
-        shown = self._chrome("Page.captureScreenshot", {"captureBeyondViewport": whole, **self._clip(whole)})
+    def picture(self, entire: bool = False) -> bytes:
+        """Take a PNG of the visible part, or of the `entire` page."""
+        shown = self._chrome("Page.captureScreenshot", {"captureBeyondViewport": entire, **self._clip(entire)})
         return base64.b64decode(shown["data"])
 
-    def _clip(self, whole: bool) -> dict[str, Any]:
-        if not whole:
+    def _clip(self, entire: bool) -> dict[str, Any]:
+        if not entire:
             return {}
         box = self._chrome("Page.getLayoutMetrics", {})["cssContentSize"]
         return {"clip": {"x": 0, "y": 0, "width": box["width"], "height": box["height"], "scale": 1}}
@@ -177,7 +177,7 @@ def running(command: Sequence[str]) -> Iterator[None]:
 
 
 def until(ask: Callable[[], Any]) -> Any:
-    """What `ask` returns, once it does not fail."""
+    """Return the result of `ask`, once it does not fail."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:

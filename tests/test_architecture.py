@@ -1,44 +1,133 @@
-"""The house has walls: agents/ and emulator/ stand on vnet/ and never meet; vnet/ looks up to nobody."""
+"""The architecture: who may import whom, no circles, no package too large, no file too long.
+
+Imports under TYPE_CHECKING and inside functions count as all others do.
+"""
 
 import ast
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests.support.paths import ROOT
 
-FORBIDDEN = {"vnet": {"agents", "emulator"}, "agents": {"emulator"}, "emulator": {"agents"}}
-
+PACKAGES = ("vnet", "agents", "emulator")
+LAYERS = (
+    ("vnet",),
+    ("emulator.scenario",),
+    ("emulator.faults",),
+    ("emulator.world",),
+    ("emulator.radio",),
+    ("emulator.records",),
+    ("emulator.pages",),
+    ("emulator.checks", "emulator.stream", "emulator.export"),
+    ("emulator.viewer", "emulator.report"),
+    ("emulator.drivers",),
+    ("emulator.cells",),
+    ("emulator.terminal", "emulator.testing"),
+    ("emulator.experiments",),
+    ("emulator.cli",),
+)
+"""The lowest first: a module imports from its own package and from lower layers, never from a neighbour."""
+VNET_LAYERS = (
+    ("vnet.errors", "vnet.types", "vnet.units", "vnet.bounded"),
+    ("vnet.roads",),
+    ("vnet.node",),
+    ("vnet.transport",),
+    ("vnet.runtime",),
+)
+BASIS = ("vnet.errors", "vnet.types", "vnet.units", "vnet.bounded")
+MOST_LINES = 450
+FLAT_LISTS: frozenset[str] = frozenset()
+"""Files that may be longer, because they are flat lists."""
 
 # What an agent may do without, and what costs seconds or tens of megabytes once a vehicle.
 HEAVY = ["rerun", "matplotlib", "pandas", "pyarrow", "pydantic", "tomli_w", "emulator"]
 
 
-def tracked_files(package: str) -> list[Path]:
-    """The package's Python files that are in the repository, and not what else lies about."""
-    listed = subprocess.run(
-        ["git", "ls-files", "-z", f"{package}/*.py"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    return [ROOT / name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()]
+@cache
+def source_files() -> dict[str, Path]:
+    """The project's modules by name: those that git knows, and not what else lies about."""
+    command = ["git", "ls-files", "-z", "-co", "--exclude-standard", *(f"{package}/*.py" for package in PACKAGES)]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    paths = sorted(ROOT / name for name in set(listed) if name and (ROOT / name).exists())
+    return {module_name(path): path for path in paths}
 
 
-def imported(code: str) -> set[str]:
-    """The top-level packages that some code imports, wherever in it; `import_module("x")` counts as well."""
-    found = set()
+def module_name(path: Path) -> str:
+    """The dotted name of a file of the repository."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported_names(code: str) -> Iterator[str]:
+    """Yield the absolute names that some code imports, wherever in it; `import_module("x")` counts as well."""
     for node in ast.walk(ast.parse(code)):
         match node:
             case ast.Import(names=names):
-                found |= {alias.name for alias in names}
-            case ast.ImportFrom(module=str(module), level=0):
-                found.add(module)
+                yield from (alias.name for alias in names)
+            case ast.ImportFrom(module=str(module), names=names, level=0):
+                yield from (f"{module}.{alias.name}" for alias in names)
             case ast.Call(
                 func=ast.Name(id="import_module" | "__import__") | ast.Attribute(attr="import_module"),
                 args=[ast.Constant(value=str(module)), *_],
             ):
-                found.add(module)
-    return {name.split(".")[0] for name in found}
+                yield module
+
+
+@cache
+def imports() -> dict[str, set[str]]:
+    """The modules of the project that each of its modules imports."""
+    graph = {}
+    for module, path in source_files().items():
+        found = (nearest_module(name) for name in imported_names(path.read_text()))
+        graph[module] = {name for name in found if name is not None and name != module}
+    return graph
+
+
+def nearest_module(name: str) -> str | None:
+    """The module that an imported name is, or is in; None for one of another project."""
+    while name and name not in source_files():
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+def level(module: str, layers: tuple[tuple[str, ...], ...]) -> tuple[int, str] | None:
+    """The number of a module's layer and its package there; None for what is in none."""
+    for number, packages in enumerate(layers):
+        for package in packages:
+            if module == package or module.startswith(f"{package}."):
+                return number, package
+    return None
+
+
+def violations(graph: dict[str, set[str]], layers: tuple[tuple[str, ...], ...]) -> list[str]:
+    """The imports that go up, or to a neighbour on the same layer."""
+    found = []
+    for module, others in graph.items():
+        for other in sorted(others):
+            here, there = level(module, layers), level(other, layers)
+            if here is None or there is None or here[1] == there[1]:
+                continue
+            if there[0] >= here[0]:
+                found.append(f"{module} -> {other}")
+    return found
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that import each other: what is left when nothing can be taken away from either end."""
+    left = {module: set(others) for module, others in graph.items()}
+    while True:
+        imported = {other for others in left.values() for other in others}
+        ends = [module for module, others in left.items() if not others & left.keys() or module not in imported]
+        if not ends:
+            return [sorted(left)] if left else []
+        for module in ends:
+            del left[module]
+        left = {module: others & left.keys() for module, others in left.items()}
 
 
 @pytest.mark.parametrize(
@@ -46,25 +135,87 @@ def imported(code: str) -> set[str]:
     [
         "import json, emulator.radio.engine as e",
         "def f():\n    from emulator.world import world",
-        "if TYPE_CHECKING:\n    from emulator import engine",
+        "if TYPE_CHECKING:\n    from emulator.radio import engine",
         "import_module('emulator.cli')",
         "importlib.import_module('emulator')",
     ],
 )
 def test_no_way_of_importing_goes_unseen(code: str) -> None:
-    assert "emulator" in imported(code)
+    assert any(name.split(".")[0] == "emulator" for name in imported_names(code))
 
 
 def test_what_only_looks_like_an_import_is_none() -> None:
-    assert imported('"""import emulator"""\nemulator = "emulator.cli"\nfrom . import emulator') == set()
+    assert set(imported_names('"""import emulator"""\nemulator = "emulator.cli"\nfrom . import emulator')) == set()
 
 
-@pytest.mark.parametrize("package", FORBIDDEN)
-def test_no_import_goes_through_a_wall(package: str) -> None:
-    files = tracked_files(package)
-    assert len(files) > 3
-    broken = {str(path.relative_to(ROOT)): imported(path.read_text()) & FORBIDDEN[package] for path in files}
-    assert {path: names for path, names in broken.items() if names} == {}
+def test_circles_and_upward_imports_would_be_seen() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set(), "e": {"a"}}) == [["a", "b", "c"]]
+    assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+    graph = {"vnet.errors": {"emulator.cli"}, "emulator.checks.run": {"emulator.stream.pace", "vnet.errors"}}
+    assert violations(graph, LAYERS) == [
+        "vnet.errors -> emulator.cli",
+        "emulator.checks.run -> emulator.stream.pace",
+    ]
+
+
+def test_imports_only_go_down() -> None:
+    assert violations({m: o for m, o in imports().items() if m.split(".")[0] != "agents"}, LAYERS) == []
+    assert violations(imports(), VNET_LAYERS) == []
+
+
+def test_every_module_of_the_emulator_is_in_a_layer() -> None:
+    rootless = [module for module in imports() if module.startswith("emulator.") and level(module, LAYERS) is None]
+    assert rootless == []
+
+
+def test_the_mathematics_stands_on_roads_alone() -> None:
+    may = ("vnet.cmm", "vnet.roads", *BASIS)
+    for module, others in imports().items():
+        if module.startswith("vnet.cmm"):
+            assert [other for other in others if not other.startswith(may)] == [], module
+
+
+@pytest.mark.parametrize(("package", "forbidden"), [("agents", "emulator"), ("emulator", "agents")])
+def test_agents_and_emulator_never_import_each_other(package: str, forbidden: str) -> None:
+    mine = {module: others for module, others in imports().items() if module.split(".")[0] == package}
+    assert len(mine) > 3
+    broken = {m: [o for o in others if o.split(".")[0] == forbidden] for m, others in mine.items()}
+    assert {module: others for module, others in broken.items() if others} == {}
+
+
+def test_there_are_no_circles() -> None:
+    assert circles(imports()) == []
+
+
+def test_no_package_holds_more_than_an_eighth_and_no_file_is_too_long() -> None:
+    lines = {path: len(path.read_text().splitlines()) for path in source_files().values()}
+    own: Counter[Path] = Counter()
+    for path, count in lines.items():
+        own[path.parent] += count
+    package, most = own.most_common(1)[0]
+    assert most <= sum(lines.values()) / 8, package
+    names = {str(path.relative_to(ROOT)): count for path, count in lines.items() if count > MOST_LINES}
+    assert names.keys() - FLAT_LISTS == set(), names
+
+
+def test_no_package_is_called_run() -> None:
+    packages = {path.parent.name for path in source_files().values() if path.name == "__init__.py"}
+    assert "run" not in packages
+
+
+def test_no_public_name_of_the_emulator_is_a_submodule_too() -> None:
+    """`emulator.run` is to be a function: importing a submodule of that name would rebind it."""
+    import emulator
+
+    below = {module.split(".")[1] for module in source_files() if module.startswith("emulator.")}
+    assert set(getattr(emulator, "__all__", ())) & below == set()
+
+
+def test_tests_mirror_the_packages() -> None:
+    packages = {path.parent.relative_to(ROOT) for path in source_files().values()}
+    folders = {p.parent.relative_to(ROOT / "tests") for p in (ROOT / "tests").glob("*/**/test_*.py")}
+    others = {Path(name) for name in ("benchmarks", "docs", "fuzz", "system")}
+    assert folders - packages - others == set()
 
 
 @pytest.mark.parametrize("modules", ["agents.cooperative, agents.host", "agents.cli, agents.beacon"])
@@ -78,8 +229,7 @@ def test_an_agent_imports_nothing_heavy(modules: str) -> None:
 def test_every_file_opens_with_what_it_is_for() -> None:
     silent = [
         str(path.relative_to(ROOT))
-        for package in FORBIDDEN
-        for path in tracked_files(package)
+        for path in source_files().values()
         if path.stat().st_size and ast.get_docstring(ast.parse(path.read_text())) is None
     ]
     assert silent == []

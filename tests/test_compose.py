@@ -24,9 +24,9 @@ def options(service: str) -> dict[str, object]:
     command = typer.main.get_command(PROGRAMS[program])
     context = command.make_context(program, arguments, resilient_parsing=False)
     if isinstance(command, typer.core.TyperGroup):
-        name, command, rest = command.resolve_command(context, [*context._protected_args, *context.args])
-        assert command is not None
-        context = command.make_context(name, rest, parent=context)
+        name, chosen, rest = command.resolve_command(context, [*context._protected_args, *context.args])
+        assert chosen is not None
+        context = chosen.make_context(name, rest, parent=context)
     return context.params
 
 

@@ -18,68 +18,71 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import replace
+from typing import Annotated, Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
+from agents import options as parsing
 from agents.cooperative.frame import COMMON_LIMIT_M, CooperativeFrame, encode
 from agents.cooperative.options import Options
 from agents.cooperative.program import Estimator, cooperate
 from vnet import Fix, Node
-from vnet.errors import ProgramError
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
-LIES = ("offset", "overconfident", "sums", "relay", "epoch", "non_finite", "absurd", "random")
+Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
+
 EPOCH_LEAP = 20
+"""Epochs between two frames of an attack on the epochs: more than honest vehicles start in seconds."""
 _NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))
 """Estimate in metres, variance in m², and shift of the fix in centimetres."""
 
 
-@dataclass(frozen=True)
-class Lie:
-    """What is said that is not so; see the module's text."""
+class Attack(msgspec.Struct, frozen=True, kw_only=True):
+    """The attacker's own options."""
 
-    lie: str = "offset"
-    offset_m: list[float] = field(default_factory=lambda: [50.0, 0.0])
-    from_s: float = 0.0
+    lie: Literal["offset", "overconfident", "sums", "relay", "epoch", "non_finite", "absurd", "random"] = "offset"
+    """What is false in its frames; see the module's text."""
+    offset_m: tuple[Finite, Finite] = (50.0, 0.0)
+    """Shift (east, north) of what is false."""
+    from_s: Finite = 0.0
+    """Time of the run from which on frames are false."""
 
     @classmethod
-    def parse(cls, options: Mapping[str, Any]) -> Lie:
-        """The liar's own options. Raises ProgramError that names the key, the value and what is allowed."""
-        parsed = cls(**options)
-        if parsed.lie not in LIES:
-            raise ProgramError(f"program.options.lie = {parsed.lie!r}: allowed: {', '.join(LIES)}")
-        numbers = isinstance(parsed.offset_m, list) and all(type(x) in (int, float) for x in parsed.offset_m)
-        if not numbers or len(parsed.offset_m) != 2 or not np.isfinite(parsed.offset_m).all():
-            raise ProgramError(f"program.options.offset_m = {parsed.offset_m!r}: two numbers expected")
-        if type(parsed.from_s) not in (int, float):
-            raise ProgramError(f"program.options.from_s = {parsed.from_s!r}: a number of seconds expected")
-        return parsed
+    def split(cls, options: Mapping[str, Any]) -> tuple[Attack, Options]:
+        """Convert the options of a scenario into those of the attack, and those of the program that it extends.
+
+        Raises ProgramError with the key, the value and what is allowed.
+        """
+        own = {key: value for key, value in options.items() if key in cls.__struct_fields__}
+        others = {key: value for key, value in options.items() if key not in own}
+        return parsing.parse(own, cls), Options.parse(others)
 
 
-class Liar(Estimator):
-    """An estimator whose frames lie. `lie` is set once it has been made."""
+class Attacker(Estimator):
+    """An estimator whose frames are false. `attack` is set once it has been made."""
 
-    lie = Lie()
-    said = 0
+    attack = Attack()
+    sent = 0
 
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
         honest = self.compose(fix, max_payload)
-        if fix.time_ns < self.lie.from_s * NS_PER_S:
+        if fix.time_ns < self.attack.from_s * NS_PER_S:
             return encode(honest)
-        self.said += 1
-        if self.lie.lie == "random":
+        self.sent += 1
+        if self.attack.lie == "random":
             return self._rng.bytes(len(encode(honest)))
-        return encode(self.twist(honest))
+        return encode(self.falsify(honest))
 
-    def twist(self, frame: CooperativeFrame) -> CooperativeFrame:
+    def falsify(self, frame: CooperativeFrame) -> CooperativeFrame:
         """The frame, as the lie has it."""
-        offset_m = np.array(self.lie.offset_m)
-        match self.lie.lie:
+        offset_m = np.array(self.attack.offset_m)
+        match self.attack.lie:
             case "offset":
                 return replace(
                     frame,
@@ -100,10 +103,10 @@ class Liar(Estimator):
             case "epoch":
                 return replace(frame, epoch=frame.epoch + EPOCH_LEAP)
             case "non_finite":
-                wrong = _NOT_FINITE[self.said % 3]
+                wrong = _NOT_FINITE[self.sent % 3]
                 return replace(frame, estimate_m=np.full(2, wrong), covariance_m2=np.full((2, 2), wrong))
             case _:
-                estimate, variance, far_cm = _ABSURD[self.said % len(_ABSURD)]
+                estimate, variance, far_cm = _ABSURD[self.sent % len(_ABSURD)]
                 fix_m = np.full(2, far_cm / 100) if far_cm else frame.fix_m
                 covariance = variance * np.eye(2)
                 return replace(frame, fix_m=fix_m, estimate_m=np.full(2, estimate), covariance_m2=covariance)
@@ -117,10 +120,8 @@ def _shifted(running_sum: tuple[float, float, float], offset_m: Array) -> tuple[
 
 
 async def main(node: Node) -> None:
-    """Cooperate inside, and lie outside, until the run ends."""
-    own = {f.name for f in fields(Lie)}
-    lie = Lie.parse({key: value for key, value in node.options.items() if key in own})
-    options = Options.parse({key: value for key, value in node.options.items() if key not in own})
-    liar = Liar(node.id, options, node.map, node.rng, node.period_ns)
-    liar.lie = lie
-    await cooperate(node, options, liar)
+    """Cooperate inside, and broadcast false frames, until the run ends."""
+    attack, options = Attack.split(node.options)
+    attacker = Attacker(node.id, options, node.map, node.rng, node.period_ns)
+    attacker.attack = attack
+    await cooperate(node, options, attacker)

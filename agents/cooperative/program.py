@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from agents.cooperative.admission import Admission
-from agents.cooperative.fix_table import Sightings
+from agents.cooperative.fix_table import FixTable
 from agents.cooperative.frame import (
     NAME_BYTES,
     POSITION_LIMIT_M,
@@ -38,7 +38,7 @@ from vnet.cmm.consensus import (
     RatioConsensus,
     Share,
 )
-from vnet.cmm.fusion import Cloud, fuse
+from vnet.cmm.fusion import Cloud, fuse, shift
 from vnet.cmm.rbpf import Observation, Rbpf
 from vnet.cmm.robust import near_the_median
 from vnet.cmm.weights import (
@@ -89,7 +89,7 @@ class Estimator:
         self._now_ns = -period_ns
         self._covariance_m2 = np.eye(2)
         self._frames: dict[str, CooperativeFrame] = {}
-        self._sightings = Sightings(int(self.name, 16), period_ns)
+        self._fixes = FixTable(int(self.name, 16), period_ns)
         self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._largest_degree = 0
@@ -105,7 +105,7 @@ class Estimator:
         """Take in what the radio brought; what is not usable is counted by reason."""
         admitted = dict(self._admission.admit(packets, now_ns))
         heard = [(int(sender, 16), frame) for sender, frame in admitted.items() if self._is_neighbour(sender)]
-        forged = self._sightings.learn(heard)
+        forged = self._fixes.learn(heard)
         for code in forged:
             self.rejected["forged"] += 1
             del admitted[name_of_code(code)]
@@ -119,10 +119,10 @@ class Estimator:
         dt_s = max(0, own.time_ns - self._now_ns) / NS_PER_S
         self._since_fusion_s += dt_s
         self._now_ns = max(self._now_ns, own.time_ns)
-        self._sightings.forget(own.time_ns - round(self.rbpf.config.memory_s * NS_PER_S))
+        self._fixes.forget(own.time_ns - round(self.rbpf.config.memory_s * NS_PER_S))
         if np.isfinite(own.covariance_m2).all():
             self._covariance_m2 = own.covariance_m2
-        observations = dict(self._sightings.observations(own.time_ns, self._covariance_m2))
+        observations = dict(self._fixes.observations(own.time_ns, self._covariance_m2))
         if usable(own):
             observations[self.name] = Observation(own.position_m, own.covariance_m2, own.heading_rad)
         self.rbpf.step(dt_s, observations)
@@ -187,7 +187,7 @@ class Estimator:
             stacked, self.imported = fuse(self.rbpf, clouds, weights, self._rng)
             return stacked
         offset = np.array([frame.estimate_m for frame in frames.values()]) - self._said[0]
-        self.rbpf.shift(weights[1:] @ offset)
+        shift(self.rbpf, weights[1:] @ offset)
         return self.rbpf.estimate_m
 
     def _weigh(self, frames: Mapping[str, CooperativeFrame]) -> Array:
@@ -219,7 +219,7 @@ class Estimator:
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """What to broadcast together with the newest fix."""
         frame = self.compose(fix, max_payload)
-        self._admission.said(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
+        self._admission.claim(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
         return encode(frame)
 
     def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
@@ -240,7 +240,7 @@ class Estimator:
             share.running_sum,
             heard,
             self.rbpf.sample(count),
-            self._sightings.freshest(fix.time_ns, most),
+            self._fixes.freshest(fix.time_ns, most),
             min(self._largest_degree, 255),
             self.name,
         )

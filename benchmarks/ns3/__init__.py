@@ -1,1 +1,1 @@
-"""The radio held to ns-3: the same vehicles, sending at the same instants, in both."""
+"""The radio validated against ns-3: the same vehicles, sending at the same instants, in both."""

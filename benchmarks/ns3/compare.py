@@ -47,12 +47,12 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """How many times as much CPU ns-3 took."""
+        """CPU time of ns-3 divided by that of the engine."""
         return self.cpu_s[0] / self.cpu_s[1]
 
     @property
     def holds(self) -> bool:
-        """Whether the curves and the busy ratios agree."""
+        """True if the curves and the channel busy ratios agree."""
         return self.largest <= CURVE_LIMIT and abs(self.busier) <= BUSY_LIMIT
 
     def figures(self) -> dict[str, Any]:

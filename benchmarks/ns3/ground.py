@@ -1,4 +1,4 @@
-"""What both simulators are given, and what both give back."""
+"""Input and output that both simulators share."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ScheduleConstraints:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How many frames each received of each other (N, N), rows are senders; busy ratios (N,); what it took."""
+    """Frames received by sender and receiver (N, N), rows are senders; channel busy ratios (N,); CPU time."""
 
     received: NDArray[np.float64]
     busy: NDArray[np.float64]

@@ -32,23 +32,9 @@ FOLDER = {
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
     "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
-    "control.json, operator.json": "the way in for `vnet fault` and `vnet status`; there while a live run is on",
+    "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
     "again/": "the second run, with `--check-determinism`",
-}
-OUTCOMES = {
-    Outcome.delivered: "it arrived, at `arrival_ns`",
-    Outcome.out_of_range: "counted in `verdict.json`, and has no row",
-    Outcome.peer_cap: "the receiver hears `radio.max_peers` nearer senders",
-    Outcome.faded: "too weak to be detected, or to be read, with nobody else on the air",
-    Outcome.collided: "it would have been received had nobody else been on the air",
-    Outcome.lost: "by `radio.loss`",
-    Outcome.queue_full: "the sender's queue was full",
-    Outcome.held_back: "congestion control gave a newer frame its place",
-    Outcome.oversize: "longer than `radio.max_payload_bytes`",
-    Outcome.fault: "cut or lost by the fault in `cause`",
-    Outcome.receiver_down: "it arrived at a vehicle that was down, at `arrival_ns`",
-    Outcome.transport: "lost between emulator and agent; in real time only, and the run is then unknown",
 }
 TRACE = {
     "sent_ns": "when the program handed it to the radio",
@@ -92,7 +78,11 @@ EVENTS = {
     "interrupted": ("", "", "Ctrl-C or SIGTERM"),
     "finished": ("vehicle", "", "its program returned"),
     "crashed": ("vehicle", "`error`, `where`", "its program raised; the traceback"),
-    "spun": ("vehicle", "`error`, `where`", "its program went on for ever at one instant; where its tasks stood"),
+    "spun": (
+        "vehicle",
+        "`error`, `where`",
+        "its program did not let time advance (busy loop); where its tasks stood",
+    ),
     "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
     "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
@@ -137,7 +127,6 @@ VERDICT = {
 def page() -> str:
     """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
     trace, metrics = Trace(["v01"], knows_air=True).to_table().schema, _metrics_schema()
-    assert {**OUTCOMES, Outcome.pending: ""}.keys() == set(Outcome), "an outcome without a text"
     parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
     parts += [
         "## `trace.parquet`",
@@ -145,7 +134,8 @@ def page() -> str:
         columns(trace, TRACE),
     ]
     parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
-    parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", what] for outcome, what in OUTCOMES.items())))
+    public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
+    parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
     parts += ["## `states.parquet`", columns(STATES, STATE)]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += [

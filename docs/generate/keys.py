@@ -7,9 +7,10 @@ from collections.abc import Collection, Iterator
 from types import UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
+import msgspec
 from pydantic import BaseModel
 
-from docs.generate.markdown import table
+from docs.generate.markdown import attribute_docstrings, table
 
 HEADER = ("key", "type", "default", "unit", "allowed", "what")
 UNITS = {
@@ -56,9 +57,22 @@ def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
         if name not in without and name not in subsections(model):
             if "description" not in key:
                 raise LookupError(f"{model.__name__}.{name} has no docstring")
-            default = "required" if name in required else _default(key)
-            rows.append([f"`{name}`", _type(key), default, unit(name), _allowed(key), key["description"]])
+            rows.append(_row(name, key, name in required))
     return table(HEADER, rows)
+
+
+def option_table(options: type[msgspec.Struct]) -> str:
+    """The options of a program, from the JSON schema that msgspec makes of their structure and their docstrings."""
+    (schema,), components = msgspec.json.schema_components([options])
+    properties = components[schema["$ref"].rpartition("/")[2]]["properties"]
+    said = attribute_docstrings(options)
+    rows = [_row(name, {**key, "description": said[name]}, False) for name, key in properties.items()]
+    return table(HEADER, rows)
+
+
+def _row(name: str, key: dict[str, Any], required: bool) -> list[str]:
+    default = "required" if required else _default(key)
+    return [f"`{name}`", _type(key), default, unit(name), _allowed(key), key["description"]]
 
 
 def subsections(model: type[BaseModel]) -> dict[str, list[type[BaseModel]]]:
@@ -84,7 +98,7 @@ def unit(name: str) -> str:
 
 
 def _type(key: dict[str, Any], many: bool = False) -> str:
-    """What kind of value a key takes, in words; of `many` such values, if they stand in a list."""
+    """Kind of value that a key takes, in words; `many` for a list of them."""
     if "$ref" in key:
         return "[selector](faults.md#selectors)"
     if "anyOf" in key:
@@ -110,7 +124,7 @@ def _default(key: dict[str, Any]) -> str:
 
 def _allowed(key: dict[str, Any]) -> str:
     """The bounds of a key, in words, and those of each of its values if it takes a list."""
-    each = ", ".join(_bounds(key.get("items", {})))
+    each = ", ".join(_bounds(key.get("items") or key.get("prefixItems", [{}])[0]))
     return ", ".join([*_bounds(key), *([f"each {each}"] if each else [])])
 
 

@@ -37,7 +37,7 @@ def sentence(text: str) -> str:
 
 
 def docstring(thing: object) -> str:
-    """What the docstring of `thing` itself says. Raises LookupError if there is none."""
+    """Return the docstring of `thing` itself. Raises LookupError if there is none."""
     text = inspect.cleandoc(getattr(thing, "__doc__", None) or "")
     if not text:
         raise LookupError(f"{thing!r} has no docstring")

@@ -1,17 +1,15 @@
-"""docs/reference/scenario.md: every section and key of a scenario, and the options of the flagship."""
+"""docs/reference/scenario.md: every section and key of a scenario, and the options of programs."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Iterator
 from typing import get_args
 
 from pydantic import BaseModel
 
-from agents.cooperative import options as cooperative_options
-from docs.generate.keys import HEADER, key_table, number, subsections, unit
-from docs.generate.markdown import attribute_docstrings, docstring, sentence, table
+from agents.cooperative.options import Options
+from docs.generate.keys import key_table, option_table, subsections
+from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.scenario import ProgramException, Scenario
 
@@ -25,13 +23,6 @@ OPTIONS = """
 What `agents.cooperative:main` and `agents.centralized:main` take; [estimator.md](../estimator.md) explains what
 they do. Other programs have options of their own, in `node.options`.
 """
-CHOICES = {
-    "profile": tuple(cooperative_options.PROFILES),
-    "fusion": cooperative_options.FUSIONS,
-    "exchange": cooperative_options.EXCHANGES,
-    "consensus": cooperative_options.CONSENSUSES,
-}
-_TYPES = {"str": "text", "bool": "true or false", "int": "whole number", "float": "number"}
 
 
 def page() -> str:
@@ -76,12 +67,4 @@ def _choice(path: str, said: str, kinds: list[type[BaseModel]]) -> Iterator[str]
 def _options() -> Iterator[str]:
     yield "## `[program.options]` of the cooperative programs"
     yield OPTIONS
-    said = attribute_docstrings(cooperative_options.Options)
-    rows = []
-    for field in dataclasses.fields(cooperative_options.Options):
-        value = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-        choices = " or ".join(f"`{json.dumps(choice)}`" for choice in CHOICES.get(field.name, ()))
-        kind = choices or _TYPES.get(str(field.type), "table" if value == {} else "[number, number]")
-        default = number(value) if isinstance(value, (int, float)) else json.dumps(value)
-        rows.append([f"`{field.name}`", kind, f"`{default}`", unit(field.name), "", said[field.name]])
-    yield table(HEADER, rows)
+    yield option_table(Options)

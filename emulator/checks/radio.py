@@ -16,6 +16,7 @@ from emulator.checks.channel import nothing_seen, received_twice
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import DETECTION_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
+from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
@@ -31,7 +32,7 @@ TELLING_VARIANCE = 5.0
 """Of how many faded on a link: with less, a sum is not yet normal."""
 GRID_DB = 0.25
 FACTORS = 1024
-NEVER_SENT = ("queue_full", "oversize", "held_back")
+NEVER_SENT = decided_at(Stage.SENDER)
 LEAST_PAUSE_NS = 25_000_000
 ROUNDING = 1e-6
 

@@ -42,7 +42,7 @@ def table1(
     seeds: SeedsOption = 20, out: OutOption = None, only: OnlyOption = None, live: LiveOption = False
 ) -> None:
     """Table I: four vehicles on a directed ring, constant α against optimized weights."""
-    from emulator.experiments import figures, reports
+    from emulator.experiments import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "table1")
@@ -50,7 +50,7 @@ def table1(
         cells = paper.table1_cells(range(1, seeds + 1), folder / "crossing.csv")
         results = _run(cells, folder, "table1", only, live)
         if only is None:
-            figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
+            result_figures.alpha_curve(results, reports.PAPER_TABLE1, folder / "table1")
             _show(reports.table1(results), folder / "table1.md")
 
 
@@ -83,14 +83,14 @@ def default(
     live: LiveOption = False,
 ) -> None:
     """vnet's own profile on the same networks, against the limit of any cooperation. Takes hours for all."""
-    from emulator.experiments import figures, reports
+    from emulator.experiments import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "default")
         cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
         results = _run(cells, folder, "default", only, live)
         if any(row["mechanism"] == "limit" for row in results):
-            figures.ratio_bars(results, folder / "default")
+            result_figures.ratio_bars(results, folder / "default")
             _show(reports.default_profile(results), folder / "default.md")
 
 
@@ -98,7 +98,7 @@ def default(
 def tempering(
     networks: NetworksOption = None, seeds: SeedsOption = 10, out: OutOption = None, only: OnlyOption = None
 ) -> None:
-    """How often roads count anew: ANEES and error of the limit, on N3 of the default too, against lateral_tau_s."""
+    """Consistency (ANEES) and error of the hears-all bound against lateral_tau_s, on N3 of the default too."""
     from emulator.experiments import tempering as study
 
     with one_line_errors():
@@ -170,13 +170,17 @@ def draw_figures(
     / "table2",
 ) -> None:
     """The paper's pictures: degrees, road angles, graphs; RMSE and deviation against time on N2 and N3."""
-    from emulator.experiments import figures
+    from emulator.experiments import network_figures
 
     with one_line_errors():
         folder = _folder(out, "figures")
         sections = paper.network_sections(networks)
         found = {name.upper(): paper.load_positions(section) for name, section in sections.items()}
-        for draw in (figures.degree_histogram, figures.road_angle_histogram, figures.graphs):
+        for draw in (
+            network_figures.degree_histogram,
+            network_figures.road_angle_histogram,
+            network_figures.graphs,
+        ):
             print(draw(found, folder / draw.__name__))
         cells = paper.table2_cells({n: sections[n] for n in ("n2", "n3")}, range(1, seeds + 1), sides=(1,))
         run_cells(cells, cells_from, title="figures")
@@ -200,7 +204,7 @@ def capacity(
     seeds: SeedsOption = 2,
     out: OutOption = None,
 ) -> None:
-    """How many peers an 802.11p channel has room for: delivery against the number of senders in reach."""
+    """Capacity of an 802.11p channel: packet delivery ratio against the number of senders in range."""
     from emulator.experiments.capacity import run_capacity
 
     with one_line_errors():
@@ -247,13 +251,13 @@ def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
 
 
 def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
-    from emulator.experiments import figures, reports
+    from emulator.experiments import reports, result_figures
 
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
         references = {f"the paper's {m}": rmse[network] for m, rmse in reports.PAPER_TABLE2.items()}
         series = _series(cells, cells_from, network)
-        print(figures.against_time(series, folder / f"{network}_against_time", title, references))
+        print(result_figures.against_time(series, folder / f"{network}_against_time", title, references))
 
 
 def _series(cells: Sequence[Cell], folder: Path, network: str) -> dict[str, list[pa.Table]]:

@@ -28,7 +28,7 @@ from vnet.errors import VnetError
 WORST_LINKS = 10
 FIGURES = {
     "latency": "latency_mean_ms",
-    "between two receptions": "inter_reception_mean_ms",
+    "inter-packet gap": "inter_reception_mean_ms",
     "age of information": "age_mean_ms",
 }
 DISTANCE_COLUMNS = {"from": "from_m", "to": "to_m", "pairs": "pairs", "delivered": "delivery_ratio"}
@@ -46,7 +46,7 @@ LINK_COLUMNS = {
 
 
 class Format(StrEnum):
-    """What a run can be exported to."""
+    """File formats to which a run can be exported."""
 
     PCAPNG = "pcapng"
     MCAP = "mcap"

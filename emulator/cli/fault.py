@@ -23,7 +23,7 @@ from emulator.terminal.painter import Painter
 from emulator.terminal.progress import terminal
 from vnet.errors import ScenarioError, VnetError
 
-app = typer.Typer(no_args_is_help=True, help="Break things in a running emulator, and mend them.")
+app = typer.Typer(no_args_is_help=True, help="Inject faults into a running emulator, and heal them.")
 
 RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
 LATEST = Path("runs/latest")
@@ -43,7 +43,7 @@ def inject(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. As often as need be.",
+            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. May be repeated.",
         ),
     ] = None,
     run: RunOption = LATEST,
@@ -89,7 +89,7 @@ def status(
         bool, typer.Option("--watch", metavar="", help="Go on showing it until the run is over.")
     ] = False,
 ) -> None:
-    """How a running emulator gets on: time, vehicles, errors, frames, faults, events."""
+    """Show the progress of a running emulator: time, vehicles, errors, frames, faults, events."""
     with one_line_errors():
         if as_json and watch:
             raise VnetError("--json and --watch exclude each other")

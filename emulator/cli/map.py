@@ -163,7 +163,7 @@ def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
 
 
 def _draw(roads: Roads, out: Path, title: str, window: tuple[Array, Array] | None) -> None:
-    from emulator.world.maps.picture import draw_map  # matplotlib takes a second to import
+    from emulator.pages.map_picture import draw_map  # matplotlib takes a second to import
 
     try:
         draw_map(roads, out, title, window)

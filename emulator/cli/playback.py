@@ -1,4 +1,4 @@
-"""`vnet render` and `vnet play`: a run that is over, drawn anew from its files alone."""
+"""`vnet render` and `vnet play`: a finished run, drawn again from its files alone."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def render(
     ] = None,
     rerun_vehicle: RerunVehicleOption = None,
 ) -> None:
-    """Make a run's recording anew, and where it lies in the run's folder the report, from its files alone."""
+    """Rebuild a run's recording (and its report, where the recording is the run's own) from its files alone."""
     from emulator.report.write import write_report  # matplotlib is slow to import
 
     with one_line_errors():

@@ -27,7 +27,7 @@ def report(
     ] = None,
     show: Annotated[bool, typer.Option("--open", help="Open it in a browser here.")] = False,
 ) -> None:
-    """Write a run's report.html anew, from its files alone."""
+    """Rebuild a run's report.html from its files alone."""
     with one_line_errors():
         path = _write_index(index) if index is not None else _write_report(run)
         print(path, flush=True)

@@ -1,28 +1,33 @@
-"""`vnet view`: looking at runs, in a window where there is a display, else from a browser."""
+"""`vnet view` and `vnet record`: look at a run in Rerun, and record one that is on from outside."""
 
 from __future__ import annotations
 
 import contextlib
 import socket
 import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from emulator.cli.options import RerunOption
 from emulator.drivers.control import read_control_file
 from emulator.records.run_folder import check_is_run
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
     RECORDING,
+    choose_sinks,
     has_display,
     is_closed,
-    mend,
     place_to_serve,
+    repair,
     serve_file,
     viewer_command,
 )
 from vnet.errors import VnetError
+from vnet.transport.credentials import Credentials
 
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
 RerunBindOption = Annotated[
@@ -53,7 +58,7 @@ def view(
         if not recording.exists() or not recording.stat().st_size:
             raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
         if not is_closed(recording):
-            recording = mend(recording)
+            recording = repair(recording)
             print(f"the recording was not closed: what it has is in {recording}", flush=True)
         if has_display() and not serve and rerun_bind is None and rerun_port is None:
             with contextlib.suppress(KeyboardInterrupt):
@@ -65,7 +70,7 @@ def view(
 
 
 def _is_on(run: Path) -> bool:
-    """Whether a run is going on in this folder."""
+    """Return True if the run of this folder is on."""
     way = read_control_file(run)
     if way is None:
         return False
@@ -80,3 +85,28 @@ def _tell_where(run: Path) -> None:
     if way is None or way[2] is None:
         raise VnetError(f"{run}: the run is on, and is not served: only vnet run --rerun serve can be watched")
     print(f"the run is on\n{way[2].announcement()}")
+
+
+def record(
+    connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Of the emulator, or of its router.")],
+    run: Annotated[str, typer.Option(metavar="NAME", help="The name of the run: run.name of its scenario.")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The recording to write.")] = Path("recording.rrd"),
+    credentials: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The observer's: access/credentials/observer.json.")
+    ] = None,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
+) -> None:
+    """Watch a run from outside and write a Rerun recording of it."""
+    from emulator.viewer.watch import record_run  # Rerun is slow to import, and only this command needs it
+
+    with one_line_errors():
+        login = None if credentials is None else Credentials.load(credentials)
+        sinks = choose_sinks(rerun or ["save"], rerun_bind, rerun_port, rerun_vehicle)
+        if sinks is None:
+            raise VnetError("--rerun off: there is nothing to do")
+        if sinks.serve is not None:
+            print(sinks.serve.announcement(), file=sys.stderr, flush=True)
+        record_run(connect, run, login, replace(sinks, save=out))

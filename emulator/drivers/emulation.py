@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of, distances_m
@@ -41,10 +42,11 @@ class PeriodView:
 
 @dataclass(frozen=True)
 class ProcessActions:
-    """What processes suffer from an instant on.
+    """What faults and trips do to processes from an instant on.
 
-    `stop`: nodes whose programs end now, and whether they are killed; `start`: those that start (anew); `paused`:
-    all that stand still; `clocks`: how all clocks go; `restarts`: of the emulator or its router.
+    `stop`: nodes whose programs end now, and whether they are killed; `start`: nodes that are started, for the
+    first time or again; `paused`: all nodes that are paused; `clocks`: the errors of all clocks; `restarts`: of the
+    emulator or its router.
     """
 
     stop: dict[str, bool]
@@ -72,20 +74,15 @@ class Emulation:
         self._placed = 0  # the period in which vehicles are where the engine has them
         self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
         self.gnss = FaultyGnss(world, self.faults.faults, scenario.run.seed)
-        self.incarnation = dict.fromkeys(world.node_ids, 0)
-        self._outside = self._absent(0)  # whom no event says to be there
-        self._newcomers = set(self._outside)
-        self._down = set(self._outside)  # until a fault ends, or they enter
-        self._starting: set[str] = set()
-        self._ended: set[str] = set()
+        self.presence = Presence(world.node_ids, self._absent(0))
+        self.up, self.incarnation = self.presence.up, self.presence.incarnation
         self._acting: set[str] = set()
         self._acted_ns = -1
         self._next_change_ns = self._find_next_change_ns()
         self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
-        self.up = dict.fromkeys(world.node_ids, True)
-        for node in self._outside:
-            self._take_down(node)
+        for node, up in self.up.items():
+            self.engine.set_up(self.number[node], up)
         self._watchers: list[Callable[[PeriodView], None]] = []
         self._period = 0
         self._finished = False
@@ -146,7 +143,7 @@ class Emulation:
             scenario.run.orphan_timeout_s,
             scenario.run.spin_limit,
             wire.boot_id(),
-            node not in self._ended,
+            not self.presence.has_ended(node),
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -173,25 +170,19 @@ class Emulation:
             self._placed = period
 
     def _end(self, time_ns: int, ending: wire.Ending) -> None:
-        if not self.up[ending.node]:
-            return
         details: dict[str, Any] = {}
         if ending.error:
             details = {"error": ending.error, "where": ending.details}
-        self.folder.event(time_ns, ending.kind, ending.node, **details)
-        self._ended.add(ending.node)
-        self._take_down(ending.node)
+        self._program_over(time_ns, ending.node, ending.kind, details)
 
     def died(self, time_ns: int, node: str, **details: Any) -> None:
-        """A node's process ended without being told to."""
-        if self.up[node]:
-            self.folder.event(time_ns, "died", node, **details)
-            self._ended.add(node)
-            self._take_down(node)
+        """Take a node down whose process has ended without being told to."""
+        self._program_over(time_ns, node, "died", details)
 
-    def _take_down(self, node: str) -> None:
-        self.up[node] = False
-        self.engine.set_up(self.number[node], False)
+    def _program_over(self, time_ns: int, node: str, kind: str, details: dict[str, Any]) -> None:
+        if self.presence.end(node):
+            self.folder.event(time_ns, kind, node, **details)
+            self.engine.set_up(self.number[node], False)
 
     # Faults, and vehicles that enter and leave.
 
@@ -216,47 +207,28 @@ class Emulation:
         self.engine.set_faults(active, time_ns)
         self._log_changes(time_ns, active)
         absent = self._absent(time_ns // self.world.period_ns)
-        down = self._nodes_under(active, "kill", "restart") | absent
-        paused = self._nodes_under(active, "pause")
         killed = self._nodes_under(active, "kill")
-        living = [node for node in self.world.node_ids if self.up[node] or node in self._starting]
-        stop = {node: node in killed for node in living if node in down}
-        start = [n for n in self.world.node_ids if n in self._down and n not in down]
-        for node in stop:
-            self._take_down(node)
-        self._log_departures(time_ns, absent)
-        for node in start:
-            self.incarnation[node] += node not in self._newcomers
-        self._newcomers.difference_update(start)
-        self._starting = (self._starting - stop.keys()) | set(start)
+        changes = self.presence.change(killed | self._nodes_under(active, "restart"), absent)
+        for node in changes.stopped:
+            self.engine.set_up(self.number[node], False)
+        for node in changes.left:
+            self.folder.event(time_ns, "left", node)
         if starts_at_once:
-            self.come_back(start, time_ns)
-        self._down = (self._down | stop.keys()) - set(start)
-        clocks = [clock_of(active, node, number, time_ns) for node, number in self.number.items()]
-        restarts = [p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns]
-        return ProcessActions(stop, start, paused, clocks, restarts)
+            self.come_back(changes.started, time_ns)
+        return ProcessActions(
+            stop={node: node in killed for node in changes.stopped},
+            start=changes.started,
+            paused=self._nodes_under(active, "pause"),
+            clocks=[clock_of(active, node, number, time_ns) for node, number in self.number.items()],
+            restarts=[p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns],
+        )
 
     def come_back(self, nodes: Sequence[str], time_ns: int) -> None:
-        """Nodes that were down are up, but for those whose programs have ended by themselves."""
-        self._starting.difference_update(nodes)
-        for node in [node for node in nodes if node not in self._ended]:
-            self.up[node] = True
+        """Nodes that have been started are up."""
+        for node, entered in self.presence.come_up(nodes).items():
             self.engine.set_up(self.number[node], True)
-            if node in self._outside:
-                self._outside.discard(node)
-                self.folder.event(time_ns, "entered", node, incarnation=self.incarnation[node])
-            else:
-                self.folder.event(time_ns, "restarted", node, incarnation=self.incarnation[node])
-
-    def has_left(self, node: str) -> bool:
-        """Whether a vehicle is not in the network, as events tell it."""
-        return node in self._outside
-
-    def _log_departures(self, time_ns: int, absent: set[str]) -> None:
-        for node in self.world.node_ids:
-            if node in absent and node not in self._outside:
-                self.folder.event(time_ns, "left", node)
-        self._outside |= absent
+            kind = "entered" if entered else "restarted"
+            self.folder.event(time_ns, kind, node, incarnation=self.incarnation[node])
 
     def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
         chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]

@@ -70,7 +70,7 @@ class Membership:
 
     @property
     def missing(self) -> list[str]:
-        """Nodes that should be there and are not ready, or not of their lead's process, in number order."""
+        """Nodes that should be there and are not ready, or not of the process they named, in number order."""
         return [node for node in self._node_ids if node not in self.later and not self._is_ready(node)]
 
     def _is_ready(self, node: str) -> bool:
@@ -91,18 +91,18 @@ class Membership:
         return member is not None and member.nonce == nonce and member.process_id == process_id
 
     def nodes_with(self, process_id: str) -> list[str]:
-        """The nodes of the process of `process_id`, the lead first."""
+        """Nodes of a process, its id first."""
         others = [
             node for node in self._node_ids if node != process_id and self._members[node].process_id == process_id
         ]
         return [process_id, *others]
 
-    def lead_of(self, node: str) -> str:
-        """The lead of a node's process."""
+    def process_of(self, node: str) -> str:
+        """Id of a node's process."""
         return self._members[node].process_id
 
     def processes(self) -> list[list[str]]:
-        """The nodes of each process, lead first, in the order of their leads' numbers."""
+        """Nodes of each process, its id first, in the order of the ids' numbers."""
         assert not self.missing, self.missing
         groups = {node: [node] for node in self._node_ids if self._members[node].process_id == node}
         for node in self._node_ids:

@@ -61,7 +61,7 @@ class Launcher:
         self._services: set[str] = set()
 
     def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
-        """Start the process of `nodes`; its name here is that of its lead, the first node.
+        """Start the process of `nodes`; its name is the id of the first.
 
         `nice` lowers its priority, so that on a full machine the emulator, which all wait for, comes first.
         """

@@ -1,29 +1,20 @@
-"""The two pacings of a run, lockstep and real time, without any transport.
+"""The barrier of a run in lockstep, without any transport.
 
-Lockstep is a conservative discrete-event simulation whose entities are event loops: it is told what each
-process yields and says whom to grant what. The live driver moves these messages over Zenoh, `vnet simulate`
-by calling; so both give the same trace. Real time runs the same engine on a clock that the driver reads.
+Lockstep is a conservative discrete-event simulation whose entities are event loops: it is told what each process
+yields and says which processes to grant which instant. The live driver moves these messages over Zenoh,
+`vnet simulate` by calling; so both give the same trace.
 """
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
-from itertools import accumulate
 from typing import Any
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.radio.engine import Delivery
-from vnet.errors import VnetError
-from vnet.node import INBOX_LIMIT, Packet
+from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
+from vnet.node import INBOX_LIMIT
 from vnet.transport import wire
-
-WORST_PROCESSES, WORST_SECONDS = 8, 20
-"""How many are named of those to which deliveries came late."""
-
-
-class ProtocolError(VnetError):
-    """A message that does not fit what its process was told, or speaks for others."""
 
 
 class _Process:
@@ -59,7 +50,7 @@ class _Process:
 
 
 class Lockstep:
-    """The barrier of a run. `processes` are the node ids of each event loop, the lead first.
+    """The barrier of a run. `processes` are the node ids of each event loop; the first is its id.
 
     Use: grants = start(); then, until `step` returns none: do what `take_actions` says, give each grant to its
     process and `receive` its yield (or say that it `died`); when nothing is `owed`, call `step`.
@@ -104,7 +95,7 @@ class Lockstep:
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
         waiting = [*message.waiting_radio, *message.waiting_gnss]
-        _check_ownership(process.nodes, message.traffic, waiting)
+        check_ownership(process.nodes, message.traffic, waiting)
         del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns
         process.waiting_radio = message.waiting_radio
@@ -237,7 +228,7 @@ class Lockstep:
         queues = {node: queue for p in self._processes.values() for node, queue in p.packets.items()}
         for delivery in self._emulation.advance(time_ns):
             node = node_ids[delivery.receiver]
-            queues[node].append(_wire_packet(node, delivery.packet))
+            queues[node].append(wire_packet(node, delivery.packet))
 
     def _grant(self, process_ids: Sequence[str]) -> dict[str, wire.Grant]:
         grants = {}
@@ -261,225 +252,3 @@ class Lockstep:
         number = self._emulation.number[node]
         fixes = [self._emulation.gnss.fix(period, number) for period in range(first, last + 1)]
         return [wire.WireFix.of(node, fix) for fix in fixes if fix is not None]
-
-
-class RealTime:
-    """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
-
-    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`. Processes
-    come and go with faults: do what `take_actions` says, and tell `returned` when one is there again.
-    """
-
-    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
-        self._emulation = emulation
-        self._nodes = {nodes[0]: tuple(nodes) for nodes in processes}
-        self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
-        self._batch_seq = dict.fromkeys(self._nodes, 0)
-        self._frames_seq = dict.fromkeys(self._nodes, 0)
-        self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {process_id: {} for process_id in self._nodes}
-        self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
-        self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
-        self._present = {
-            process_id for process_id, nodes in self._nodes.items() if any(emulation.up[node] for node in nodes)
-        }
-        self._awaited = set(self._present)
-        self._paused: set[str] = set()
-        self._was_paused: set[str] = set()
-        self._actions: list[ProcessActions] = []
-        self._packets: dict[str, list[Delivery]] = {}
-        self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
-        self._affected: set[str] = set()
-        self._next_period = 0
-        self._origin_ns = 0
-        self.gaps = 0
-
-    def start(self, origin_ns: int) -> dict[str, wire.Batch]:
-        """The batches that start every process that is there; time 0 is `origin_ns` on the monotonic clock."""
-        self._origin_ns = origin_ns
-        return {
-            process_id: self._batch(process_id, origin_ns=origin_ns)
-            for process_id in self._nodes
-            if process_id in self._present
-        }
-
-    def next_time_ns(self) -> int | None:
-        """When `due` must be called next: the next arrival, fix or fault."""
-        candidates = [
-            self._emulation.engine.next_time(),
-            self._emulation.fix_time_ns(self._next_period),
-            self._emulation.next_change_ns(),
-        ]
-        due = [time_ns for time_ns in candidates if time_ns is not None]
-        return min(due) if due else None
-
-    def receive(self, now_ns: int, process_id: str, message: wire.Frames) -> None:
-        """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
-        _check_ownership(self._nodes[process_id], message.traffic, ())
-        if message.seq != self._frames_seq[process_id]:
-            self.gaps += 1
-        self._frames_seq[process_id] = message.seq + 1
-        self._acknowledge(process_id, message)
-        if message.lateness is not None:
-            process = process_id, self._emulation.incarnation[process_id]
-            before = _late(self._lateness.get(process, ()))
-            self._late_in[now_ns // 10**9] += _late(message.lateness.counts) - before
-            self._lateness[process] = message.lateness.counts
-        if message.final:
-            self._awaited.discard(process_id)
-        if now_ns < self._emulation.duration_ns:
-            self._emulation.take(now_ns, [message.traffic])
-
-    @property
-    def all_final(self) -> bool:
-        """Whether every process that lives has said its last words."""
-        return not self._awaited
-
-    def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
-        waiting = self._unacknowledged[process_id]
-        for first, last in message.missed:
-            self.gaps += 1
-            for seq in [seq for seq in waiting if first <= seq <= last]:
-                self._lose(waiting.pop(seq))
-        for seq in [seq for seq in waiting if seq < message.received_seq]:
-            del waiting[seq]
-
-    def _lose(self, deliveries: Sequence[Delivery]) -> None:
-        for delivery in deliveries:
-            self._emulation.engine.lose(delivery)
-
-    def due(self, now_ns: int) -> dict[str, wire.Batch]:
-        """What has become due by `now_ns`, by process."""
-        while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
-            self._collect(change_ns - 1)
-            self._act(change_ns)
-        self._collect(now_ns)
-        ready = self._present - self._paused
-        return {
-            process_id: self._batch(process_id)
-            for process_id in self._nodes
-            if process_id in ready
-            and (process_id in self._packets or process_id in self._fixes or self._clocks[process_id])
-        }
-
-    def take_actions(self) -> list[ProcessActions]:
-        """What processes suffer by now."""
-        actions, self._actions = self._actions, []
-        return actions
-
-    def _act(self, time_ns: int) -> None:
-        actions = self._emulation.act(time_ns, starts_at_once=False)
-        self._actions.append(actions)
-        for process_id in {self._process_of[node] for node in actions.stop}:
-            self._present.discard(process_id)
-            self._awaited.discard(process_id)
-            self._unacknowledged[process_id].clear()
-            self._packets.pop(process_id, None)
-            self._fixes.pop(process_id, None)
-        paused = {self._process_of[node] for node in actions.paused}
-        self._was_paused |= self._paused - paused
-        self._paused = paused
-        for clock in actions.clocks:
-            if clock.is_wrong or clock.node in self._affected:
-                self._clocks[self._process_of[clock.node]].append(clock)
-                self._affected.add(clock.node)
-
-    def returned(self, now_ns: int, process_id: str) -> wire.Batch:
-        """A process that was started anew is ready; returns the batch that starts it."""
-        self._emulation.come_back(self._nodes[process_id], now_ns)
-        self._batch_seq[process_id] = self._frames_seq[process_id] = 0
-        self._unacknowledged[process_id].clear()
-        self._present.add(process_id)
-        self._awaited.add(process_id)
-        return self._batch(process_id, origin_ns=self._origin_ns, start_ns=now_ns)
-
-    def _collect(self, time_ns: int) -> None:
-        """Take what arrives, and the fixes that are due, by then."""
-        node_ids = self._emulation.world.node_ids
-        for delivery in self._emulation.advance(time_ns):
-            process_id = self._process_of[node_ids[delivery.receiver]]
-            if process_id in self._present:
-                self._packets.setdefault(process_id, []).append(delivery)
-        while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= time_ns:
-            for number, node in enumerate(node_ids):
-                fix = self._emulation.gnss.fix(self._next_period, number) if self._emulation.up[node] else None
-                if fix is not None and self._process_of[node] in self._present:
-                    self._fixes.setdefault(self._process_of[node], []).append(wire.WireFix.of(node, fix))
-            self._next_period += 1
-
-    def _batch(self, process_id: str, origin_ns: int | None = None, start_ns: int = 0) -> wire.Batch:
-        seq = self._batch_seq[process_id]
-        self._batch_seq[process_id] = seq + 1
-        deliveries, fixes = self._packets.pop(process_id, []), self._fixes.pop(process_id, [])
-        self._unacknowledged[process_id][seq] = deliveries
-        node_ids = self._emulation.world.node_ids
-        packets = [_wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
-        clocks, self._clocks[process_id] = self._clocks[process_id], []
-        held = process_id in self._was_paused
-        self._was_paused.discard(process_id)
-        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks)
-
-    def died(self, now_ns: int, process_id: str, **details: Any) -> None:
-        """A process has ended: its nodes are down from now on."""
-        for node in self._nodes[process_id]:
-            self._emulation.died(now_ns, node, **details)
-        self._unacknowledged[process_id].clear()
-        self._present.discard(process_id)
-        self._awaited.discard(process_id)
-
-    def finish(self) -> None:
-        """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
-        self._emulation.finish(self._emulation.duration_ns)
-        for waiting in self._unacknowledged.values():
-            for deliveries in waiting.values():
-                self._lose(deliveries)
-        if self.gaps:
-            self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
-        counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]
-        if sum(counts):
-            figures = lateness_figures(counts)
-            worst = sorted(self._lateness, key=lambda process: -_late(self._lateness[process]))[:WORST_PROCESSES]
-            figures["worst"] = {
-                f"{process_id}.{start}": _late(self._lateness[process_id, start]) for process_id, start in worst
-            }
-            worst_s = self._late_in.most_common(WORST_SECONDS)
-            figures["worst_s"] = {str(second): count for second, count in worst_s if count > 0}
-            self._emulation.folder.event(self._emulation.duration_ns, "late_deliveries", None, **figures)
-
-
-def _late(counts: Sequence[int]) -> int:
-    """How many deliveries of a lateness histogram are over the limit."""
-    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
-
-
-def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
-    """Figures of a lateness histogram: deliveries, how many over the limit, percentiles in ms."""
-    total = sum(counts)
-    cumulative = list(accumulate(counts))
-
-    def percentile_ms(share: float) -> float:
-        """Interpolated within its bin."""
-        index = next(i for i, c in enumerate(cumulative) if c >= share * total)
-        below = cumulative[index] - counts[index]
-        inside = (share * total - below) / counts[index]
-        low_ms, high_ms = wire.lateness_edge_ms(index - 1), wire.lateness_edge_ms(index)
-        return low_ms + inside * (high_ms - low_ms)
-
-    return {
-        "total": total,
-        "count": _late(counts),
-        "p50_ms": percentile_ms(0.5),
-        "p99_ms": percentile_ms(0.99),
-        "max_ms": percentile_ms(1.0),
-    }
-
-
-def _wire_packet(node: str, packet: Packet) -> wire.WirePacket:
-    return wire.WirePacket(node, packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
-
-
-def _check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str]) -> None:
-    named = [part.node for parts in (traffic.frames, traffic.reports, traffic.endings) for part in parts]
-    for node in [*named, *waiting]:
-        if node not in nodes:
-            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")

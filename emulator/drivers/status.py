@@ -140,6 +140,7 @@ class Course:
         factor = self._real_time_factor()
         now_ns = emulation.emulated_ns if now_ns is None else min(now_ns, emulation.duration_ns)
         memory_kb = resident_kb()
+        is_outside = emulation.presence.is_outside
         return Snapshot(
             run=run.name,
             pacing=run.pacing,
@@ -147,8 +148,8 @@ class Course:
             node_ids=emulation.world.node_ids,
             phase=self._phase,
             missing=self._missing,
-            down=tuple(node for node, up in emulation.up.items() if not up and not emulation.has_left(node)),
-            absent=tuple(node for node in emulation.world.node_ids if emulation.has_left(node)),
+            down=tuple(node for node, up in emulation.up.items() if not up and not is_outside(node)),
+            absent=tuple(filter(is_outside, emulation.world.node_ids)),
             emulated_s=now_ns / NS_PER_S,
             duration_s=emulation.duration_ns / NS_PER_S,
             join_timeout_s=run.join_timeout_s,

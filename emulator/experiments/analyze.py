@@ -36,11 +36,11 @@ NO_CVXPY = "fastest-mixing weights left out: cvxpy is not installed (pip install
 
 
 def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
-    """What can be said of the scenario's network beforehand, as plain numbers; `analysis_table` prints it.
+    """Analyze the scenario's network before any run, as plain numbers; `analysis_table` prints them.
 
     `components` are sizes, largest first, of who is linked both ways (`weak_components` counts links of one
     direction as well, as the metrics of a run do). Of each of the `rules`: `convergence_factor` (r_asym, 1.0 where
-    the network does not come together), `spectral_gap` (1 less that), `deviation_variance`, the steady variance
+    the network is not connected), `spectral_gap` (1 less that), `deviation_variance`, the steady variance
     per axis of x_i − x̄, a mean over vehicles, with noise of unit variance a round (None where it grows for ever),
     and both for each component by itself, where x̄ is the component's mean. `run`, a run's folder, adds `measured`.
     Raises VnetError where the network or the run cannot be used.
@@ -115,21 +115,21 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
 
 def hears_matrix(scenario: Scenario, world: World) -> Links:
-    """Who (row) hears whom (column) at the start, (N, N): range, links or path loss, and the peer cap."""
+    """Directed links at the start, (N, N), row i hears column j: range, links or path loss, and the peer cap."""
     connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
     topology = Topology(world.at(0).position_m, connectivity, scenario.radio.max_peers)
     return np.asarray(topology.now.admitted.T)
 
 
 def mutual(hears: Links) -> Links:
-    """Who hears each other, (N, N), nobody itself."""
+    """Links that work in both directions, (N, N), without the diagonal."""
     linked: Links = hears & hears.T
     np.fill_diagonal(linked, False)
     return linked
 
 
 def is_connected(linked: Links) -> bool:
-    """Whether everybody is reached from everybody."""
+    """Return True if the graph is connected."""
     return bool(_labels(linked).max() == 0)
 
 
@@ -175,7 +175,7 @@ def metropolis_matrix(linked: Links) -> Array:
 
 
 def ratio_matrix(linked: Links) -> Array:
-    """What a round of ratio consensus does to mass: A_ij = 1/(d_j + 1). Its columns add up to 1, not its rows."""
+    """Mass matrix of a round of ratio consensus: A_ij = 1/(d_j + 1). Its columns add up to 1, not its rows."""
     return np.asarray((linked + np.eye(len(linked))) / (linked.sum(axis=0) + 1))
 
 
@@ -188,7 +188,7 @@ def _assemble(linked: Links, weigh: Callable[[int, NDArray[np.intp]], Array]) ->
 
 
 def has_cvxpy() -> bool:
-    """Whether fastest-mixing weights can be had."""
+    """Return True if fastest-mixing weights can be computed (cvxpy is installed)."""
     return importlib.util.find_spec("cvxpy") is not None
 
 

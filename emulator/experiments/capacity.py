@@ -1,9 +1,9 @@
-"""How many peers the air has room for: delivery against the number of senders in reach, by the engine alone.
+"""Capacity of the channel: delivery ratio against the number of senders in range, by the engine alone.
 
-Vehicles send ten frames a second, each at an instant of its own in every tenth. Delivery is the share of what was
-handed over that arrives at those within reach: the distance at which a frame is just detected without fading. Two
-places: one where all are within 200 m, so that all hear all, and a straight road whose middle third is looked at,
-with hidden terminals from beyond the horizon of either end of a pair.
+Vehicles send ten frames a second, each at its own instant within every tenth. The packet delivery ratio is that of
+enqueued frames at the receivers in range, which is the distance at which a frame is just detected without fading.
+There are two layouts: all vehicles within 200 m, so that all hear all; and a straight road, of which the middle
+third is measured, with hidden terminals beyond the range of either end of a link.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from emulator.experiments.figures import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
+from emulator.experiments.style import BLACK, BLUE, GREEN, GREY, ORANGE, RED, save, styled
 from emulator.radio.dot11p import airtime_ns
 from emulator.radio.engine import Engine
 from emulator.radio.outcomes import Outcome
@@ -59,7 +59,7 @@ VARIANTS = (
 
 @dataclass(frozen=True)
 class Point:
-    """What so many peers find: the share delivered of what was handed over, and the busy ratio."""
+    """Packet delivery ratio and channel busy ratio with this number of peers."""
 
     variant: str
     size_bytes: int
@@ -69,7 +69,7 @@ class Point:
 
 
 def reach_m() -> float:
-    """How far a frame is detected without fading."""
+    """Distance at which a frame is just detected without fading."""
     loss, receiver = LogDistance(kind="log_distance"), Receiver()
     spare_db = loss.tx_power_dbm - loss.reference_db - receiver.min_rssi_dbm
     return float(10 ** (spare_db / (10 * loss.exponent)))
@@ -123,7 +123,7 @@ def study(seconds: float, seeds: Sequence[int], peers: Sequence[int] = PEERS) ->
 
 
 def _mean(points: Sequence[Point]) -> Point:
-    """Of points that differ only in their seeds."""
+    """Mean of points that differ only in their seeds."""
     delivered, busy = (float(np.mean([getattr(one, name) for one in points])) for name in ("delivered", "busy"))
     return replace(points[0], delivered=delivered, busy=busy)
 
@@ -157,7 +157,7 @@ def report(points: Sequence[Point]) -> str:
     begins = ["never" if peers is None else f"**{peers:.0f}**" for peers in onsets]
     lines.append(f"| less than {SIGNIFICANT:.0%} from | " + " | ".join(begins) + " |")
     air = ", ".join(f"{size} B take {airtime_ns(size, 6.0) / 1e6:.3f} ms" for size in SIZES)
-    head = f"Delivered of what was handed over (busy ratio); {RATE_HZ} frames a second, 6 Mbit/s: {air}."
+    head = f"Delivered of the enqueued frames (channel busy ratio); {RATE_HZ} frames a second, 6 Mbit/s: {air}."
     return "\n".join([head, "", *lines, ""])
 
 
@@ -176,7 +176,7 @@ def draw(points: Sequence[Point]) -> Figure:
     panels = figure.subplots(1, len(SIZES), sharey=True)
     for axes, size_bytes in zip(panels, SIZES, strict=True):
         _draw_size(axes, points, size_bytes)
-    panels[0].set_ylabel("delivered of what was handed over")
+    panels[0].set_ylabel("packet delivery ratio")
     panels[0].legend(loc="lower left", frameon=True, framealpha=1, edgecolor="none")
     figure.suptitle(
         f"Delivery within {reach_m():.0f} m against the number of others there, {RATE_HZ} frames a second"
@@ -194,7 +194,7 @@ def _draw_size(axes: Axes, points: Sequence[Point], size_bytes: int) -> None:
         peers, delivered = [point.peers for point in series], [point.delivered for point in series]
         axes.plot(peers, delivered, line, color=colour, marker=marker, markersize=4.5, label=variant.name)
     axes.set_title(f"{size_bytes} bytes, {airtime_ns(size_bytes, 6.0) / 1e6:.2f} ms on air")
-    axes.set_xlabel("others within reach")
+    axes.set_xlabel("others in range")
     axes.set_ylim(0, 1.1)
     axes.set_xlim(0, None)
 

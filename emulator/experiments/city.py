@@ -18,9 +18,10 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
-from emulator.experiments.figures import against_time, save, styled
 from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.result_figures import against_time
+from emulator.experiments.style import save, styled
 from emulator.experiments.tables import MISSING, in_seeds, markdown_table, mean_and_error
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
@@ -40,7 +41,7 @@ MECHANISMS: dict[str, dict[str, Any]] = {
 }
 """Options of each mechanism that is not centralized."""
 KEPT = "optimized"
-"""Of this mechanism and the first seed the states are kept, for the map of errors."""
+"""Mechanism whose states of the first seed are kept for the map of errors."""
 VEHICLES = 50
 PLACE_M = 50.0
 """The map of errors has squares of this side."""
@@ -49,13 +50,13 @@ PLACE_M = 50.0
 def place(trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float) -> dict[str, Any]:
     """The sections `network` and `map` of scenarios: of files, or of a generated city.
 
-    Raises VnetError unless trips and roads come together, and from files that are there.
+    Raises VnetError unless both trips and roads are given, and from files that are there.
     """
     if trips is None and roads is None:
         return {"network": {"kind": "city", "vehicles": VEHICLES}}
     for option, path in (("--trips", trips), ("--map", roads)):
         if path is None:
-            raise VnetError(f"{option} is needed: trips and the map that they are on come together")
+            raise VnetError(f"{option} is missing: trips and their map are needed together")
         if not path.is_file():
             raise VnetError(f"{option} {path}: no such file")
     return {
@@ -148,7 +149,7 @@ def draw_errors_by_place(states: pa.Table, lanes: Array, title: str) -> Figure:
     corner_m, error_m = errors_by_place(states)
     figure = Figure(figsize=(9, 8), layout="constrained")
     axes = figure.add_subplot()
-    axes.add_collection(LineCollection(list(lanes / 1000), colors="#bbbbbb", linewidths=0.4))
+    axes.add_collection(LineCollection(list(lanes / 1000), colors="0.733", linewidths=0.4))
     middle_km = (corner_m + PLACE_M / 2) / 1000
     order = np.argsort(error_m)  # the worst on top
     top_m = max(2.0, np.percentile(error_m, 98))
@@ -175,7 +176,7 @@ def draw_against_time(cells: Sequence[Cell], folder: Path) -> Path:
 
 
 def draw_errors(cells: Sequence[Cell], folder: Path) -> Path | None:
-    """Where positions are wrong, on the map, in the run that was kept; returns the PNG, None without that run."""
+    """Draw the position errors of the kept run on the map; return the PNG's path, None without that run."""
     kept = next(cell for cell in cells if cell.keeps_states)
     if not has_states(kept, folder):
         return None

@@ -29,6 +29,7 @@ from emulator.experiments.analyze import (
     ratio_matrix,
 )
 from emulator.experiments.paper import RANGE_M, network_sections
+from emulator.pages.palette import PALETTE
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.cmm.linear_model import convergence_factor
@@ -47,13 +48,18 @@ ONE_WAY_SHARE, CHURN_SHARE = 0.1, 0.1
 AWAY_S = (6.0, 20.0)
 FLOOR = 1e-10
 """Smaller relative errors are rounding: the convergence factor is measured above."""
-COLOURS = {"ratio": "#0072B2", "metropolis": "#D55E00", "max-degree": "#009E73", FASTEST: "#000000"}
+COLOURS = {
+    "ratio": PALETTE["blue"].light,
+    "metropolis": PALETTE["red"].light,
+    "max-degree": PALETTE["green"].light,
+    FASTEST: "0",
+}
 MARKERS = {"ratio": "o", "metropolis": "s", "max-degree": "^"}
 
 
 @dataclass(frozen=True)
 class Study:
-    """What has been run: the network's links (N, N), and a relative error (rounds + 1,) for each cell.
+    """Results of the study: the network's links (N, N), and a relative error (rounds + 1,) for each cell.
 
     Entry t of an error is after t exchanges of frames; NaN where no vehicle had a mean.
     """
@@ -163,7 +169,7 @@ def _scenario(
 
 
 def one_way_links(linked: Links, seed: int) -> Links:
-    """Who (row) hears whom (column) when a tenth of all links works in one direction only; still connected."""
+    """Directed links, row i hears column j, a tenth of which work in one direction only; still connected."""
     rng = np.random.default_rng([seed, 1])
     links = np.argwhere(np.triu(linked))
     wanted = round(ONE_WAY_SHARE * len(links))
@@ -211,7 +217,7 @@ def _columns(rounds: int) -> list[int]:
 
 
 def _is_plain(labels: dict[str, Any]) -> bool:
-    """Whether the linear iteration, or the same with a delay, is what ran."""
+    """Return True if the run was the linear iteration, with or without a delay."""
     return bool(labels["study"] == "delay" or (labels["study"] == "loss" and labels["loss"] == 0))
 
 

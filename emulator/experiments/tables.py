@@ -52,7 +52,7 @@ def with_error(value: float, error: float, form: str) -> str:
 
 
 def in_seeds(count: int) -> str:
-    """How many seeds, and what stands beside a mean of them: "10 seeds, ± standard error"."""
+    """Number of seeds, and the spread given beside their mean: "10 seeds, ± standard error"."""
     return "1 seed" if count == 1 else f"{count} seeds, ± standard error"
 
 
@@ -94,6 +94,6 @@ def _standard_error(found: Array) -> float:
 
 
 def _is_numeric(column: Sequence[str]) -> bool:
-    """Whether a column holds numbers and dashes, and at least one number."""
+    """Return True if a column holds numbers and dashes, and at least one number."""
     filled = [cell for cell in column if cell not in ("", MISSING)]
     return bool(filled) and all(_NUMBER.match(cell) for cell in filled)

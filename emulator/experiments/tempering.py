@@ -1,4 +1,4 @@
-"""How often a road may count anew: the filters' consistency against `lateral_tau_s` (MODEL 2, `vnet/cmm/rbpf.py`).
+"""Tempering of the map's evidence: the filters' consistency against `lateral_tau_s` (MODEL 2, `vnet/cmm/rbpf.py`).
 
 A filter that takes its vehicles to change their offsets in the lane sooner than they do counts old evidence as new
 and is too sure of itself (ANEES over 1); one that takes them to keep them longer is less sure than it could be. So
@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from emulator.cells.cells import Cell
-from emulator.experiments.figures import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
 from emulator.experiments.paper import DEFAULT_S, Labels, bound_scenario, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, save, styled
 from emulator.experiments.tables import in_seeds, markdown_table, mean_and_error, mean_and_standard_error
 from emulator.records.metrics import anees_band
 
@@ -154,7 +154,7 @@ def draw_tempering_curve(results: Sequence[Result]) -> Figure:
         if any(row[POSITION] is not None for row in rows):
             _draw_curve(consistency, rows, POSITION, len(groups), f"{label}, position")
     low, high = anees_band(len(unique(results, "seed")))
-    consistency.axhspan(low, high, color="#e6e6e6", zorder=0, label="95 % band, one sample a run")
+    consistency.axhspan(low, high, color="0.902", zorder=0, label="95 % band, one sample a run")
     consistency.axhline(1.0, color=BLACK, linewidth=1, zorder=1)
     consistency.set_yscale("log")
     _dress(
@@ -162,7 +162,7 @@ def draw_tempering_curve(results: Sequence[Result]) -> Figure:
     )
     _dress(error, unique(results, "tau_s"), "RMSE of the common error (m)", ())
     error.set_ylim(0, None)
-    figure.suptitle("How often roads count anew: consistency and error, ± 1 standard error")
+    figure.suptitle("Tempering of the roads: consistency and error, ± 1 standard error")
     figure.legend(*consistency.get_legend_handles_labels(), loc="outside lower center", ncols=3, handlelength=3.5)
     return figure
 

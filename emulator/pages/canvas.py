@@ -23,28 +23,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from emulator.pages.page import escape
+from emulator.pages.palette import PALETTE
 from vnet.types import Array
 
-# Light paper's colours, which page.STYLE has under these names.
-PALETTE = {
-    "ink": "#1b1f24",
-    "quiet": "#59626d",
-    "line": "#d5d9df",
-    "grid": "#e6e9ed",
-    "paper": "#ffffff",
-    "blue": "#0072b2",
-    "orange": "#e69f00",
-    "green": "#009e73",
-    "red": "#d55e00",
-    "purple": "#cc79a7",
-    "sky": "#56b4e9",
-    "grey": "#8b929b",
-    "sand": "#bdb35c",
-    "rust": "#8a3a00",
-    "navy": "#004166",
-}
-INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, GREY, SAND, RUST, NAVY = PALETTE.values()
-_VARIABLE = {colour: f"var(--{name})" for name, colour in PALETTE.items()}
+INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY = (
+    colour.light for colour in PALETTE.values()
+)
+_VARIABLE = {colour.light: f"var(--{name})" for name, colour in PALETTE.items()}
 
 WIDTH_PX, PLOT_PX = 400, 190
 """A figure's width, and the height of what is inside its axes, at the size that it is drawn for."""

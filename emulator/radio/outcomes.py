@@ -1,28 +1,175 @@
-"""What can become of a (frame, receiver) pair: a closed set, of which each pair gets exactly one."""
+"""The outcomes of receptions: a closed set, of which each attempted reception gets exactly one.
 
+This table is the only place that states an outcome: number and name, meaning, where it is decided, colour, sign and
+condition. The trace, checks, reports, the terminal, Rerun and the reference pages read it from here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from emulator.scenario.scenario import Scenario
+
+
+class Stage(IntEnum):
+    """Place on a frame's way at which an outcome is decided, in the order in which pictures stack them."""
+
+    RECEPTION = 1
+    """At the receiver's radio."""
+    CHANNEL = 2
+    """Between sender and receiver, before the receiver's radio has a say."""
+    SENDER = 3
+    """At the sender: the frame never goes on the air."""
+    ARRIVAL = 4
+    """At the receiver's program, after the frame was received."""
+
+
+def _always(scenario: Scenario, vehicles: int) -> bool:
+    return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Facts:
+    """All that vnet states about an outcome.
+
+    `meaning` completes "the outcome of a frame at a receiver if …" for the reference pages. `colour` is a name of
+    `emulator.pages.palette`, and `sign` a block for terminals without colours; an outcome without a colour is not
+    drawn. `is_possible(scenario, vehicles)` says whether a run can have it, whatever faults are injected.
+    """
+
+    meaning: str
+    stage: Stage | None = None
+    colour: str = ""
+    sign: str = ""
+    is_possible: Callable[[Scenario, int], bool] = _always
+
+
+IN_FLIGHT = Facts(meaning="it is in flight; no finished trace has it")
 
 
 class Outcome(IntEnum):
-    """The outcome of one pair. The values are those of the trace's internal columns, the names its public ones.
+    """The outcome of one reception. Its number is that of the trace's internal columns, its name the public one.
 
-    `pending` is the state of a pair that is still on its way; no finished trace contains it.
+    `pending` is the state of a reception in flight; no finished trace contains it. Numbers count up from 0.
     """
 
+    _value_: int
+    facts: Facts
+
+    def __new__(cls, number: int, facts: Facts = IN_FLIGHT) -> Self:
+        """Make a member that is its number, and carries its facts."""
+        outcome = int.__new__(cls, number)
+        outcome._value_ = number
+        outcome.facts = facts
+        return outcome
+
     pending = 0
-    delivered = 1
-    out_of_range = 2
-    peer_cap = 3
-    lost = 4
-    queue_full = 5
-    oversize = 6
-    fault = 7
-    receiver_down = 8
-    transport = 9
-    faded = 10
-    collided = 11
-    held_back = 12
+    delivered = (
+        1,
+        Facts(meaning="it arrived, at `arrival_ns`", stage=Stage.ARRIVAL, colour="green", sign="█"),
+    )
+    out_of_range = 2, Facts(meaning="counted in `verdict.json`, and has no row")
+    peer_cap = (
+        3,
+        Facts(
+            meaning="the receiver hears `radio.max_peers` nearer senders",
+            stage=Stage.CHANNEL,
+            colour="orange",
+            sign="░",
+            is_possible=lambda scenario, vehicles: scenario.radio.max_peers < vehicles - 1,
+        ),
+    )
+    lost = (
+        4,
+        Facts(
+            meaning="by `radio.loss`",
+            stage=Stage.RECEPTION,
+            colour="red",
+            sign="▒",
+            is_possible=lambda scenario, vehicles: scenario.radio.loss > 0,
+        ),
+    )
+    queue_full = (
+        5,
+        Facts(meaning="the sender's queue was full", stage=Stage.SENDER, colour="blue", sign="▚"),
+    )
+    oversize = (
+        6,
+        Facts(meaning="longer than `radio.max_payload_bytes`", stage=Stage.SENDER, colour="ink", sign="▞"),
+    )
+    fault = (
+        7,
+        Facts(meaning="cut or lost by the fault in `cause`", stage=Stage.CHANNEL, colour="purple", sign="▓"),
+    )
+    receiver_down = (
+        8,
+        Facts(
+            meaning="it arrived at a vehicle that was down, at `arrival_ns`",
+            stage=Stage.ARRIVAL,
+            colour="grey",
+            sign="▤",
+        ),
+    )
+    transport = (
+        9,
+        Facts(
+            meaning="lost between emulator and agent; in real time only, and the run is then unknown",
+            stage=Stage.ARRIVAL,
+            colour="sky",
+            sign="▥",
+            is_possible=lambda scenario, vehicles: scenario.run.pacing == "realtime",
+        ),
+    )
+    faded = (
+        10,
+        Facts(
+            meaning="too weak to be detected, or to be read, with nobody else on the air",
+            stage=Stage.RECEPTION,
+            colour="sand",
+            sign="▧",
+            is_possible=lambda scenario, vehicles: scenario.radio.path_loss is not None,
+        ),
+    )
+    collided = (
+        11,
+        Facts(
+            meaning="it would have been received had nobody else been on the air",
+            stage=Stage.RECEPTION,
+            colour="rust",
+            sign="▨",
+            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None,
+        ),
+    )
+    held_back = (
+        12,
+        Facts(
+            meaning="congestion control gave a newer frame its place",
+            stage=Stage.SENDER,
+            colour="navy",
+            sign="▦",
+            is_possible=lambda scenario, vehicles: scenario.radio.congestion is not None,
+        ),
+    )
+
+    @property
+    def title(self) -> str:
+        """The outcome in words, for legends."""
+        return self.name.replace("_", " ")
 
 
+def decided_at(*stages: Stage) -> tuple[str, ...]:
+    """Names of the outcomes that are decided at these stages."""
+    return tuple(outcome.name for outcome in Outcome if outcome.facts.stage in stages)
+
+
+_LOST = [outcome for outcome in Outcome if outcome.facts.colour and outcome is not Outcome.delivered]
+DRAWN = (Outcome.delivered, *sorted(_LOST, key=lambda outcome: (outcome.facts.stage or 0, outcome)))
+"""Outcomes of receptions in range in the order in which they are stacked: delivered first, then by stage."""
 PENDING, OUT_OF_RANGE = Outcome.pending.value, Outcome.out_of_range.value
 """The same as plain numbers, with which numpy compares ten times as fast."""

@@ -19,6 +19,7 @@ from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_tim
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
+from emulator.radio.outcomes import Stage, decided_at
 from emulator.records.busy import busy_windows
 from emulator.records.positions import Places
 from emulator.records.run_folder import Event
@@ -33,8 +34,8 @@ NO_FAULT, UNHEARD_OF = -1, -2
 NEVER_NS = np.iinfo(np.int64).max
 REALTIME_GUARD_NS = 50_000_000
 """In real time nobody can say on which side of a fault's start or end a frame was that close to it."""
-ARRIVED = ("delivered", "receiver_down", "transport")
-ON_AIR = ("lost", "faded", "collided", *ARRIVED)
+ARRIVED = decided_at(Stage.ARRIVAL)
+ON_AIR = decided_at(Stage.RECEPTION, Stage.ARRIVAL)
 """What becomes of pairs that come as far as the radio."""
 ENDINGS = ("died", "crashed", "finished", "spun")
 

@@ -23,13 +23,8 @@ from emulator.pages.canvas import (
     GREEN,
     GREY,
     INK,
-    NAVY,
-    ORANGE,
-    PURPLE,
     QUIET,
     RED,
-    RUST,
-    SAND,
     SKY,
     Canvas,
     Span,
@@ -42,8 +37,9 @@ from emulator.pages.canvas import (
     to_svg,
     whole_numbers,
 )
+from emulator.pages.palette import PALETTE
 from emulator.radio.medium import WINDOW_NS
-from emulator.radio.outcomes import Outcome
+from emulator.radio.outcomes import DRAWN
 from emulator.records.metrics import anees_band
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.source import Source
@@ -51,19 +47,7 @@ from emulator.world.world import components
 from vnet.errors import VnetError, printable
 from vnet.types import Array
 
-OUTCOME_COLOURS = {
-    "delivered": GREEN,
-    "faded": SAND,
-    "collided": RUST,
-    "lost": RED,
-    "peer_cap": ORANGE,
-    "queue_full": BLUE,
-    "held_back": NAVY,
-    "oversize": INK,
-    "fault": PURPLE,
-    "receiver_down": GREY,
-    "transport": SKY,
-}
+OUTCOME_COLOURS = {outcome.name: PALETTE[outcome.facts.colour].light for outcome in DRAWN}
 DASHES: tuple[Any, ...] = ("-", (0, (4, 1.8)), (0, (1.2, 1.4)))
 MOST_BINS = 80
 MOST_BARS = 10
@@ -275,7 +259,7 @@ def _bars(trace: pa.Table) -> list[tuple[str, str, int]]:
         label = row["cause"] if row["outcome"] == "fault" else row["outcome"]
         key = (str(label), str(row["outcome"]))
         found[key] = found.get(key, 0) + row["count_all"]
-    order = {outcome.name: outcome.value for outcome in Outcome}
+    order = {outcome.name: number for number, outcome in enumerate(DRAWN)}
     bars = [(label, outcome, count) for (label, outcome), count in found.items()]
     bars.sort(key=lambda bar: (order.get(bar[1], len(order)), -bar[2]))
     shown, others = bars[:MOST_BARS], bars[MOST_BARS:]

@@ -34,8 +34,6 @@ WEIGHT = "weight."
 """Prefix of the reported values that are weights of a fusion; a node's id follows."""
 LONGEST_DETAIL = 200
 """Characters of a detail of an event."""
-_OUTCOMES = 16
-"""Bound above all outcomes, to encode sender, receiver and outcome in one number."""
 
 
 def pack(array: ArrayLike) -> bytes:
@@ -191,12 +189,12 @@ def _frames(rows: NDArray[np.void], start_ns: int, end_ns: int, count: int) -> d
     decided = rows[(rows["outcome"] != Outcome.pending) & (start_ns <= time_ns) & (time_ns < end_ns)]
     sender, receiver = decided["sender"].astype(np.int64), decided["receiver"]
     key, inverse, number = np.unique(
-        (sender * count + receiver) * _OUTCOMES + decided["outcome"], return_inverse=True, return_counts=True
+        (sender * count + receiver) * len(Outcome) + decided["outcome"], return_inverse=True, return_counts=True
     )
-    link = key // _OUTCOMES
+    link = key // len(Outcome)
     newest_ns = np.zeros(len(key), np.int64)
     np.maximum.at(newest_ns, inverse, decided["sent_ns"])
-    pairs = np.column_stack([link // count, link % count, key % _OUTCOMES, number])
+    pairs = np.column_stack([link // count, link % count, key % len(Outcome), number])
     outcomes = np.bincount(decided["outcome"]).tolist()
     delivered = decided[decided["outcome"] == Outcome.delivered]
     bins = np.minimum((delivered["arrival_ns"] - delivered["sent_ns"]) // LATENCY_BIN_NS, LATENCY_BINS - 1)

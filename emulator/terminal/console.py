@@ -1,4 +1,4 @@
-"""What all commands do at a terminal: errors of one line, and an exit status that says what kind."""
+"""Behaviour that all commands share at a terminal: errors in one line, and the exit status."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WRONG_USAGE = 2
 
 
 class LogFormat(StrEnum):
-    """What is written on stderr."""
+    """Format of the messages on stderr."""
 
     TEXT = "text"
     JSON = "json"
@@ -51,7 +51,7 @@ def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
 
 
 def _in_one_line(error: typer.TyperException) -> str:
-    """What is wrong with a command line, what may have been meant, and where to read more."""
+    """Say what is wrong with a command line, what may have been meant, and where to read more."""
     meant = getattr(error, "possibilities", None)
     text = f"{error.message}; did you mean {' or '.join(meant)}?" if meant else error.format_message()
     text = " ".join(text.replace("Value error, ", "").replace(". Did you", "; did you").split()).removesuffix(".")

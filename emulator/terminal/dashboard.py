@@ -18,34 +18,20 @@ from rich.segment import Segment
 from rich.style import Style
 
 from emulator.drivers.status import BINS, FaultState, Snapshot
+from emulator.pages.palette import PALETTE
+from emulator.radio.outcomes import DRAWN
 from emulator.records.run_folder import Event
 from vnet.errors import printable
 
 Line = list[Segment]
 
-# Okabe & Ito 2008: colours that the colour-blind can tell apart.
-GREEN, RED, ORANGE, SKY, PURPLE, YELLOW, BLUE, GREY = (
-    Style(color=colour)
-    for colour in ("#009E73", "#D55E00", "#E69F00", "#56B4E9", "#CC79A7", "#F0E442", "#0072B2", "#969696")
-)
-# Shades, for more outcomes than there are such colours.
-DARK_YELLOW, DARK_RED, DARK_BLUE = (Style(color=colour) for colour in ("#8C8232", "#964208", "#285A8C"))
+GREEN, RED, ORANGE, SKY = (Style(color=PALETTE[name].either) for name in ("green", "red", "orange", "sky"))
 PLAIN, BOLD, DIM = Style(), Style(bold=True), Style(dim=True)
 BAD = RED + BOLD
-# The signs tell outcomes apart where there are no colours.
 OUTCOMES = {
-    "delivered": (GREEN, "█"),
-    "faded": (DARK_YELLOW, "▧"),
-    "collided": (DARK_RED, "▨"),
-    "lost": (RED, "▒"),
-    "peer_cap": (ORANGE, "░"),
-    "queue_full": (BLUE, "▚"),
-    "held_back": (DARK_BLUE, "▦"),
-    "oversize": (YELLOW, "▞"),
-    "fault": (PURPLE, "▓"),
-    "receiver_down": (GREY, "▤"),
-    "transport": (SKY, "▥"),
+    outcome.name: (Style(color=PALETTE[outcome.facts.colour].either), outcome.facts.sign) for outcome in DRAWN
 }
+"""Style and sign of each outcome; signs tell them apart where there are no colours."""
 BAD_EVENTS = ("died", "crashed", "spun", "stalled", "refused", "transport_gap", "observer_ended", "interrupted")
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0
@@ -61,7 +47,7 @@ GROUPS = (("title", "time"), ("vehicles",), ("common_error", "deviation", "posit
           ("faults",), ("events",))  # fmt: skip
 FIGURES = {"common_error": "common_error_rmse_m", "deviation": "deviation_m"}
 PATIENCE_S = 1.0
-"""Of emulated time: what programs have not reported by then has no row."""
+"""Emulated time after which a value that is not reported has no row."""
 EARLY_ROWS = {"starting": ["title"], "joining": ["title", "joined", "vehicles", "missing"]}
 
 
@@ -104,7 +90,7 @@ class Dashboard:
         return found + [[]] * min(spare, count["events"] - max(1, len(shot.events)))
 
     def _allot(self, height: int) -> Counter[str]:
-        """How many rows each part gets."""
+        """Rows given to each part."""
         shot = self._snapshot
         most = {**dict.fromkeys(ROWS, height), "faults": len(shot.faults)}
         if shot.emulated_s >= PATIENCE_S:
@@ -135,7 +121,7 @@ class _Rows:
         return [start, *axis, Segment(" " * (self._axis - filled + 2)), *words]
 
     def title(self, rows: int) -> list[Line]:
-        """What runs, and how fast."""
+        """Line with the run's name, pacing and speed."""
         shot = self._shot
         about = [shot.pacing, f"seed {shot.seed}", f"{len(shot.node_ids)} vehicles"]
         if shot.emulator_memory_mb is not None:
@@ -163,7 +149,7 @@ class _Rows:
         return [Segment(f"{shot.real_time_factor:.1f}× real time", BOLD), Segment(f" · {left}")]
 
     def time(self, rows: int) -> list[Line]:
-        """How far it has come."""
+        """Progress bar of the emulated time."""
         shot = self._shot
         done = shot.emulated_s / shot.duration_s
         words = [Segment(f"{shot.emulated_s:.1f}", BOLD), Segment(f" of {shot.duration_s:g} s")]
@@ -174,7 +160,7 @@ class _Rows:
         return [Segment("━" * done, SKY), Segment("─" * (self._axis - done), DIM)]
 
     def joined(self, rows: int) -> list[Line]:
-        """How many have joined, and how long they still may take."""
+        """Line with the number of vehicles that have joined and the time left to join."""
         shot = self._shot
         count = len(shot.node_ids)
         joined = count - len(shot.missing)
@@ -184,7 +170,7 @@ class _Rows:
         return [self._row("joined", self._bar(joined / count), words)]
 
     def missing(self, rows: int) -> list[Line]:
-        """Who has not joined."""
+        """Line with the vehicles that have not joined."""
         named = _names(self._shot.missing, self._width - self._label)
         return [[Segment("missing".ljust(self._label), DIM), Segment(named)]]
 
@@ -205,7 +191,7 @@ class _Rows:
         return [self._row("vehicles", strip, words)]
 
     def _strip(self, node_ids: Sequence[str], away: set[str]) -> Line:
-        """Where there are more vehicles than room, one dot stands for several, and is hollow if any is away."""
+        """Dots for the vehicles; with more vehicles than room a dot stands for several, hollow if any is away."""
         dots = min(len(node_ids), self._axis)
         hollow = DIM if self._shot.phase == "joining" else RED
         absent = set(self._shot.absent)
@@ -224,7 +210,7 @@ class _Rows:
         return [self._figure("common error", "common_error_rmse_m", "RMSE")]
 
     def deviation(self, rows: int) -> list[Line]:
-        """How much vehicles differ."""
+        """Line with the deviation between vehicles."""
         return [self._figure("deviation", "deviation_m", "between vehicles")]
 
     def position(self, rows: int) -> list[Line]:
@@ -243,7 +229,7 @@ class _Rows:
         return self._row(label, [Segment(line, SKY)], words)
 
     def frames(self, rows: int) -> list[Line]:
-        """What became of frames in the last second, as shares."""
+        """Shares of the outcomes of the last second."""
         rates = _shown(self._shot.frames_per_s)
         total = sum(rates.values())
         bar: Line = []
@@ -320,7 +306,7 @@ class _Rows:
 
 
 def is_bad(event: Event) -> bool:
-    """Whether something has gone wrong that no fault of the plan was to do."""
+    """True if something failed that no planned fault was to do."""
     return event.kind in BAD_EVENTS
 
 
@@ -409,7 +395,7 @@ def _cut(text: str, width: int) -> str:
 
 
 def _cut_middle(text: str, width: int) -> str:
-    """What is cut of a long name is not its number."""
+    """Cut a long name, but not the number at its end."""
     return text if len(text) <= width else f"{text[: width - 4]}…{text[-3:]}"
 
 

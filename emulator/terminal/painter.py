@@ -1,8 +1,8 @@
 """A picture kept at the foot of a terminal, redrawn a few times a second by a thread of its own.
 
-What is printed meanwhile passes above it. rich's `Live` does much the same, but draws anew at every printed line,
+What is printed meanwhile passes above it. rich's `Live` does much the same, but redraws at every printed line,
 leaves half the old picture behind when the window is made narrower, and ends the program when the terminal goes
-away. Here only the lines that have changed are written, each redraw in one piece, and a terminal that stands still
+away. Here only the lines that have changed are written, each redraw in one piece, and a terminal that blocks
 or goes away never holds up those who print.
 """
 
@@ -117,7 +117,7 @@ class Painter:
         return ["".join(_coloured(segment, colours) for segment in line) for line in lines]
 
     def _redraw(self, lines: list[str], above: str, columns: int) -> str:
-        """What turns the old picture, with the cursor on the line below it, into the new one."""
+        """Return the text that turns the old picture, with the cursor on the line below it, into the new one."""
         rows = sum(self._rows(line, columns) for line in self._lines)
         parts = [_BEGIN, "\r", f"\x1b[{rows}A" if rows else ""]
         old = self._lines
@@ -129,7 +129,7 @@ class Painter:
         return "".join([*parts, _ERASE_BELOW, _END])
 
     def _rows(self, line: str, columns: int) -> int:
-        """How many rows a line takes up now: a terminal that has become narrower has broken it."""
+        """Rows that a line takes up now: a terminal that has become narrower has broken it."""
         if columns >= self._columns:
             return 1
         return max(1, -(-cell_len(_COLOURS.sub("", line)) // columns))

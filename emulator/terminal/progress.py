@@ -1,4 +1,4 @@
-"""How a run gets on, for its user: a live picture in a terminal, plain lines elsewhere, JSON for machines.
+"""Progress of a run, for its user: a live picture in a terminal, plain lines elsewhere, JSON for machines.
 
 All of it goes to stderr, and whatever becomes of stderr, the run goes on.
 """
@@ -51,7 +51,7 @@ class Progress:
 
 
 def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool) -> Progress:
-    """What shows on stderr how this run gets on."""
+    """Return the display of this run's progress on stderr."""
     if quiet:
         return Progress()
     if log_format is LogFormat.JSON:
@@ -163,10 +163,10 @@ class _Lines(Progress):
             self._tell_events()
 
     def _progress(self, shot: Snapshot) -> None:
-        """How it gets on."""
+        """Print the run's progress."""
 
     def _event(self, event: Event) -> None:
-        """What has happened."""
+        """Print an event."""
 
 
 class PlainLines(_Lines):

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from emulator.checks.judge import Judgement, Verdict
 from emulator.records.page_names import REPORT
-from emulator.viewer.sinks import RECORDING, is_closed, mending_command
+from emulator.viewer.sinks import RECORDING, is_closed, repair_command
 
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 FIGURES = {
@@ -40,7 +40,7 @@ def print_summary(
     if (recording := folder / RECORDING).exists():
         following[f"vnet view {folder}"] = "look at it"
         if not is_closed(recording):
-            following[mending_command(recording)] = "mend the recording, whose observer was killed"
+            following[repair_command(recording)] = "repair the recording, whose observer was killed"
     for number, (command, why) in enumerate(following.items()):
         heading = "" if number else "next"
         console.print(f"{heading:13}{as_typed(command)}   ({why})", highlight=False, soft_wrap=True)

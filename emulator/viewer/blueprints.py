@@ -1,4 +1,4 @@
-"""How a recording is laid out: an overview, the radio, and one vehicle, as tabs."""
+"""Layout of a recording: an overview, the radio, and one vehicle, as tabs."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def overview() -> rrb.Vertical:
 
 
 def radio() -> rrb.Vertical:
-    """What became of frames."""
+    """Views of the outcomes of frames."""
     last = f"last {WINDOW_S:g} s"
     return rrb.Vertical(
         rrb.Horizontal(
@@ -69,7 +69,7 @@ def radio() -> rrb.Vertical:
         ),
         rrb.Horizontal(
             _bars("radio/distance", f"Delivered (%) by distance (m), {last}"),
-            _bars("radio/latency", f"Deliveries by time on the way (ms), {last}"),
+            _bars("radio/latency", f"Deliveries by latency (ms), {last}"),
             _against_time("radio/age", "Age of information, time between receptions (ms)"),
         ),
         rrb.Horizontal(

@@ -17,13 +17,12 @@ import numpy as np
 
 from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import unpack
+from vnet.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.lanes import LaneMap
 
 PARTICLES = 500
 STEP_NS = 500_000_000
-LEAST_LOG_ROAD = -6.0
-"""As the vehicles: one whose fixes are false must not outvote all others."""
 
 
 class Limit:
@@ -50,7 +49,7 @@ class Limit:
             max(world.common_error.sigma_m, 1e-3),
             world.common_error.tau_s,
             lateral_tau_s=world.lateral.tau_s,
-            least_log_road=LEAST_LOG_ROAD,
+            min_map_log_likelihood=MIN_MAP_LOG_LIKELIHOOD,
         )
         seeds = np.random.default_rng(scenario.run.seed).spawn(int(self._component.max()) + 1)
         self._filters = [Rbpf(config, lanes, seed) for seed in seeds]

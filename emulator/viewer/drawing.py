@@ -1,4 +1,4 @@
-"""What all parts of a recording are drawn with: colours, lengths, a canvas, and a period as arrays.
+"""Drawing for all parts of a recording: colours, lengths, a canvas, and a period as arrays.
 
 Rerun's 2-D views have y downwards, hence the minus signs: east is right, north is up.
 """
@@ -16,7 +16,8 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.outcomes import Outcome
+from emulator.pages.palette import PALETTE
+from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.stream.messages import unpack, unpack_pairs
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
@@ -24,32 +25,10 @@ Floats = NDArray[np.float32]
 
 TIMELINE = "emulated time"
 
-# Okabe & Ito 2008: colours that the colour-blind can tell apart, and that show on dark and light.
 BLUE, SKY, GREEN, ORANGE, RED, PURPLE, GREY, DARK = (
-    (0, 114, 178),
-    (86, 180, 233),
-    (0, 158, 115),
-    (230, 159, 0),
-    (213, 94, 0),
-    (204, 121, 167),
-    (150, 150, 150),
-    (100, 100, 100),
+    PALETTE[name].rgb for name in ("blue", "sky", "green", "orange", "red", "purple", "grey", "ink")
 )
-DARK_YELLOW, DARK_RED, DARK_BLUE = (140, 130, 50), (150, 66, 8), (40, 90, 140)
-"""Shades of yellow, red and blue, where there are more things than colours."""
-OUTCOME_COLOURS: dict[Outcome, Colour] = {
-    Outcome.delivered: GREEN,
-    Outcome.faded: DARK_YELLOW,
-    Outcome.collided: DARK_RED,
-    Outcome.lost: RED,
-    Outcome.peer_cap: ORANGE,
-    Outcome.fault: PURPLE,
-    Outcome.receiver_down: GREY,
-    Outcome.queue_full: BLUE,
-    Outcome.held_back: DARK_BLUE,
-    Outcome.oversize: DARK,
-    Outcome.transport: SKY,
-}
+OUTCOME_COLOURS: dict[Outcome, Colour] = {outcome: PALETTE[outcome.facts.colour].rgb for outcome in DRAWN}
 """In the order in which they are stacked."""
 
 COMMON_RINGS_M = (0.5, 1.0, 2.0, 5.0, 10.0)
@@ -72,11 +51,6 @@ def _has_glyph(character: str) -> bool:
     return character.isprintable() and (ord(character) < 0x180 or character in _ALSO_DRAWN)
 
 
-def outcome_title(outcome: Outcome) -> str:
-    """An outcome in words."""
-    return outcome.name.replace("_", " ")
-
-
 @dataclass(frozen=True)
 class Period:
     """A period message as arrays; n vehicles in the order of `node_ids`, NaN for what was not reported."""
@@ -86,12 +60,12 @@ class Period:
 
     @property
     def number(self) -> int:
-        """Of the period."""
+        """Number of the period, from 0."""
         return int(self.message["period"])
 
     @property
     def time_ns(self) -> int:
-        """When it began."""
+        """Start of the period, in nanoseconds."""
         return int(self.message["time_ns"])
 
     @property
@@ -118,7 +92,7 @@ class Period:
 
     @cached_property
     def up(self) -> NDArray[np.bool_]:
-        """Which vehicles are up, (n,)."""
+        """Mask of the vehicles that are up, (n,)."""
         return np.frombuffer(self.message["up"], dtype=np.uint8).astype(bool)
 
     @cached_property
@@ -134,11 +108,11 @@ class Period:
 
     @cached_property
     def pairs(self) -> NDArray[np.int32]:
-        """What became of frames, (k, 4): sender, receiver, outcome, how many."""
+        """Counts of outcomes by link, (k, 4): sender, receiver, outcome, count."""
         return unpack_pairs(self.message)
 
     def counts(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """How many frames there were, and how many were delivered, each (n, n): row receives, column sends."""
+        """Frames attempted and frames delivered, each (n, n): row receives, column sends."""
         sender, receiver, outcome, number = self.pairs.T
         n = len(self.node_ids)
         place = receiver * n + sender + n * n * (outcome == Outcome.delivered)
@@ -202,7 +176,7 @@ for _outcome, _colour in OUTCOME_COLOURS.items():
 
 
 class _Rows:
-    """What is to be drawn of one entity, instant by instant."""
+    """Drawing of one entity, instant by instant."""
 
     def __init__(self) -> None:
         self.times_ns: list[int] = []
@@ -217,7 +191,7 @@ class _Rows:
 
     @property
     def lengths(self) -> NDArray[np.int32]:
-        """How many there are at each instant."""
+        """Number of elements at each instant."""
         return np.array([len(array) for array in self.arrays], dtype=np.int32)
 
 
@@ -236,7 +210,7 @@ class Canvas:
         self._bars: dict[str, Floats] = {}
 
     def at(self, time_ns: int) -> None:
-        """What is drawn from now on belongs to this emulated time."""
+        """Set the emulated time of whatever is drawn from now on."""
         self._time_ns = time_ns
 
     def log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
@@ -254,7 +228,7 @@ class Canvas:
         show_labels: bool = False,
         order: float | None = None,
     ) -> None:
-        """How the points of an entity look at all times: `radius` on the screen, one colour or one each.
+        """Set the style of an entity's points for all times: `radius` on the screen, one colour or one each.
 
         None for colours that change: what is always there would hide what comes with a time.
         """
@@ -283,7 +257,7 @@ class Canvas:
         self.points(entity, position_m, static=True)
 
     def strip_style(self, entity: str, colour: Colour | None, width: float, order: float | None = None) -> None:
-        """How the lines of an entity look at all times: `width` on the screen; None for a colour that changes."""
+        """Set the style of an entity's lines for all times: `width` on screen; None for a changing colour."""
         style = rr.LineStrips2D.from_fields(
             colors=None if colour is None else [colour],
             radii=rr.Radius.ui_points(width / 2),

@@ -11,6 +11,7 @@ import rerun as rr
 
 from emulator.radio.outcomes import Outcome
 from emulator.records.paper_values import paper_rmse
+from emulator.scenario.scenario import Scenario
 from emulator.stream.messages import unpack
 from emulator.viewer.bound import Limit
 from emulator.viewer.drawing import (
@@ -33,7 +34,6 @@ from emulator.viewer.drawing import (
     link_states,
     nice_length,
     outcome_colours,
-    outcome_title,
 )
 from emulator.viewer.radio_scene import next_charts_s
 
@@ -223,10 +223,10 @@ def draw_scale(canvas: Canvas, point_m: Floats) -> None:
 
 
 def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
-    """What the colours of the map mean, in a view of its own: two rows of points with their names."""
+    """Legend of the map's colours, in a view of its own: two rows of points with their names."""
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     never = impossible(scene)
-    links = [(outcome_title(one), colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
+    links = [(one.title, colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
         place = [[LEGEND_STEP * number, row] for number in range(1, len(items) + 1)]
         canvas.labels(f"legend/{entity}/title", [[0.0, row]], GREY, [f"{entity}:"])
@@ -236,22 +236,15 @@ def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
 
 
 def impossible(scene: Mapping[str, Any]) -> set[Outcome]:
-    """The outcomes that nothing in this run can have, whatever faults there will be."""
-    scenario = tomllib.loads(scene["scenario"])
-    radio = scenario["radio"]
-    can_be = {
-        Outcome.faded: "path_loss" in radio,
-        Outcome.collided: "mac" in radio,
-        Outcome.held_back: "congestion" in radio,
-        Outcome.lost: radio["loss"] > 0,
-        Outcome.peer_cap: scene["max_peers"] < len(scene["node_ids"]) - 1,
-        Outcome.transport: scenario["run"]["pacing"] == "realtime",
-    }
-    return {outcome for outcome, is_possible in can_be.items() if not is_possible}
+    """The outcomes that no reception of this run can have, whatever faults are injected."""
+    data = tomllib.loads(scene["scenario"])
+    data.pop("inputs", None)
+    scenario, vehicles = Scenario.model_validate(data), len(scene["node_ids"])
+    return {outcome for outcome in Outcome if not outcome.facts.is_possible(scenario, vehicles)}
 
 
 def in_reach(radio: Mapping[str, Any]) -> str:
-    """Who hears whom, in words, by the scenario's section."""
+    """Rule of connectivity in words, by the scenario's section."""
     if "path_loss" not in radio:
         return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
     stages = {"shadowing": "shadowing", "fading": "fading", "mac": "CSMA", "congestion": "congestion"}

@@ -1,5 +1,4 @@
-"""The radio's part of a recording: what became of frames, by time, link, distance and time on the way; how old it
-is what receivers know; the load."""
+"""The radio's part of a recording: outcomes by time, link, distance and latency; age of information; load."""
 
 from __future__ import annotations
 
@@ -22,11 +21,10 @@ from emulator.viewer.drawing import (
     Canvas,
     Floats,
     Period,
-    outcome_title,
 )
 
 WINDOW_S = 5.0
-"""Shares, histograms and loads are those of so many last seconds, and drawn anew as often."""
+"""Shares, histograms and loads are those of so many last seconds, and redrawn as often."""
 DISTANCE_BINS = 20
 STROKES = 8
 """The layers of the stacked chart are lines that go up and down so often in a period: Rerun fills no areas."""
@@ -36,7 +34,7 @@ LARGEST_MATRIX = 400
 
 
 def next_charts_s(time_s: float) -> float:
-    """When charts that are drawn now are drawn anew: soon in the beginning, then as often as there are new ones."""
+    """Time of the charts' next redraw: soon in the beginning, then as often as there is new data."""
     return time_s + min(max(1.0, time_s), WINDOW_S)
 
 
@@ -60,7 +58,7 @@ class Window:
 
 
 class Ages:
-    """How old is the newest that receivers have of senders, and how much time passes from one to the next.
+    """Age of information at the receivers, and the gaps between packets from one sender.
 
     Times between receptions are those between the sendings of what is received.
     """
@@ -83,7 +81,7 @@ class Ages:
     def at(self, end_ms: float, tried: NDArray[Any]) -> NDArray[np.float64]:
         """The ages in ms (n, n), a row receives, a column sends; NaN on links that have not brought anything yet.
 
-        Links on which there were no frames of late, by `tried` (n, n), begin anew.
+        Links on which there were no frames of late, by `tried` (n, n), begin again.
         """
         self._sent_ms[tried == 0] = np.nan
         return end_ms - self._sent_ms
@@ -140,7 +138,7 @@ class RadioScene:
             if count and entity not in self._announced:
                 self._announced.add(entity)
                 style = rr.SeriesLines(
-                    names=outcome_title(outcome), colors=[colour], widths=[2.5], aggregation_policy="MinMax"
+                    names=outcome.title, colors=[colour], widths=[2.5], aggregation_policy="MinMax"
                 )
                 self._canvas.log(entity, style, static=True)
             if entity in self._announced:

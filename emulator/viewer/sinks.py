@@ -1,4 +1,4 @@
-"""Where a recording goes: into a file, to those who look at it from elsewhere, to a window on this machine.
+"""Destinations of a recording: a file, a server for viewers elsewhere, a window on this machine.
 
 Nothing of it listens on more than the loopback interface unless that is asked for. A viewer that is slow, or stands
 still, holds nothing up: what waits for it is bounded, and it is dropped when it no longer answers.
@@ -33,7 +33,7 @@ LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 9876
 PORTS_TRIED = 50
 SERVER_MEMORY = "256MiB"
-"""What the server keeps for viewers that come late; the oldest goes first, what does not change stays."""
+"""Memory of the server for viewers that come late; the oldest data go first, static data stay."""
 VIEWER_MEMORY = "2GiB"
 CLOSE_TIMEOUT_S = 10.0
 _END_OF_A_CLOSED_FILE = b"RRF2FOOT"
@@ -42,19 +42,19 @@ _ITS_NAME = "/__properties"
 
 @dataclass(frozen=True)
 class ServeAt:
-    """Where a recording is served: viewers connect to `port` of `address`, browsers to the one after it."""
+    """Address of a served recording: viewers connect to `port` of `address`, browsers to the next port."""
 
     address: str = LOOPBACK
     port: int = DEFAULT_PORT
 
     @property
     def web_port(self) -> int:
-        """Where browsers find the viewer."""
+        """URL of the viewer for browsers."""
         return self.port + 1
 
     @property
     def host(self) -> str:
-        """What others call this machine, as it stands in an URL."""
+        """Name of this machine for others, as it stands in a URL."""
         address = ipaddress.ip_address(self.address)
         if address.is_unspecified:
             return socket.gethostname()
@@ -86,7 +86,7 @@ class ServeAt:
 
 @dataclass(frozen=True)
 class Sinks:
-    """Where a recording goes: `save` into a file, `serve` to viewers, `spawn` a viewer on this machine.
+    """Destinations of a recording: `save` into a file, `serve` to viewers, `spawn` a viewer on this machine.
 
     A spawned viewer looks at what is served. `vehicle` is the one that is looked at closely, by default the first.
     """
@@ -117,7 +117,7 @@ def choose_sinks(
     vehicle: str | None = None,
     live: bool = True,
 ) -> Sinks | None:
-    """What `--rerun` and its companions ask for; None for nothing. Saved as `recording.rrd`.
+    """Return the sinks that `--rerun` and its companions ask for; None for nothing. Saved as `recording.rrd`.
 
     Raises VnetError for what is not among the choices (or cannot be had of what is not `live`), where there is no
     display for `spawn`, and where `address` and `port` cannot be listened at; without `port` the first that is
@@ -143,7 +143,7 @@ def choose_sinks(
 
 
 def _chosen(words: Sequence[str]) -> list[str]:
-    """What is written once or several times, one or several separated by commas; none for `off`."""
+    """Split values that may be repeated or separated by commas; empty for `off`."""
     chosen = [word.strip() for several in words for word in several.split(",")]
     for word in chosen:
         if word not in CHOICES:
@@ -156,7 +156,7 @@ def _chosen(words: Sequence[str]) -> list[str]:
 
 
 def place_to_serve(address: str | None = None, port: int | None = None) -> ServeAt:
-    """Where a recording can be served; see `choose_sinks`. Raises VnetError."""
+    """Return the address at which a recording can be served; see `choose_sinks`. Raises VnetError."""
     address = address or LOOPBACK
     try:
         ipaddress.ip_address(address)
@@ -189,7 +189,7 @@ def _why_not(address: str, port: int) -> str:
 
 
 def has_display() -> bool:
-    """Whether a window can be opened on this machine."""
+    """Return True if a window can be opened on this machine."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -296,43 +296,43 @@ def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a recording was closed cleanly; the viewer opens no other."""
+    """Return True if a recording was closed cleanly; the viewer opens no other."""
     with path.open("rb") as file:
         file.seek(0, os.SEEK_END)
         file.seek(max(0, file.tell() - 16))
         return _END_OF_A_CLOSED_FILE in file.read()
 
 
-def mended_path(path: Path) -> Path:
-    """Where the whole recording goes that is made of one that was not closed."""
-    return path.with_name(f"{path.stem}-mended{path.suffix}")
+def repaired_path(path: Path) -> Path:
+    """Path of the repaired copy of a recording that was not closed."""
+    return path.with_name(f"{path.stem}-repaired{path.suffix}")
 
 
-def mending_command(path: Path) -> str:
-    """What makes a whole recording of one that was not closed, as one types it."""
+def repair_command(path: Path) -> str:
+    """Command that repairs a recording that was not closed, as one types it."""
     return f"rerun {shlex.join(_mending(path))}"
 
 
-def mend(path: Path) -> Path:
+def repair(path: Path) -> Path:
     """Make a whole recording of one that was not closed, and return where it is.
 
-    Raises VnetError if it cannot be mended, or there is nothing in it.
+    Raises VnetError if it cannot be repaired, or there is nothing in it.
     """
     done = subprocess.run([_program(), *_mending(path)], capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip() or "nothing was said").splitlines()[-1]
-        raise VnetError(f"{path}: was not closed, and cannot be mended: {last}")
-    mended = mended_path(path)
-    if _is_empty(mended):
-        mended.unlink()
+        raise VnetError(f"{path}: was not closed, and cannot be repaired: {last}")
+    repaired = repaired_path(path)
+    if _is_empty(repaired):
+        repaired.unlink()
         raise VnetError(
-            f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} makes it anew"
+            f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} rebuilds it"
         )
-    return mended
+    return repaired
 
 
 def _is_empty(path: Path) -> bool:
-    """Whether a closed recording has nothing in it but its name."""
+    """Return True if a closed recording holds nothing but its name."""
     from rerun.chunk import RrdReader
 
     reader = RrdReader(str(path))
@@ -342,4 +342,4 @@ def _is_empty(path: Path) -> bool:
 
 
 def _mending(path: Path) -> list[str]:
-    return ["rrd", "optimize", "--continue-on-error", str(path), "-o", str(mended_path(path))]
+    return ["rrd", "optimize", "--continue-on-error", str(path), "-o", str(repaired_path(path))]

@@ -26,7 +26,7 @@ from emulator.viewer.drawing import (
 from emulator.viewer.radio_scene import WINDOW_S, Window, next_charts_s
 
 SLOW_EVERY_S = 1.0
-"""How often ellipses and neighbours are drawn."""
+"""Interval at which ellipses and neighbours are drawn."""
 LABELLED = 40
 """As many neighbours have their names written beside them."""
 
@@ -100,7 +100,7 @@ class VehicleScene:
             self._neighbours(period)
 
     def _neighbours(self, period: Period) -> None:
-        """Whom it hears: lines from those in range, coloured by what became of their frames."""
+        """Draw the links from the vehicles in range, coloured by the outcome of their frames."""
         canvas, position = self._canvas, period.points("position_m")
         place = position - position[self._number]
         sender, receiver, state = link_states(period)

@@ -30,11 +30,11 @@ from vnet.transport.session import open_client
 
 LEASE_MS = 60_000
 NICE = 10
-"""Where it shares a session with the run, or sessions do not count, the emulator and the agents come first."""
+"""Niceness of the observer, so that the emulator and the agents come first."""
 GATHER_S = 1.0
 """Messages are taken together, once so often: ten at a time cost a fifth less than each by itself."""
 CLOSING_S = 0.2
-"""Who ends it waits no longer than for half a second, and the file must be closed by then."""
+"""Time to finish after a signal: it is killed half a second after it, and the file must be closed by then."""
 INBOX_BYTES = 64 * 1024 * 1024
 DEFAULT_PATIENCE_S = 5.0
 
@@ -150,7 +150,7 @@ class _Taker:
 
     @property
     def left_s(self) -> float | None:
-        """How long the emulator may still be gone; None if it is there."""
+        """Time left for the emulator to return; None if it is there."""
         return None if self._deadline is None else max(0.0, self._deadline - time.monotonic())
 
     def take(self, count: int) -> None:
@@ -191,7 +191,7 @@ def _decode(data: bytes) -> dict[str, Any] | None:
 
 
 def _patience_s(scene: dict[str, Any]) -> float:
-    """How long the emulator may be gone: as long as agents wait, and as long as planned faults take it away."""
+    """Time that the emulator may be gone: as long as agents wait, and as long as planned faults take it away."""
     scenario = tomllib.loads(scene["scenario"])
     away_s = [fault.get("down_s", 0.0) for fault in scenario.get("fault", [])]
     return float(scenario["run"]["orphan_timeout_s"]) + max(away_s, default=0.0)

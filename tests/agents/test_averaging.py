@@ -63,13 +63,13 @@ def test_a_frame_of_absurd_numbers_is_refused(share: Share) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"rul": "ratio"}, "program.options.rul: unknown; allowed: rule, silent"),
-        ({"rule": "exact"}, "program.options.rule = 'exact': allowed: ratio, metropolis, max-degree"),
+        ({"rul": "ratio"}, "program.options.rul: unknown (did you mean rule?); allowed: rule, silent"),
+        ({"rule": "exact"}, "program.options.rule = 'exact': one of ratio, metropolis, max-degree expected"),
         ({"silent": ["v1"]}, "program.options.silent = ['v1']: a table"),
-        ({"silent": {"v1": 3.0}}, "program.options.silent.v1 = 3.0: [from_s, to_s] expected"),
-        ({"silent": {"v1": [3.0]}}, "program.options.silent.v1 = [3.0]: [from_s, to_s] expected"),
-        ({"silent": {"v1": [3.0, 2.0]}}, "program.options.silent.v1 = [3.0, 2.0]"),
-        ({"silent": {"v1": [0.0, float("nan")]}}, "program.options.silent.v1 = [0.0, nan]"),
+        ({"silent": {"v1": 3.0}}, "program.options.silent.v1 = 3.0: a list of 2 (each a number"),
+        ({"silent": {"v1": [3.0]}}, "program.options.silent.v1 = [3.0]: a list of 2"),
+        ({"silent": {"v1": [3.0, 2.0]}}, "program.options.silent.v1 = [3.0, 2.0]: [from_s, to_s] expected"),
+        ({"silent": {"v1": [0.0, float("nan")]}}, "program.options.silent.v1 = [0.0, nan]: a list of 2"),
     ],
 )
 def test_a_wrong_option_is_one_line(options: dict[str, object], message: str) -> None:

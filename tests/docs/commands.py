@@ -16,7 +16,7 @@ import typer.main
 
 import agents.cli
 import emulator.cli.commands
-from tests.docs.markdown import ROOT
+from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map")

@@ -24,7 +24,8 @@ import yaml
 from emulator.scenario.scenario import load_scenario
 from tests.docs import commands
 from tests.docs.commands import DocsError
-from tests.docs.markdown import ROOT, Block, blocks
+from tests.docs.markdown import Block, blocks
+from tests.support.paths import ROOT
 
 NOT_INSTALLED = re.compile(r"^(import|from) pandas\b", re.MULTILINE)
 """What examples use and vnet does not need: such blocks are only compiled."""

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from tests.docs.commands import DocsError
-from tests.docs.markdown import PAGES, ROOT, blocks
+from tests.docs.markdown import PAGES, blocks
 from tests.docs.pages import Page, check_workflow, shows
+from tests.support.paths import ROOT
 
 
 @pytest.fixture

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.markdown import PAGES, ROOT, anchors, links
+from tests.docs.markdown import PAGES, anchors, links
+from tests.support.paths import ROOT
 
 
 def broken(path: Path, text: str) -> list[str]:

@@ -22,7 +22,7 @@ from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import Section
 from emulator.world.world import build_world
-from tests.docs.markdown import ROOT
+from tests.support.paths import ROOT
 
 
 @pytest.mark.parametrize("name", PAGES)

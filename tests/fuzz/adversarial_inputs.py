@@ -58,7 +58,15 @@ def _toml() -> dict[str, bytes]:
         "lines": b'"a\\nb\\u001b[31m"',
         "a table": b"{}",
     }
-    keys = (b"radio.links", b"radio.max_peers", b"radio.loss", b"run.seed", b"run.name", b"network.path", b"inputs")
+    keys: tuple[bytes, ...] = (
+        b"radio.links",
+        b"radio.max_peers",
+        b"radio.loss",
+        b"run.seed",
+        b"run.name",
+        b"network.path",
+        b"inputs",
+    )
     keys += (b"program.options.a", b"program.entry")
     nasty = {f"{key.decode()} = {name}": key + b" = " + value for name, value in values.items() for key in keys}
     nasty |= {f"--set {name}": OVERRIDE + key for name, key in zip(nasty, nasty.values(), strict=True)}

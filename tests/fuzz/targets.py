@@ -37,6 +37,7 @@ from vnet.roads.road_map import RoadMap
 from vnet.transport import wire
 from vnet.transport.access import Access
 from vnet.transport.credentials import Credentials
+from vnet.types import Mask
 
 OVERRIDE = b"\n--set "
 """Stands between a scenario file and each override in one input of the scenario target."""
@@ -157,7 +158,7 @@ def _read_trips(name: str, data: bytes) -> None:
     """Trips, as a world of them reads them: the reader that goes with the file's name, and what it makes of it."""
     network = Network(kind="trips", path=_file(name, data), origin_deg=(42.0, -83.0))
     motion = drive(network, 21, 10**8)
-    there = np.isfinite(motion.position_m).all(axis=2)
+    there: Mask = np.logical_and.reduce(np.isfinite(motion.position_m), axis=2)
     assert motion.position_m.shape == (21, len(motion.node_ids), 2) and there[:20].any(axis=0).all()
 
 
@@ -208,14 +209,14 @@ _TRAFFIC = wire.Traffic(
 )
 _PACKET = wire.WirePacket("v01", "v02", 5, 6, b"payload")
 _FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5)
-_TX = (
+_TX: tuple[wire.AgentMessage, ...] = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None),
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import"),
     wire.Yield(b"n" * 16, 3, 100, ["v01"], [], _TRAFFIC),
-    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], _TRAFFIC, wire.Lateness([1, 2]), True),
+    wire.Frames(b"n" * 16, 3, 3, [(1, 2)], _TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
     wire.StackDump(b"n" * 16, "File …"),
 )
-_RX = (
+_RX: tuple[wire.EmulatorMessage, ...] = (
     wire.Welcome(
         "v01",
         b"n" * 16,

@@ -1,6 +1,6 @@
 """Scenarios in which vehicles move, for tests: made of a function for each vehicle."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ def along(x_m: float, speed_mps: float, y_m: float = 0.0) -> Course:
     return lambda time_s: (x_m + speed_mps * time_s, y_m)
 
 
-def write_trips(path: Path, vehicles: dict[str, Sequence[Stay]], rate_hz: float = 5.0) -> Path:
+def write_trips(path: Path, vehicles: Mapping[str, Sequence[Stay]], rate_hz: float = 5.0) -> Path:
     """A CSV file in which each vehicle has its stays, sampled at `rate_hz`."""
     rows = ["id,time_s,x_m,y_m"]
     for name, stays in vehicles.items():

@@ -104,7 +104,9 @@ class _Process:
         self.grants: queue.SimpleQueue[bytes | type[BaseException]] = queue.SimpleQueue()
         self.yields: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
         encoded = [wire.encode(emulation.welcome(node, b"n")) for node in nodes]
-        self._welcomes = [wire.decode_rx(welcome) for welcome in encoded]
+        decoded = [wire.decode_rx(welcome) for welcome in encoded]
+        self._welcomes = [message for message in decoded if isinstance(message, wire.Welcome)]
+        assert len(self._welcomes) == len(nodes)
         self._seq = 0
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

@@ -49,7 +49,12 @@ def main() -> None:
     user, password, victim_user = json.loads(sys.stdin.readline())
     received: list[str] = []
     over = threading.Event()
-    threading.Thread(target=lambda: (sys.stdin.read(), over.set()), daemon=True).start()
+
+    def wait_for_the_end() -> None:
+        sys.stdin.read()
+        over.set()
+
+    threading.Thread(target=wait_for_the_end, daemon=True).start()
     with open_client(endpoint, Credentials(user, password), 2000) as session:
         for key in ("**", f"vnet/{run}/**", keys.node_rx(run, VICTIM), keys.node_tx(run, VICTIM), "@/**"):
             session.declare_subscriber(

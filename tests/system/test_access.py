@@ -16,7 +16,8 @@ from emulator.drivers.live import run_live
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import load_scenario
 from emulator.world.world import build_world
-from tests.system.conftest import ROOT, TIMEOUT_S
+from tests.support.paths import ROOT
+from tests.system.conftest import TIMEOUT_S
 from vnet.errors import VnetError
 from vnet.transport.access import Access, node_user
 

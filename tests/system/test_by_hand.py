@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.conftest import AGENT, ROOT, TIMEOUT_S, VNET, Finished, Vnet
+from tests.support.paths import ROOT
+from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet
 
 SCENARIO = "scenarios/beacon.toml"
 OPTIONS = ["--duration", "2", "--set", "network.vehicles=4"]

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from emulator.drivers.control import CONTROL_FILE, OPERATOR_FILE, ask
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet
+from tests.support.paths import ROOT
+from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
 from vnet.transport import keys

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from emulator.checks.judge import check_run
+from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
+from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, running_agents
 
 LONG = ["--program", "tests.system.programs:runs_long", "--duration", "3600", "--set", "network.vehicles=3"]
 

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 import tomli_w
 
+from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
+from tests.system.conftest import TIMEOUT_S, VNET, Vnet
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
 

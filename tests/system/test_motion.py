@@ -11,11 +11,12 @@ import tomli_w
 
 from emulator.scenario.scenario import dump_scenario
 from tests.emulator.world.maps.test_city_map import driving
-from tests.support.motion import along, still, write_trips
-from tests.system.conftest import AGENT, ROOT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
+from tests.support.motion import Stay, along, still, write_trips
+from tests.support.paths import ROOT
+from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
-VEHICLES = {
+VEHICLES: dict[str, list[Stay]] = {
     "v1": [(0, 4, along(0, 10))],
     "v2": [(0, 4, still(0, 50))],
     "v3": [(0, 4, along(80, -10, 10))],

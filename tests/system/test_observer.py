@@ -8,16 +8,21 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from emulator.viewer.sinks import is_closed
+from tests.support.paths import ROOT
 from tests.support.processes import has_ended
 from tests.support.recordings import descendants, listening_addresses, read_back, rrd
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S, VNET
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
-LONG = {"run": {"duration_s": 60.0, "name": "watched"}, "program": {"entry": "agents.beacon:main"}}
+LONG: dict[str, dict[str, Any]] = {
+    "run": {"duration_s": 60.0, "name": "watched"},
+    "program": {"entry": "agents.beacon:main"},
+}
 
 
 def observer_of(folder: Path) -> int:
@@ -51,7 +56,7 @@ def verdict_of(folder: Path) -> str:
     return json.loads((folder / "verdict.json").read_text())["verdict"]
 
 
-def test_a_killed_observer_does_not_end_the_run_and_its_recording_is_mended_by_the_printed_command(
+def test_a_killed_observer_does_not_end_the_run_and_its_recording_is_repaired_by_the_printed_command(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "run"
@@ -65,9 +70,9 @@ def test_a_killed_observer_does_not_end_the_run_and_its_recording_is_mended_by_t
     printed = next(line for line in stdout.splitlines() if "rrd optimize" in line).partition("   (")[0]
     words = shlex.split(printed.removeprefix("next"))
     assert subprocess.run(words, cwd=ROOT, capture_output=True).returncode == 0
-    mended = folder / "recording-mended.rrd"
-    assert rrd("verify", str(mended)).returncode == 0
-    assert len(read_back(mended)["/map/true"].at["Points2D:positions"]) > 5
+    repaired = folder / "recording-repaired.rrd"
+    assert rrd("verify", str(repaired)).returncode == 0
+    assert len(read_back(repaired)["/map/true"].at["Points2D:positions"]) > 5
 
 
 def test_an_observer_that_is_told_to_end_closes_the_recording_and_the_run_goes_on(tmp_path: Path) -> None:

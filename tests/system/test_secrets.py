@@ -7,14 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.live import LiveOptions, run_live
+from emulator.drivers.live import run_live
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import load_scenario
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world
-from tests.system.conftest import ROOT, running_agents
+from tests.support.paths import ROOT
+from tests.system.conftest import running_agents
 from vnet.transport.access import Access
 from vnet.transport.certificates import certifier
 from vnet.transport.credentials import KeyPair

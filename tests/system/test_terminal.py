@@ -21,8 +21,9 @@ from emulator.cli.commands import app
 from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
 from emulator.terminal.console import run_app
+from tests.support.paths import ROOT
 from tests.support.screen import Screen
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
+from tests.system.conftest import TIMEOUT_S, VNET, Vnet
 from tests.system.test_failures import long_run
 from vnet.errors import TransportError
 from vnet.transport import session
@@ -199,7 +200,7 @@ def test_quiet(vnet: Vnet) -> None:
     ],
 )
 def test_a_mistake_gets_one_line(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
     assert run_app(app, arguments) == 2
@@ -212,7 +213,7 @@ def test_a_mistake_gets_one_line(
 @pytest.mark.parametrize(
     "arguments", [["simulate", "nowhere.toml", "--log-format", "json"], ["run", "--log-format=json", "--sed", "1"]]
 )
-def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pytest.CaptureFixture) -> None:
+def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     if arguments[0] == "simulate":  # which starts anew, for its hash seed
         arguments = ["run", *arguments[1:]]
     assert run_app(app, arguments) == 2
@@ -227,7 +228,7 @@ def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pyt
     "command", ["", "run", "simulate", "emulator", "status", "fault inject", "campaign", "check"]
 )
 def test_help_fits_eighty_columns(
-    command: str, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     assert run_app(app, [*command.split(), "--help"]) == 0
@@ -236,7 +237,7 @@ def test_help_fits_eighty_columns(
     assert not [line for line in lines if "…" in line], "nothing is cut off"
 
 
-def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture) -> None:
+def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_app(app, []) == 2
     told = capsys.readouterr()
     assert "Run a scenario" in told.out
@@ -264,8 +265,8 @@ def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
         watch = ("status", "--run", str(folder), "--watch")
         exit_status, written = at_a_terminal(*watch, awaited="vehicles", then=ends)
         assert exit_status == 0
-        told = on_screen(written).replace("\n", "")  # the folder may have a long name
-        assert told == f"{folder}: the run is over"
+        last = on_screen(written).replace("\n", "")  # the folder may have a long name
+        assert last == f"{folder}: the run is over"
         process.communicate(timeout=TIMEOUT_S)
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.system.conftest import ROOT, TIMEOUT_S, VNET, Vnet
+from tests.support.paths import ROOT
+from tests.system.conftest import TIMEOUT_S, VNET, Vnet
 from tests.system.test_by_hand import OPTIONS, ROUTER, SCENARIO, finish, start_agents, start_emulator
 from vnet.errors import TransportError
 from vnet.transport import keys, session
@@ -102,7 +103,7 @@ def test_a_client_verifies_the_name_of_the_router(access: Access) -> None:
 def test_anothers_certificate_gives_no_rights(router: zenoh.Session, access: Access) -> None:
     """A password goes with its own user's certificate: either alone opens nothing."""
     heard: list[str] = []
-    received = zenoh.handlers.FifoChannel(10)
+    received: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(10)
     subscriber = router.declare_subscriber(keys.node_tx("r", "*"), received)
     stolen = with_identity(access.credentials(V01), own=own_key_pair(access, V02))
     for credentials in (stolen, access.credentials(V02)):

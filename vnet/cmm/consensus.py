@@ -7,8 +7,9 @@ peer. A peer takes what has been added since the last sum it saw, so that a late
 The inputs change: a change of x is added to s, so that the ratio tracks the mean (dynamic average consensus).
 
 Mass must be neither created nor lost. A sender splits only over peers whose recent frames list it as heard, and
-names them; only they take a share. When that set changes (a peer dies, joins, restarts, no longer hears), everybody
-starts again under a new epoch: the highest spreads, and the old mean serves until the new one has settled.
+names them: its *out-neighbours*; only they take a share. When that set changes (a peer dies, joins, restarts, no
+longer hears), everybody starts again under a new epoch: the highest spreads, and the old mean serves until the new
+one has settled.
 
 `AveragingConsensus` is the ordinary averaging of neighbours' states, for comparison: lost frames move its mean.
 """
@@ -19,7 +20,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 
@@ -29,9 +30,10 @@ from vnet.types import Array
 
 @dataclass(frozen=True)
 class Share:
-    """What a node says each round: its epoch, the running sum (s_x, s_y, w) given to each of `out_neighbours`.
+    """A node's broadcast of one round: its epoch, the running sum (s_x, s_y, w) given to each of `out_neighbours`.
 
-    Averaging needs no epoch (it is 0) and says (state x, state y, degree) instead of a sum.
+    `heard` are the peers that it has received lately. Averaging needs no epoch (it is 0) and has
+    (state x, state y, degree) in place of a sum.
     """
 
     epoch: int
@@ -42,37 +44,41 @@ class Share:
 
 @dataclass(frozen=True)
 class ConsensusConfig:
-    """Rounds, that is periods, of patience.
-
-    `silence_rounds`: a peer not heard for so long is gone. `steady_rounds`: how long a changed set of takers must
-    last before it starts a new epoch. `settle_rounds`: how long the old mean serves after a start; if epoch follows
-    epoch, for `serve_rounds` at most.
-    `gate_m`: mass whose ratio is further from the node's own input is not taken, and its sender not heard.
-    `penalty`: a peer that has been blamed for more is not heard; it is forgiven one in `blame_rounds` (a leaky
-    bucket). False sums count so much each, to be the first to bring a new epoch 1, a leap of epochs up to
-    `max_penalty`.
-    """
+    """Constants of a consensus; a round is a period of the program."""
 
     silence_rounds: int = 20
+    """Silence after which a peer is gone: at 20 % loss a chance of 10⁻¹⁴."""
     steady_rounds: int = 5
+    """Age at which a changed set of out-neighbours starts a new epoch, so that single losses do not."""
     settle_rounds: int = 30
+    """Age at which a new epoch's ratio is the mean; until then the old mean serves."""
     serve_rounds: int = 100
+    """Age up to which an old mean serves, if epoch follows epoch."""
     gate_m: float = math.inf
-    penalty: int = 10
-    blame_rounds: int = 100
+    """Distance from the node's own input beyond which the ratio of a mass is implausible: it is not taken."""
+    ban_penalty: int = 10
+    """Penalty beyond which a peer is banned, and the penalty for implausible mass."""
+    forgive_rounds: int = 100
+    """Rounds in which a penalty of 1 is forgiven (a leaky bucket)."""
     max_penalty: int = 4
+    """Largest penalty for a leap of epochs. To be the first with a new epoch costs 1, shared by all who are."""
 
 
-LEAST_MASS = 0.1
-"""Tracking adds the change of the input to masses of any size: small ones need not have a sensible ratio."""
-
-
-MOST_BLAMED = 1024
-"""Names cost a liar nothing."""
+MIN_MASS = 0.1
+"""Weight added to that of a mass before its ratio is judged: tracking adds the change of the input to masses of any
+size, and small ones need not have a sensible ratio."""
+MAX_PENALIZED = 1024
+"""Number of peers whose penalties are kept: names cost an attacker nothing."""
+MIN_WEIGHT_SHARE = 0.6
+"""Share of the usual weight below which a ratio is not the mean: most of the mass is elsewhere."""
+USUAL_ROUNDS = 50
+"""Rounds over which the usual weight is averaged."""
+DOUBTFUL_ROUNDS = 6
+"""Silence of an out-neighbour for which the ratio is not the mean: at 10 % loss a chance of 10⁻⁶."""
 
 
 class Consensus(Protocol):
-    """What a vehicle needs of a consensus."""
+    """The interface of a consensus to a vehicle."""
 
     @property
     def mean_m(self) -> Array | None:
@@ -85,7 +91,7 @@ class Consensus(Protocol):
 
 
 class Peers:
-    """Who is there, and who of them says that it hears this node."""
+    """The peers that a node has received lately, and whether each of them receives this node."""
 
     def __init__(self, node: str, silence_rounds: int) -> None:
         self._node = node
@@ -95,16 +101,16 @@ class Peers:
 
     @property
     def heard(self) -> frozenset[str]:
-        """Peers heard lately."""
+        """Peers received lately."""
         return frozenset(self._silent)
 
     @property
     def mutual(self) -> frozenset[str]:
-        """Peers heard lately that hear this node as well."""
+        """Peers received lately that receive this node as well."""
         return frozenset(peer for peer, hears in self._hears_us.items() if hears)
 
     def longest_silence(self, peers: Set[str]) -> int:
-        """For how many rounds the most silent of `peers` has not been heard."""
+        """Number of rounds since the most silent of `peers` was received."""
         return max((self._silent.get(peer, 0) for peer in peers), default=0)
 
     def drop(self, peer: str) -> None:
@@ -123,29 +129,23 @@ class Peers:
             self._hears_us[peer] = self._node in share.heard
 
 
-LEAST_SHARE, USUAL_ROUNDS = 0.6, 50
-"""A ratio of less than this share of the mass usual in so many rounds is not taken for the mean."""
-DOUBTFUL_ROUNDS = 6
-"""Nor is one while a peer that is given to has been silent for so long: at 10 % loss that is one chance in 10⁶."""
-
-
 class RatioConsensus:
     """The consensus state of one node. Epoch 0 means: not taking part yet."""
 
     def __init__(
         self, node: str, config: ConsensusConfig | None = None, rejected: Counter[str] | None = None
     ) -> None:
-        """`rejected` counts shares that are not believed, by reason: `sums`, `banned`."""
+        """Begin outside of any epoch. `rejected` counts shares by reason: `implausible_mass`, `banned`."""
         self._node = node
         self._config = config or ConsensusConfig()
         self._rejected = Counter() if rejected is None else rejected
-        self._blamed: dict[str, tuple[float, int]] = {}  # and up to which epoch
+        self._penalties: dict[str, tuple[float, int]] = {}  # penalty, and the epoch up to which it accounts
         self.epoch = 0
         self._highest = 0
         self._mass = np.zeros(3)
         self._running_sum = np.zeros(3)
         self._input: Array | None = None
-        self._takers: frozenset[str] = frozenset()
+        self._out_neighbours: frozenset[str] = frozenset()
         self._changed_rounds = 0
         self._age = 0
         self._seen: dict[str, Array] = {}
@@ -176,65 +176,65 @@ class RatioConsensus:
         self._divide()
         self._input = np.array(value, dtype=float)
         s_x, s_y, w = self._running_sum.tolist()
-        return Share(self.epoch, (s_x, s_y, w), self._takers, self._peers.heard)
+        return Share(self.epoch, (s_x, s_y, w), self._out_neighbours, self._peers.heard)
 
     def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
-        """Without the shares of those who bring false sums, or epoch after epoch: as if these were not heard.
+        """Return the shares without those of banned peers and of implausible mass: as if these were not received.
 
-        What they have been given is given to them in vain, until a new epoch starts without them; the ratio of what
-        is left is the mean all the same.
+        Mass that such a peer has been given is lost until a new epoch starts without it; the ratio of what is left
+        is the mean all the same.
         """
-        leak = 1 / self._config.blame_rounds
-        self._blamed = {
-            p: (penalty - leak, epoch) for p, (penalty, epoch) in self._blamed.items() if penalty > leak
+        leak = 1 / self._config.forgive_rounds
+        self._penalties = {
+            p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
         }
-        self._blame_for_epochs(shares)
+        self._penalize_new_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._blame_of(peer) > self._config.penalty:
-                self._rejected["exile"] += 1
+            if self._penalty(peer) > self._config.ban_penalty:
+                self._rejected["banned"] += 1
             elif not self._is_plausible(peer, share, x, y):
-                self._rejected["sums"] += 1
-                self._blame(peer, self._config.penalty, share.epoch)
+                self._rejected["implausible_mass"] += 1
+                self._penalize(peer, self._config.ban_penalty, share.epoch)
             else:
                 believed[peer] = share
         return believed
 
-    def _blame_for_epochs(self, shares: Mapping[str, Share]) -> None:
-        """Blame those who are the first with a new epoch.
+    def _penalize_new_epochs(self, shares: Mapping[str, Share]) -> None:
+        """Penalize the peers that are the first with a new epoch.
 
-        They share the blame: who starts it brings it alone, and who hands it on does so together with others.
+        They share the penalty: the peer that starts an epoch brings it alone, peers that hand it on do so together.
         """
         newest = max((share.epoch for share in shares.values()), default=0)
-        if newest > self._highest > 0:  # who joins finds the others further on, for which they are not to blame
+        if newest > self._highest > 0:  # a node that joins finds the others further on, which is no fault of theirs
             first = [peer for peer, share in shares.items() if share.epoch == newest]
             for peer in first:
-                if newest > self._blamed.get(peer, (0.0, 0))[1]:
-                    self._blame(peer, min(newest - self._highest, self._config.max_penalty) / len(first), newest)
+                if newest > self._penalties.get(peer, (0.0, 0))[1]:
+                    self._penalize(peer, min(newest - self._highest, self._config.max_penalty) / len(first), newest)
 
-    def _blame_of(self, peer: str) -> float:
-        return self._blamed[peer][0] if peer in self._blamed else 0.0
+    def _penalty(self, peer: str) -> float:
+        return self._penalties[peer][0] if peer in self._penalties else 0.0
 
-    def _blame(self, peer: str, more: float, epoch: int) -> None:
-        penalty = self._blame_of(peer) + more
-        if peer in self._blamed or len(self._blamed) < MOST_BLAMED:
-            self._blamed[peer] = penalty, epoch
-        if penalty > self._config.penalty:
+    def _penalize(self, peer: str, more: float, epoch: int) -> None:
+        penalty = self._penalty(peer) + more
+        if peer in self._penalties or len(self._penalties) < MAX_PENALIZED:
+            self._penalties[peer] = penalty, epoch
+        if penalty > self._config.ban_penalty:
             self._peers.drop(peer)
 
     def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
-        """Whether what the peer has added since its last sum could be mass of common errors near (x, y)."""
+        """Tell whether the mass that a peer has added since its last sum may be of common errors near (x, y)."""
         if share.epoch != self.epoch or self._node not in share.out_neighbours:
             return True
         seen = self._seen.get(peer)
         s_x, s_y, w = share.running_sum if seen is None else (np.array(share.running_sum) - seen).tolist()
-        return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + LEAST_MASS)
+        return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + MIN_MASS)
 
     def _follow(self, value: Array) -> None:
         """Start a new epoch where one is due, otherwise add the change of the input."""
         wanted = self._peers.mutual
-        changed = wanted != self._takers or self.epoch == 0
+        changed = wanted != self._out_neighbours or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
         if self._changed_rounds >= self._config.steady_rounds:
             self._start(self._highest + 1, value, wanted)
@@ -250,7 +250,7 @@ class RatioConsensus:
         self._mass = np.array([value[0], value[1], 1.0])
         self._usual_weight = 1.0
         self._running_sum = np.zeros(3)
-        self._takers = out_neighbours
+        self._out_neighbours = out_neighbours
         self._changed_rounds = 0
         self._age = 0
         self._seen = {}
@@ -263,30 +263,30 @@ class RatioConsensus:
         self._seen[peer] = total
 
     def _divide(self) -> None:
-        """Take the ratio for the mean, where it can be trusted.
+        """Take the ratio for the mean, if it can be trusted.
 
-        Whoever gives to peers that have died keeps next to nothing of what is usual, and changes of its input are
-        then too much for it; in the end for all, whose mass goes there too.
+        A node that gives to peers that have died keeps next to nothing of its usual mass, and changes of its input
+        are then too much for it; in the end for all nodes, whose mass goes there too.
         """
         self._mean_rounds += 1
-        weight = float(self._mass[2]) * (len(self._takers) + 1)  # before it was split
+        weight = float(self._mass[2]) * (len(self._out_neighbours) + 1)  # before it was split
         self._usual_weight += (weight - self._usual_weight) / USUAL_ROUNDS
         settled = self.epoch and self._age >= self._config.settle_rounds
-        doubtful = self._peers.longest_silence(self._takers) >= DOUBTFUL_ROUNDS
-        if settled and not doubtful and weight >= LEAST_SHARE * self._usual_weight:
+        doubtful = self._peers.longest_silence(self._out_neighbours) >= DOUBTFUL_ROUNDS
+        if settled and not doubtful and weight >= MIN_WEIGHT_SHARE * self._usual_weight:
             self._mean, self._mean_rounds = self._mass[:2] / self._mass[2], 0
 
     def _split(self) -> None:
         if self.epoch:
-            share = self._mass / (len(self._takers) + 1)
+            share = self._mass / (len(self._out_neighbours) + 1)
             self._running_sum += share
-            self._mass = self._mass - share * len(self._takers)
+            self._mass = self._mass - share * len(self._out_neighbours)
 
 
 class DirectMean:
     """The mean of everybody's x, heard from everybody: for comparisons, where all hear all.
 
-    `current`: what has been heard is of the same instant as the input, and not of the round before.
+    `current`: shares are of the same instant as the input, and not of the round before.
     """
 
     def __init__(self, current: bool = False) -> None:
@@ -309,7 +309,8 @@ class DirectMean:
         return Share(0, (x, y, 1.0), frozenset(), frozenset(shares))
 
 
-AVERAGING_RULES = ("metropolis", "max-degree")
+AveragingRule = Literal["metropolis", "max-degree"]
+AVERAGING_RULES: tuple[str, ...] = get_args(AveragingRule)
 
 
 class AveragingConsensus:
@@ -328,7 +329,7 @@ class AveragingConsensus:
         config: ConsensusConfig | None = None,
         rejected: Counter[str] | None = None,
     ) -> None:
-        """`rejected` counts states that are not believed as `sums`."""
+        """Begin with the first input. `rejected` counts implausible states as `implausible_mass`."""
         if rule not in AVERAGING_RULES:
             raise VnetError(f"averaging rule {rule!r}: allowed: {', '.join(AVERAGING_RULES)}")
         self._rule = rule
@@ -373,11 +374,11 @@ class AveragingConsensus:
             if math.hypot(share.running_sum[0] - x, share.running_sum[1] - y) <= self._config.gate_m
         }
         if len(believed) < len(shares):
-            self._rejected["sums"] += len(shares) - len(believed)
+            self._rejected["implausible_mass"] += len(shares) - len(believed)
         return believed
 
 
 def _towards(state: Array, degree: float, other: tuple[float, float, float]) -> Array:
-    """What one peer's state and degree add to one's own."""
+    """Step (2,) from a node's own state towards a peer's, by the larger of both degrees."""
     x, y, other_degree = other
     return np.asarray((np.array([x, y]) - state) / max(degree, other_degree, 1.0))

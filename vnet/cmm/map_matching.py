@@ -34,6 +34,11 @@ from vnet.types import Array
 FAR_SIGMAS = 5.0
 """Beyond this many deviations outside the lane, the difference of two Φ would lose its digits."""
 
+MIN_MAP_LOG_LIKELIHOOD = -6.0
+"""Least log-likelihood of being on the road that programs use: a truncated likelihood, so that a vehicle whose
+fixes are false says the same of all hypotheses and cannot outvote the others (Huber and Ronchetti 2009,
+redescending M-estimators). On a wide lane −6 is reached 2.8 deviations beyond its edge."""
+
 STEPS, REACH = 128, 9
 """The table of Φ: so many steps in a deviation; beyond so many deviations it says 0 or 1, true to 10⁻¹⁸.
 
@@ -140,7 +145,7 @@ class Matcher(Protocol):
         """Lanes within gates (m,) of (m, 2) that fit headings (m,), NaN if unknown: rows and lanes, by row."""
         ...
 
-    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+    def log_likelihood(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
         """log P(on a road) of `count` vehicles, (count, K); `row` (E,), `lane` (E,) are their candidates, by row.
 
         Positions (E, 2, K) and covariances (E, 2, 2) are the vehicles' of each candidate. Without a candidate: 0.
@@ -151,17 +156,17 @@ class Matcher(Protocol):
 class StraightLanes:
     """Matches vehicles that stand to straight lanes (`LaneMap`): each keeps the candidates of its first fix.
 
-    `one_sided` lanes are bounded on their right only; no lane says less than `least_log_road`.
+    `one_sided` lanes are bounded on their right only; no lane says less than `min_map_log_likelihood`.
     """
 
     drives = False
 
-    def __init__(self, lanes: LaneMap, one_sided: bool, least_log_road: float) -> None:
+    def __init__(self, lanes: LaneMap, one_sided: bool, min_map_log_likelihood: float) -> None:
         self.heading_rad = lanes.heading_rad
         self._lanes = lanes
         self._normal, self._offset_m = lanes.normal, lanes.offset_m
         self._score = log_left_of_edge if one_sided else log_on_lane
-        self._least = least_log_road
+        self._min = min_map_log_likelihood
 
     def seek(self, position_m: Array, heading_rad: Array, gate_m: Array) -> tuple[Rows, Rows]:
         """See `Matcher`."""
@@ -173,12 +178,12 @@ class StraightLanes:
         row = np.repeat(np.arange(len(found)), [len(lanes) for lanes in found])
         return row, np.concatenate([*found, np.empty(0, dtype=np.intp)])
 
-    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+    def log_likelihood(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
         """See `Matcher`."""
         offset_m, sigma_m = _across(self._normal[lane], self._offset_m[lane], position_m, covariance_m2)
         score = self._score(offset_m, sigma_m, self._lanes.half_width_m)
-        if self._least > -np.inf:
-            np.maximum(score, self._least, out=score)
+        if self._min > -np.inf:
+            np.maximum(score, self._min, out=score)
         if len(row) == count and np.array_equal(row, np.arange(count)):
             return score
         return _by_row(np.logaddexp, score, row, count)
@@ -205,7 +210,7 @@ class CityRoads:
         place = np.arange(len(row)) - np.searchsorted(row, row)
         return row[place < MOST_LANES], segment[place < MOST_LANES]
 
-    def log_road(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
+    def log_likelihood(self, position_m: Array, covariance_m2: Array, row: Rows, lane: Rows, count: int) -> Array:
         """See `Matcher`."""
         roads = self._roads
         offset_m, sigma_m = _across(roads.normal[lane], roads.offset_m[lane], position_m, covariance_m2)
@@ -219,11 +224,11 @@ class CityRoads:
         return np.log(_by_row(np.add, inside, row, count, 1.0))
 
 
-def matcher(lanes: LaneMap | RoadMap, one_sided: bool, least_log_road: float, off_road: float) -> Matcher:
+def matcher(lanes: LaneMap | RoadMap, one_sided: bool, min_map_log_likelihood: float, off_road: float) -> Matcher:
     """What matches vehicles to a map of this kind."""
     if isinstance(lanes, RoadMap):
         return CityRoads(lanes, off_road)
-    return StraightLanes(lanes, one_sided, least_log_road)
+    return StraightLanes(lanes, one_sided, min_map_log_likelihood)
 
 
 def _across(normal: Array, offset_m: Array, position_m: Array, covariance_m2: Array) -> tuple[Array, Array]:

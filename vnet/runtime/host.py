@@ -22,6 +22,7 @@ from typing import Any
 from vnet.errors import ProgramError
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
+from vnet.runtime import asyncio_internals
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -145,7 +146,7 @@ class Host:
         if killed:
             self._killed[gone] = self._tasks_of(gone)
             for task in self._killed[gone]:
-                task._log_destroy_pending = False  # type: ignore[attr-defined]
+                asyncio_internals.abandon(task)
                 program = task.get_coro()
                 assert inspect.iscoroutine(program)
                 if inspect.getcoroutinestate(program) == inspect.CORO_CREATED:
@@ -242,7 +243,7 @@ class Host:
 
         What spins on although it was cancelled loses its callbacks.
         """
-        ready = loop._ready
+        ready = asyncio_internals.ready_queue(loop)
         owners = dict.fromkeys(_owner(handle) for handle in ready)
         spinning = [owner for owner in owners if owner is not None] or list(self.nodes.values())
         if not any(self._runs(node) for node in spinning):
@@ -304,8 +305,9 @@ class Host:
         loop: asyncio.AbstractEventLoop,
         coroutine: Generator[Any, None, Any],
         context: contextvars.Context | None = None,
+        **options: Any,  # from Python 3.13.3 on: the name, and whatever else a task takes
     ) -> asyncio.Task[Any]:
-        task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context)
+        task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context, **options)
         owner = _current_node.get() if context is None else context.get(_current_node)
         self._tasks[task] = owner
         return task
@@ -326,7 +328,7 @@ def _no_bend() -> wire.ClockError | None:
 
 def _owner(handle: asyncio.Handle) -> Node | None:
     """The node on whose behalf a callback is scheduled."""
-    return handle._context.get(_current_node)  # type: ignore[attr-defined, no-any-return]
+    return asyncio_internals.context_of(handle).get(_current_node)
 
 
 async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:

@@ -13,16 +13,17 @@ virtual loop spins for ever (cpython#116342).
 from __future__ import annotations
 
 import asyncio
-import heapq
 import selectors
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from contextvars import Context
 from itertools import count
 from typing import Any, NoReturn
 
 from vnet.errors import VirtualTimeError
+from vnet.runtime import asyncio_internals
+from vnet.runtime.asyncio_internals import NumberedTimer
 from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
 
@@ -78,23 +79,6 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         return when if clock_error is None else self.own_time() + (when - self.time()) / (1 + clock_error.rate)
 
 
-class _Timer(asyncio.TimerHandle):
-    """A timer with a number: those of one instant fire in the order in which they were set.
-
-    asyncio leaves that to the shape of its heap, and so to how many other nodes share the loop.
-    """
-
-    __slots__ = ("_number",)
-
-    def __init__(self, number: int, *rest: Any) -> None:
-        super().__init__(*rest)
-        self._number = number
-
-    def __lt__(self, other: asyncio.TimerHandle) -> bool:
-        assert isinstance(other, _Timer)
-        return (self._when, self._number) < (other._when, other._number)  # type: ignore[attr-defined]
-
-
 class VirtualTimeLoop(SkewedLoop):
     """An event loop in virtual time; see the module's text.
 
@@ -109,10 +93,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._ending = False
         self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
         self._timers = count()
-        self._scheduled: list[asyncio.TimerHandle]  # asyncio's heap
-        self._ready: deque[asyncio.Handle]  # asyncio's
         super().__init__(_YieldingSelector(self._wait))
-        self._clock_resolution = 0.5 / NS_PER_S  # no timer fires before its nanosecond
+        asyncio_internals.set_clock_resolution(self, 0.5 / NS_PER_S)  # no timer fires before its nanosecond
 
     @property
     def now_ns(self) -> int:
@@ -128,11 +110,12 @@ class VirtualTimeLoop(SkewedLoop):
 
         Timers that became due meanwhile are due when they are let go: after what has come in by then, in order.
         """
-        if not isinstance(self._ready, _HoldingQueue):
-            self._ready = _HoldingQueue(self._ready)
-        for timer in self._ready.release(held):
-            heapq.heappush(self._scheduled, timer)
-            timer._scheduled = True  # type: ignore[attr-defined]
+        ready = asyncio_internals.ready_queue(self)
+        if not isinstance(ready, _HoldingQueue):
+            ready = _HoldingQueue(ready)
+            asyncio_internals.replace_ready_queue(self, ready)
+        for timer in ready.release(held):
+            asyncio_internals.push_timer(self, timer)
 
     def own_time(self) -> float:
         """The granted time in seconds, as asyncio counts."""
@@ -142,13 +125,12 @@ class VirtualTimeLoop(SkewedLoop):
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """Call at `when` on the clock of the task that asks, at the nearest nanosecond."""
-        self._check_closed()  # type: ignore[attr-defined]
+        asyncio_internals.check_not_closed(self)
         when = self._own_when(when)
         if when < LATEST_S:
             when = round(when * NS_PER_S) / NS_PER_S
-        timer = _Timer(next(self._timers), when, callback, args, self, context)
-        heapq.heappush(self._scheduled, timer)
-        timer._scheduled = True  # type: ignore[attr-defined]
+        timer = NumberedTimer(next(self._timers), when, callback, args, self, context)
+        asyncio_internals.push_timer(self, timer)
         return timer
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
@@ -181,10 +163,10 @@ class VirtualTimeLoop(SkewedLoop):
             raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
 
     def _next_timer_ns(self) -> int | None:
-        # asyncio has just dropped cancelled timers from the head of its heap.
-        if not self._scheduled or self._scheduled[0].when() > LATEST_S:
+        timer = asyncio_internals.next_timer(self)
+        if timer is None or timer.when() > LATEST_S:
             return None
-        return max(round(self._scheduled[0].when() * NS_PER_S), self._now_ns)
+        return max(round(timer.when() * NS_PER_S), self._now_ns)
 
     # Executors: while a job is pending the loop does not yield (computing costs no virtual time), and results
     # appear in the order in which the jobs were submitted, when all are there: no race decides anything.
@@ -194,18 +176,12 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
         if executor is None:
-            executor = self._own_executor()
+            executor = asyncio_internals.default_executor(self, "vnet")
         job = executor.submit(func, *args)
         outer: asyncio.Future[Any] = self.create_future()
         self._jobs.append((job, outer))
         job.add_done_callback(lambda _: self.call_soon_threadsafe(_nothing))
         return outer
-
-    def _own_executor(self) -> Executor:
-        if self._default_executor is None:  # type: ignore[has-type]
-            self._default_executor = ThreadPoolExecutor(thread_name_prefix="vnet")
-        executor: Executor = self._default_executor
-        return executor
 
     def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
         if not all(job.done() for job, _ in self._jobs):
@@ -249,7 +225,7 @@ class _HoldingQueue(deque[asyncio.Handle]):
         else:
             super().append(handle)
 
-    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[_Timer]:
+    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
         """Hold what `holds` says, and let go of the rest in the order in which it came; returns timers let go."""
         waiting, held = list(self), self._held
         self.clear()
@@ -258,7 +234,7 @@ class _HoldingQueue(deque[asyncio.Handle]):
             self.append(handle)
         timers = []
         for handle in held:
-            if isinstance(handle, _Timer) and not holds(handle):
+            if isinstance(handle, NumberedTimer) and not holds(handle):
                 timers.append(handle)
             else:
                 self.append(handle)

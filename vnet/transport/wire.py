@@ -21,6 +21,12 @@ from vnet.node import Fix, Packet, Report
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
+HEAD_START_NS = 200_000_000
+"""Real time: time from the announcement of time 0 to time 0, so that all processes receive it before."""
+LATENESS_LIMIT_NS = 20_000_000
+"""Deliveries later than this count against a real-time run."""
+LATENESS_BINS = 80
+"""Bins of delays: four for each factor of two, from 10 µs to 10 s."""
 LARGEST_MESSAGE_BYTES = 64 * 2**20
 """Largest message of an agent: it holds a frame of the largest payload from each of a thousand nodes."""
 
@@ -120,7 +126,7 @@ class Yield(Message, frozen=True):
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
     """Real time: delays of packets to their process, as counts in the bins of `lateness_bin`."""
 
-    counts: Sequence[Count] = ()
+    counts: Annotated[Sequence[Count], msgspec.Meta(min_length=LATENESS_BINS, max_length=LATENESS_BINS)]
 
 
 class Frames(Message, frozen=True):
@@ -300,12 +306,6 @@ def _check_size(data: bytes) -> None:
         raise WireError(f"message of {len(data)} bytes: at most {LARGEST_MESSAGE_BYTES} allowed")
 
 
-HEAD_START_NS = 200_000_000
-"""Real time: time from the announcement of time 0 to time 0, so that all processes receive it before."""
-LATENESS_LIMIT_NS = 20_000_000
-"""Deliveries later than this count against a real-time run."""
-LATENESS_BINS = 80
-"""Bins of delays."""
 _LATENESS_LIMIT_BIN = 44
 """Bin whose lower edge is `LATENESS_LIMIT_NS`."""
 

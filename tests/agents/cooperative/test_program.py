@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents.cooperative.fix_table import CAPACITY, Sightings
+from agents.cooperative.fix_table import CAPACITY, FixTable
 from agents.cooperative.frame import RELAYED, CooperativeFrame, FrameError, decode, encode, room, short_name
 from agents.cooperative.options import Options
 from agents.cooperative.program import Estimator, listening_share
@@ -126,24 +126,37 @@ def test_old_foreign_and_future_frames_are_counted_and_left_out() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fusoin": "none"}, "program.options.fusoin: unknown; allowed: alpha, common_sigma_m"),
+        (
+            {"fusoin": "none"},
+            "program.options.fusoin: unknown (did you mean fusion?); allowed: alpha, common_sigma_m",
+        ),
+        ({"roads_apart": True}, "program.options.roads_apart: renamed; use separate_map_update"),
         (
             {"fusion": "magic"},
-            "program.options.fusion = 'magic': allowed: optimized, random, metropolis, max-degree, constant, none",
+            "program.options.fusion = 'magic': one of optimized, random, metropolis, max-degree, ",
         ),
-        ({"consensus": "exactly"}, "program.options.consensus = 'exactly': allowed: ratio, metropolis, max-degree"),
-        ({"profile": "mine"}, "program.options.profile = 'mine': allowed: default, paper"),
-        ({"relay": 1}, "program.options.relay = 1: bool expected"),
-        ({"alpha": 1.01}, "program.options.alpha = 1.01: 0 to 1 allowed"),
-        ({"start_m": [1.0]}, "program.options.start_m = [1.0]: two numbers"),
-        ({"hears": {"v1": ["v2"]}}, 'only with consensus = "exact"'),
-        ({"hears": {"v1": "v2"}}, "program.options.hears.v1 = 'v2': a list of node ids expected"),
-        ({"common_sigma_m": float("inf")}, "program.options.common_sigma_m = inf: 0 to 327.0 allowed"),
-        ({"self_floor": 1.5}, "program.options.self_floor = 1.5: 0 to 1 allowed"),
-        ({"particles": "many"}, "program.options.particles = 'many': int expected"),
-        ({"particles": 0}, "program.options.particles = 0: 1 to 100000 allowed"),
-        ({"lateral_tau_s": 0.0}, "program.options.lateral_tau_s = 0.0: must be positive"),
-        ({"common_tau_s": float("nan")}, "program.options.common_tau_s = nan: must be positive"),
+        ({"consensus": "exactly"}, "one of ratio, metropolis, max-degree, exact expected (did you mean exact?)"),
+        ({"profile": "mine"}, "program.options.profile = 'mine': one of default, paper expected"),
+        ({"relay": 1}, "program.options.relay = 1: true or false expected"),
+        ({"alpha": 1.01}, "program.options.alpha = 1.01: a number from 0 to 1 expected"),
+        (
+            {"start_m": [1.0]},
+            "program.options.start_m = [1.0]: a list of 2 (each a number from -327 to 327) expected",
+        ),
+        ({"start_m": [1.0, 400]}, "program.options.start_m = [1.0, 400]: a list of 2"),
+        (
+            {"hears": {"v1": ["v2"]}},
+            "program.options.hears = {'v1': ['v2']}: allowed with consensus = \"exact\" only",
+        ),
+        ({"hears": {"v1": "v2"}}, "program.options.hears.v1 = 'v2': a list (each text) expected"),
+        ({"hears": ["v1"]}, "program.options.hears = ['v1']: a table (each a list (each text)) expected"),
+        ({"common_sigma_m": float("inf")}, "program.options.common_sigma_m = inf: a number from 0 to 327 expected"),
+        ({"self_floor": 1.5}, "program.options.self_floor = 1.5: a number from 0 to 1 expected"),
+        ({"particles": "many"}, "program.options.particles = 'many': a whole number from 1 to 100000 expected"),
+        ({"particles": 0}, "program.options.particles = 0: a whole number from 1 to 100000 expected"),
+        ({"particles": True}, "program.options.particles = True: a whole number from 1 to 100000 expected"),
+        ({"lateral_tau_s": 0.0}, "program.options.lateral_tau_s = 0.0: a number above 0 expected"),
+        ({"common_tau_s": float("nan")}, "program.options.common_tau_s = nan: a number above 0 expected"),
     ],
 )
 def test_a_wrong_option_is_one_line(options: dict[str, object], message: str) -> None:
@@ -151,6 +164,15 @@ def test_a_wrong_option_is_one_line(options: dict[str, object], message: str) ->
         Options.parse(options)
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_papers_profile_sets_its_constants_and_what_is_set_besides_counts() -> None:
+    options = Options.parse({"profile": "paper", "particles": 70})
+    assert (options.particles, options.exchange, options.separate_map_update) == (70, "particles", True)
+    config = options.filter_config()
+    assert config.common_walk_m == pytest.approx(0.5 / math.sqrt(3) / math.sqrt(0.1))
+    assert config.min_map_log_likelihood == -math.inf
+    assert Options().filter_config().min_map_log_likelihood == -6.0
 
 
 def test_the_covariance_in_a_frame_of_zeros_is_refused() -> None:
@@ -287,31 +309,31 @@ def test_relayed_fixes_reach_vehicles_that_cannot_hear_each_other() -> None:
 
 
 def test_only_the_newest_word_of_a_vehicle_counts_and_old_word_is_forgotten() -> None:
-    sightings = Sightings(1, PERIOD_NS)
+    table = FixTable(1, PERIOD_NS)
 
     def word(time_ns: int, age: int, x_cm: int) -> CooperativeFrame:
         relayed = np.array([(7, age, 0, x_cm, 0), (1, 0, 0, 5, 5)], dtype=RELAYED)
         return CooperativeFrame(time_ns, ONE, 0.0, ONE, np.eye(2), 0, (0.0, 0.0, 0.0), {}, ONE[None], relayed)
 
     now_ns = 10 * PERIOD_NS
-    sightings.learn([(2, word(now_ns, 1, 100)), (3, word(now_ns, 2, 999))])
-    seen = dict(sightings.observations(now_ns, np.eye(2)))
+    table.learn([(2, word(now_ns, 1, 100)), (3, word(now_ns, 2, 999))])
+    seen = dict(table.observations(now_ns, np.eye(2)))
     assert sorted(seen) == ["00000002", "00000003", "00000007"], "its own fix is no news"
     assert seen["00000007"].position_m.tolist() == [1.0, 0.0]
     assert seen["00000007"].age_s == pytest.approx(0.1)
-    fresh = sightings.freshest(now_ns, 2)
+    fresh = table.freshest(now_ns, 2)
     assert fresh["name"].tolist() == [2, 3], "the newest first"
-    sightings.forget(now_ns)
-    assert sorted(dict(sightings.observations(now_ns, np.eye(2)))) == ["00000002", "00000003"]
+    table.forget(now_ns)
+    assert sorted(dict(table.observations(now_ns, np.eye(2)))) == ["00000002", "00000003"]
 
 
 def test_a_liar_cannot_fill_the_memory() -> None:
-    sightings = Sightings(0, PERIOD_NS)
+    table = FixTable(0, PERIOD_NS)
     for start in range(0, 2 * CAPACITY, 250):
         relayed = np.array([(1 + start + i, 0, 0, 0, 0) for i in range(250)], dtype=RELAYED)
         frame = CooperativeFrame(0, ONE, 0.0, ONE, np.eye(2), 0, (0.0, 0.0, 0.0), {}, ONE[None], relayed)
-        sightings.learn([(2**32 - 1, frame)])
-    assert len(dict(sightings.observations(0, np.eye(2)))) == CAPACITY
+        table.learn([(2**32 - 1, frame)])
+    assert len(dict(table.observations(0, np.eye(2)))) == CAPACITY
 
 
 def test_fusion_brings_estimates_closer_than_none() -> None:

@@ -1,5 +1,6 @@
 """What cooperating vehicles believe is judged: the lost, means that are none, agreement that does not return."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict
 from emulator.records.run_folder import Event
 from tests.emulator.checks.test_faults import not_valid, simulated
-from tests.emulator.checks.test_judge import result, verdict
+from tests.emulator.checks.test_judge import checked, result, verdict
 from vnet.node import Node
 
 BLOCK = {"kind": "block", "at_s": 2.0, "duration_s": 1.0}
@@ -17,7 +18,7 @@ COOPERATION = ("consensus_mean", "convergence", "bounded_error")
 
 async def believes(node: Node) -> None:
     """Report beliefs that agree, but for the `wrong`: {node, what, from_s, to_s, by_m}."""
-    wrong: dict[str, Any] = node.options
+    wrong: Mapping[str, Any] = node.options
     number = int(node.id[1:])
     async for fix in node.gnss:
         await node.radio.broadcast(b"hello")
@@ -73,7 +74,7 @@ def test_a_vehicle_whose_receiver_is_bent_may_be_lost() -> None:
 def test_a_mean_that_is_none_is_found() -> None:
     recorded = run(duration_s=11.0, what="mean_m", from_s=3.0, to_s=11.0, by_m=2.0)
     assert not_valid(recorded) == {"consensus_mean": Verdict.INVALID}
-    rows = result(recorded, "consensus_mean").figures["rows"]
+    rows = checked(recorded, "consensus_mean").figures["rows"]
     assert [row["node"] for row in rows] == ["v03"]
     assert rows[0]["off_m"] == pytest.approx(2.0, abs=0.1)
 

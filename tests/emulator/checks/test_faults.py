@@ -14,9 +14,9 @@ import pytest
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.metrics import STATES
 from emulator.records.run_folder import Event
-from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.faults import KINDS, DataReplay, parse_fault
 from emulator.scenario.scenario import Scenario
-from tests.emulator.checks.test_judge import damaged, result, run_scenario, timely, verdict
+from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
 from vnet.node import Node
 
 NEEDED: dict[str, dict[str, Any]] = {
@@ -138,7 +138,18 @@ async def sends_by_the_clock(node: Node) -> None:
 
 
 def test_many_faults_at_once_are_told_apart() -> None:
-    kinds = ("partition", "kill", "pause", "loss", "burst_loss", "duplicate", "corrupt", "delay", "jitter", "DoS")
+    kinds: tuple[str, ...] = (
+        "partition",
+        "kill",
+        "pause",
+        "loss",
+        "burst_loss",
+        "duplicate",
+        "corrupt",
+        "delay",
+        "jitter",
+        "DoS",
+    )
     kinds += ("Sybil", "DataReplay", "StaleMessages", "swizzle", "range", "throttle", "gnss_outage", "gnss_jump")
     faults = [fault(kind, at_s=0.5 + 0.1 * place) for place, kind in enumerate(kinds)]
     recorded = simulated(*faults, radio={"loss": 0.1, "max_peers": 3, "queue_frames": 3, "delivery_tick_us": 100})
@@ -201,7 +212,9 @@ def test_a_fault_outside_its_time_or_its_links_is_found() -> None:
     assert recorded.sent_ns[outside] < AT_S * 1e9
     forged = with_cells(with_cells(recorded.trace, "outcome", outside, "fault"), "cause", outside, "block-0")
     assert set(damaged(recorded, forged)) == {"causes"}
-    free = ~recorded.plan[0].links[recorded.sender, recorded.receiver]
+    links = recorded.plan[0].links
+    assert links is not None
+    free = ~links[recorded.sender, recorded.receiver]
     within = np.flatnonzero(free & recorded.outcome_is("lost") & (abs(recorded.sent_ns / 1e9 - 3) < 0.9))[0]
     forged = with_cells(with_cells(recorded.trace, "outcome", within, "fault"), "cause", within, "block-0")
     assert set(damaged(recorded, forged)) == {"causes"}
@@ -227,14 +240,14 @@ def test_a_packet_for_a_node_that_is_down_is_found(kind: str) -> None:
 def test_frames_and_reports_of_nodes_that_should_be_down_are_found() -> None:
     found = not_valid(shifted(with_fault("kill"), -1.0))
     assert found["down_respected"] is Verdict.INVALID
-    figures = result(shifted(with_fault("kill"), -1.0), "down_respected").figures
+    figures = checked(shifted(with_fault("kill"), -1.0), "down_respected").figures
     assert min(figures["spoke"], figures["reports"], figures["missed"]) > 0
 
 
 def test_a_node_that_does_not_stand_still_is_found() -> None:
     early = shifted(with_fault("pause"), -0.5)
     assert not_valid(early)["pause_respected"] is Verdict.INVALID
-    figures = result(early, "pause_respected").figures
+    figures = checked(early, "pause_respected").figures
     assert (figures["spoke"] > 0, figures["reports"]) == (True, 4 * 5)
 
 
@@ -242,7 +255,7 @@ def test_a_node_that_does_not_stand_still_is_found() -> None:
 def test_a_fix_in_an_outage_or_none_without_is_found(seconds: float) -> None:
     moved = shifted(with_fault("gnss_outage"), seconds)
     assert not_valid(moved) == {"outage_respected": Verdict.INVALID}
-    assert len(result(moved, "outage_respected").figures["rows"]) == 10
+    assert len(checked(moved, "outage_respected").figures["rows"]) == 10
 
 
 @pytest.mark.parametrize("kind", ["loss", "burst_loss"])
@@ -332,7 +345,8 @@ def test_a_frame_that_was_not_sent_as_often_as_it_should_be_is_found(kind: str) 
 
 
 def test_a_replay_of_another_age_is_found() -> None:
-    assert with_fault("DataReplay").scenario.fault[0].age_s == 1.0
+    replay = with_fault("DataReplay").scenario.fault[0]
+    assert isinstance(replay, DataReplay) and replay.age_s == 1.0
     scenario = with_fault("DataReplay").scenario
     older = scenario.model_copy(update={"fault": (scenario.fault[0].model_copy(update={"age_s": 0.9}),)})
     assert not_valid(replace(with_fault("DataReplay"), scenario=older)) == {"copies": Verdict.INVALID}
@@ -344,7 +358,7 @@ def test_fixes_that_stray_otherwise_than_they_should_are_found(kind: str, key: s
     less = recorded.scenario.fault[0].model_copy(update={key: (4.0, 2.0)})
     scenario = recorded.scenario.model_copy(update={"fault": (less,)})
     assert not_valid(replace(recorded, scenario=scenario)) == {"gnss": Verdict.INVALID}
-    assert result(replace(recorded, scenario=scenario), "gnss").figures["rows"][0]["under"] == f"{kind}-0"
+    assert checked(replace(recorded, scenario=scenario), "gnss").figures["rows"][0]["under"] == f"{kind}-0"
 
 
 def test_a_receiver_that_is_too_good_or_too_bad_is_found() -> None:
@@ -413,7 +427,7 @@ def test_a_node_that_falls_silent_after_the_last_fault_is_found(kind: str) -> No
     node = recorded.node_ids[int(np.flatnonzero(recorded.plan[0].nodes)[0])]
     silent = without_reports(recorded, node, AT_S if kind == "kill" else 4.5)
     assert not_valid(silent) == {"liveness": Verdict.INVALID}
-    assert result(silent, "liveness").figures["rows"][0]["node"] == node
+    assert checked(silent, "liveness").figures["rows"][0]["node"] == node
 
 
 def test_a_short_silence_and_a_death_are_no_lack_of_liveness() -> None:

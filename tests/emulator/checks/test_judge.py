@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +30,9 @@ async def first_only(node: Node) -> None:
             await node.radio.broadcast(b"hello")
 
 
-def run(folder: Path, program: str = "agents.beacon:main", vehicles: int = 5, **sections: dict) -> RecordedRun:
+def run(
+    folder: Path, program: str = "agents.beacon:main", vehicles: int = 5, **sections: dict[str, Any]
+) -> RecordedRun:
     """Simulate a small dense network and keep it in `folder`."""
     settings = {"network": {"vehicles": vehicles, "layout": "dense"}, "program": {"entry": program}}
     return run_scenario(folder, Scenario.model_validate({"run": {"duration_s": 1.0}, **settings, **sections}))
@@ -39,8 +42,8 @@ def run_scenario(folder: Path, scenario: Scenario) -> RecordedRun:
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
     wall_s, _ = simulate(emulation)
     conclude(emulation, wall_s, "simulate")
-    tables = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
-    return RecordedRun(scenario, read_trace(folder / "trace.parquet"), *tables, read_events(folder))
+    states, metrics = (pq.read_table(folder / f"{name}.parquet") for name in ("states", "metrics"))
+    return RecordedRun(scenario, read_trace(folder / "trace.parquet"), states, metrics, read_events(folder))
 
 
 @pytest.fixture(scope="module")
@@ -50,13 +53,19 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
 
 def result(recorded: RecordedRun, name: str) -> CheckResult | NotExercised:
     judgement = judge(recorded)
-    return next(check for check in [*judgement.checks, *judgement.not_exercised] if check.name == name)
+    findings: list[CheckResult | NotExercised] = [*judgement.checks, *judgement.not_exercised]
+    return next(check for check in findings if check.name == name)
+
+
+def checked(recorded: RecordedRun, name: str) -> CheckResult:
+    """The result of a check that the run exercises."""
+    found = result(recorded, name)
+    assert isinstance(found, CheckResult)
+    return found
 
 
 def verdict(recorded: RecordedRun, name: str) -> Verdict:
-    found = result(recorded, name)
-    assert isinstance(found, CheckResult)
-    return found.verdict
+    return checked(recorded, name).verdict
 
 
 def with_names(table: pa.Table, column: str, row: int, name: str) -> pa.Table:
@@ -77,7 +86,7 @@ def timely(table: pa.Table) -> pa.Table:
     return table.set_column(table.column_names.index("arrival_ns"), "arrival_ns", arrival_ns)
 
 
-def figures(check: CheckResult | NotExercised) -> dict:
+def figures(check: CheckResult | NotExercised) -> dict[str, Any]:
     """The figures of a check, without the rows that it shows."""
     assert isinstance(check, CheckResult)
     return {name: figure for name, figure in check.figures.items() if name != "rows"}
@@ -150,7 +159,7 @@ def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: Reco
 HEADER = "id,x_m,y_m,heading_rad"
 
 
-def four(folder: Path, program: str = "agents.beacon:main", **sections: dict) -> RecordedRun:
+def four(folder: Path, program: str = "agents.beacon:main", **sections: dict[str, Any]) -> RecordedRun:
     """Four vehicles on a line, a kilometre apart; with a range of 2.1 km the ends do not hear each other."""
     lines = [HEADER, *(f"v{number},{1000 * number},0,1.5" for number in range(4))]
     (folder / "four.csv").write_text("\n".join(lines) + "\n")

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
+from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -20,6 +20,7 @@ from emulator.radio.trace import read_trace
 from emulator.records.run_folder import RunFolder, read_events
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from tests.emulator.checks.test_judge import checked, result, verdict
 from vnet.errors import VnetError
 
 LOG_DISTANCE = {"kind": "log_distance", "tx_power_dbm": 33.0}
@@ -56,17 +57,6 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
 @pytest.fixture(scope="module")
 def faded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     return run(tmp_path_factory.mktemp("faded") / "run", fading={}, shadowing={}, mac={}, loss=0.1)
-
-
-def found(recorded: RecordedRun, name: str) -> CheckResult | NotExercised:
-    judgement = judge(recorded)
-    return next(check for check in [*judgement.checks, *judgement.not_exercised] if check.name == name)
-
-
-def verdict(recorded: RecordedRun, name: str) -> Verdict:
-    check = found(recorded, name)
-    assert isinstance(check, CheckResult), check
-    return check.verdict
 
 
 def changed(recorded: RecordedRun, change: Change) -> RecordedRun:
@@ -110,7 +100,7 @@ def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
 def test_without_a_medium_only_the_fading_is_judged(tmp_path: Path) -> None:
     recorded = run(tmp_path / "run", fading={})
     assert verdict(recorded, "fading") is Verdict.VALID
-    assert isinstance(found(recorded, "medium"), NotExercised)
+    assert isinstance(result(recorded, "medium"), NotExercised)
     judgement = judge(recorded)
     assert judgement.verdict is Verdict.VALID, judgement.checks
 
@@ -128,12 +118,12 @@ def test_without_fading_one_frame_beyond_the_threshold_is_one_too_many(shared: R
         columns["outcome"][hopeless] = "delivered"
         columns["arrival_ns"][hopeless] = columns["left_ns"][hopeless] + 2_500_000
 
-    broken = found(changed(shared, arrives), "fading")
+    broken = checked(changed(shared, arrives), "fading")
     assert broken.verdict is Verdict.INVALID
     assert broken.figures["impossible"] == 1
     assert broken.figures["rows"][0]["outcome"] == "delivered"
     certain = changed(shared, lambda columns, arrived: became(columns, arrived[0], "faded"))
-    assert found(certain, "fading").figures["impossible"] == 1
+    assert checked(certain, "fading").figures["impossible"] == 1
 
 
 def test_with_fading_any_pair_may_do_anything_once(faded: RecordedRun) -> None:
@@ -171,7 +161,7 @@ def test_a_collision_needs_somebody_to_collide_with(shared: RecordedRun) -> None
         for row in np.flatnonzero(shared.outcome_is("delivered")).tolist()
         if not ((began < left[row]) & (left > began[row]) & (shared.emission != shared.emission[row])).any()
     )
-    broken = found(changed(shared, lambda columns, _: became(columns, alone, "collided")), "medium")
+    broken = checked(changed(shared, lambda columns, _: became(columns, alone, "collided")), "medium")
     assert broken.verdict is Verdict.INVALID
     assert broken.figures["collided_alone"] == 1
 
@@ -188,7 +178,7 @@ def test_nobody_hears_while_it_sends(shared: RecordedRun) -> None:
         columns["outcome"][deaf] = "delivered"
         columns["arrival_ns"][deaf] = columns["left_ns"][deaf] + 2_500_000
 
-    assert found(changed(shared, hears), "medium").figures["heard_while_sending"] == 1
+    assert checked(changed(shared, hears), "medium").figures["heard_while_sending"] == 1
 
 
 def moved(recorded: RecordedRun, row: int, by_ns: int) -> RecordedRun:
@@ -216,7 +206,7 @@ def test_who_talks_while_another_is_heard_breaks_the_rules(shared: RecordedRun) 
     )
     second = np.roll(order, -1)[np.flatnonzero(order == first)[0]]
     early = moved(shared, second, int(shared.on_air_ns[first] + 20_000 - shared.on_air_ns[second]))
-    assert found(early, "medium").figures["into_others"] > 0
+    assert checked(early, "medium").figures["into_others"] > 0
 
 
 def test_a_sender_pauses_between_its_frames(shared: RecordedRun) -> None:
@@ -230,7 +220,7 @@ def test_a_sender_pauses_between_its_frames(shared: RecordedRun) -> None:
                 if name != "outcome" and columns[name][row] is not None:
                     columns[name][row] += by_ns
 
-    assert found(changed(shared, early), "medium").figures["without_pause"] == 1
+    assert checked(changed(shared, early), "medium").figures["without_pause"] == 1
 
 
 @pytest.mark.parametrize(
@@ -243,7 +233,7 @@ def test_frames_are_on_air_for_their_airtime_after_they_are_sent(
         row = int(arrived[5])
         columns[name][row] = None if by_ns is None else columns[name][row] + by_ns
 
-    assert found(changed(shared, change), "medium").figures["mistimed"] >= 1
+    assert checked(changed(shared, change), "medium").figures["mistimed"] >= 1
 
 
 def test_arrivals_are_held_to_the_end_of_the_transmission(shared: RecordedRun) -> None:
@@ -254,7 +244,7 @@ def test_arrivals_are_held_to_the_end_of_the_transmission(shared: RecordedRun) -
         for row in arrived.tolist():
             columns["arrival_ns"][row] -= 100_000
 
-    assert found(changed(shared, late), "latency").figures["late"] == 1
+    assert checked(changed(shared, late), "latency").figures["late"] == 1
     assert verdict(changed(shared, shifted), "latency") is Verdict.INVALID
 
 
@@ -262,7 +252,7 @@ def test_the_medium_is_busy_at_least_while_one_sends_oneself(shared: RecordedRun
     assert shared.busy is not None
     ratio = pc.multiply(shared.busy["busy_ratio"], 0.001)
     idle = shared.busy.set_column(2, "busy_ratio", ratio)
-    assert found(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
+    assert checked(replace(shared, busy=idle), "medium").figures["too_idle"] > 100
 
 
 def test_who_never_senses_others_sends_when_it_likes_and_is_busy_while_it_sends(tmp_path: Path) -> None:
@@ -283,7 +273,7 @@ def test_frames_held_back_too_briefly_are_seen(tmp_path: Path) -> None:
     data = held.scenario.model_dump()
     data["radio"]["congestion"]["pause_ms"] = (400,) * 5
     longer = replace(held, scenario=Scenario.model_validate(data))
-    assert found(longer, "medium").figures["without_pause"] > 10
+    assert checked(longer, "medium").figures["without_pause"] > 10
 
 
 def test_a_busy_table_that_cannot_be_read_is_said_in_one_line(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from emulator.stream.playback import messages
 from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import build_world, components
-from tests.emulator.checks.test_judge import result, run_scenario, verdict
+from tests.emulator.checks.test_judge import checked, result, run_scenario, verdict
 from tests.emulator.terminal.test_dashboard import row as row_of
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_together
@@ -162,7 +162,7 @@ def test_vehicles_enter_and_leave_with_their_programs(recorded: RecordedRun) -> 
         for node in (row["sender"], row["receiver"]):
             stays = TRAFFIC[node]
             assert any(start <= row["sent_ns"] / 1e9 < end + 0.2 for start, end, _ in stays), row
-    assert result(recorded, "presence").figures["changes"] == 4  # type: ignore[union-attr]
+    assert checked(recorded, "presence").figures["changes"] == 4
 
 
 def test_what_is_on_its_way_to_one_who_leaves_does_not_reach_it(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
     assert rows["optimized"]["position_rmse_m"] > 0
     for name in ("city_against_time.png", "city_errors.png"):
         assert (files / "out" / name).read_bytes().startswith(b"\x89PNG")
-    monkeypatch.setattr("emulator.cells.cells._run_all", lambda missing, *_: iter((missing and 1 / 0) or []))
+    monkeypatch.setattr("emulator.cells.cells._run_all", lambda missing, *_: iter([1 / 0] if missing else []))
     assert run_small(monkeypatch, files) == text, "what is finished is not run again"
 
 
@@ -74,12 +74,12 @@ def test_errors_are_those_of_the_place() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--trips", "trips.csv"], "--map is needed"),
-        (["--map", "cross.npz"], "--trips is needed"),
+        (["--trips", "trips.csv"], "--map is missing"),
+        (["--map", "cross.npz"], "--trips is missing"),
         (["--trips", "nowhere.csv", "--map", "cross.npz"], "--trips nowhere.csv: no such file"),
     ],
 )
-def test_trips_and_maps_come_together(
+def test_trips_and_maps_are_needed_together(
     files: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], said: str
 ) -> None:
     monkeypatch.chdir(files)

@@ -119,7 +119,7 @@ def test_no_factor_where_nothing_can_be_measured() -> None:
     assert measured_factor(np.full(100, np.nan)) is None
     assert measured_factor(np.full(100, 1e-12)) is None
     assert measured_factor(np.full(100, 0.5)) is None
-    assert measured_factor(0.1 ** np.arange(100)) is None, "five rounds are too few"
+    assert measured_factor(0.1 ** np.arange(100.0)) is None, "five rounds are too few"
 
 
 def test_the_linear_model_is_what_random_inputs_come_to() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from emulator.experiments import figures, reports
+from emulator.experiments import network_figures, reports, result_figures
 from emulator.experiments.paper import ALPHAS, NETWORKS, load_positions
 from emulator.experiments.tables import with_error
 
@@ -23,7 +23,9 @@ def is_picture(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("networks", [NETWORK, LONELY])
-@pytest.mark.parametrize("draw", [figures.degree_histogram, figures.road_angle_histogram, figures.graphs])
+@pytest.mark.parametrize(
+    "draw", [network_figures.degree_histogram, network_figures.road_angle_histogram, network_figures.graphs]
+)
 def test_networks_are_drawn_also_without_edges(tmp_path: Path, draw, networks) -> None:  # type: ignore[no-untyped-def]
     assert is_picture(draw(networks, tmp_path / "picture"))
 
@@ -43,11 +45,13 @@ def series(seed: int, missing: bool = False) -> pa.Table:
 @pytest.mark.parametrize("seeds", [1, 3])
 def test_time_courses_are_drawn_for_one_seed_or_many(tmp_path: Path, seeds: int) -> None:
     found = {name: [series(s, missing=name == "none") for s in range(seeds)] for name in ("optimized", "none")}
-    assert is_picture(figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72}))
+    assert is_picture(
+        result_figures.against_time(found, tmp_path / "course", "N2", {"the paper's optimized": 0.72})
+    )
 
 
 def table1_results() -> list[dict[str, object]]:
-    rows = []
+    rows: list[dict[str, object]] = []
     for name in ("optimized", *(f"{alpha:g}" for alpha in ALPHAS)):
         value = 0.1 if name == "optimized" else 0.2 + (float(name) - 0.48) ** 2
         for seed in (1, 2):
@@ -61,7 +65,7 @@ def test_table_one_says_where_the_minimum_is_and_how_far_below_optimized_weights
     text = reports.table1(table1_results())
     assert "smallest at α = 0.5 and largest at α = 0.95" in text
     assert "0.50 ± 0.00 times that of the best constant" in text
-    assert is_picture(figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
+    assert is_picture(result_figures.alpha_curve(table1_results(), reports.PAPER_TABLE1, tmp_path / "table1"))
 
 
 def test_one_seed_has_no_standard_error(tmp_path: Path) -> None:
@@ -89,4 +93,4 @@ def test_ratios_to_the_limit_are_drawn(tmp_path: Path) -> None:
         for m, value in {"limit": 0.2, "optimized": 0.21, "none": 0.5}.items()
         for s in (1, 2)
     ]
-    assert is_picture(figures.ratio_bars(rows, tmp_path / "ratios"))
+    assert is_picture(result_figures.ratio_bars(rows, tmp_path / "ratios"))

@@ -72,7 +72,8 @@ def blocks(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def options(data: bytes) -> dict[int, bytes]:
-    found, place = {}, 0
+    found: dict[int, bytes] = {}
+    place = 0
     while True:
         code, length = struct.unpack_from("<HH", data, place)
         if code == 0:

@@ -127,7 +127,7 @@ def test_the_cap_is_the_nearest_live_senders_and_ties_go_to_the_lower_number(
     ]
     for receiver in range(count):
         live = [s for s in range(count) if s != receiver and s not in down and squared(s, receiver) <= reach**2]
-        nearest = sorted(live, key=lambda s, r=receiver: (squared(s, r), s))[:cap]
+        nearest = [s for _, s in sorted((squared(s, receiver), s) for s in live)][:cap]
         assert [s for s in range(count) if admitted[s][receiver]] == sorted(nearest)
 
 

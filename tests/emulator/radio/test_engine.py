@@ -2,6 +2,7 @@
 
 import tracemalloc
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def engine(position_m: np.ndarray, seed: int = 1, links: np.ndarray | None = Non
     return Engine(ids, Radio.model_validate(radio), seed, position_m, links)
 
 
-def rows(of: Engine) -> list[dict]:
+def rows(of: Engine) -> list[dict[str, Any]]:
     return of.trace.to_table().to_pylist()
 
 
@@ -116,7 +117,7 @@ def test_oversize_and_a_full_queue_are_outcomes_of_their_own() -> None:
 
 
 def run_all(subject: Engine, order: list[int], steps: int) -> list[Delivery]:
-    deliveries = []
+    deliveries: list[Delivery] = []
     for period in range(4):
         for node in order:
             subject.transmit(period * PERIOD_NS, node, [bytes([node, period])])
@@ -248,7 +249,7 @@ def test_any_matrix_decides_who_hears_whom(count: int, seed: int) -> None:
 
 @pytest.mark.parametrize("change", ["payload", "time", "loss"])
 def test_the_hash_sees_every_change(change: str) -> None:
-    def digest(**changes: object) -> str:
+    def digest(**changes: Any) -> str:
         subject = engine(np.zeros((3, 2)), loss=changes.get("loss", 0.0))
         subject.transmit(changes.get("time", 0), 0, [changes.get("payload", b"x")])
         subject.drain()

@@ -13,10 +13,11 @@ from scipy.integrate import quad
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.radio.congestion import SLICE_NS, WINDOW_NS, BusyRatioMeter, LimericControl, ReactiveControl
+from emulator.radio.congestion import BusyRatioMeter, LimericControl, ReactiveControl
 from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.dot11p import COST_STEPS, airtime_ns, arrival_probability, cost
 from emulator.radio.engine import Engine
+from emulator.radio.medium import SLICE_NS, WINDOW_NS
 from emulator.radio.outcomes import Outcome
 from emulator.radio.propagation import QUANTILES, MeanPower, Nakagami, ShadowField, loss_db
 from emulator.radio.signals import reception_draws
@@ -233,7 +234,12 @@ def test_even_the_longest_frame_without_any_signal_has_a_cost_that_can_be_told(r
 
 
 def test_the_longest_frames_destroy_each_other_between_hidden_terminals() -> None:
-    radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 3.0, "max_payload_bytes": 65_000}
+    radio: dict[str, Any] = {
+        "path_loss": {"kind": "log_distance"},
+        "mac": {},
+        "bitrate_mbps": 3.0,
+        "max_payload_bytes": 65_000,
+    }
     subject = engine(line(0, 450, 900), **radio)
     subject.transmit(0, 0, [bytes(65_000)])
     subject.transmit(50_000, 2, [bytes(65_000)])
@@ -304,7 +310,7 @@ def test_without_fading_the_threshold_is_a_circle() -> None:
 
 def test_the_noise_decides_where_it_is_loud() -> None:
     """With 20 dB more noise half of all frames arrive at -71.03 dBm: after 144 m, and at 27 Mbit/s after 24 m."""
-    loud = {"path_loss": {"kind": "log_distance"}, "receiver": {"noise_dbm": -84.0}}
+    loud: dict[str, Any] = {"path_loss": {"kind": "log_distance"}, "receiver": {"noise_dbm": -84.0}}
     subject = engine(line(0, 120, 144, 170), **loud)
     fast = engine(line(0, 20, 40, 80), **loud, bitrate_mbps=27.0)
     for one in (subject, fast):
@@ -467,7 +473,12 @@ def test_limerics_pause_is_the_airtime_over_the_share_within_bounds() -> None:
 def test_a_congested_channel_thins_out_what_is_sent() -> None:
     """Sixty vehicles, a frame of 1 000 bytes every 50 ms each: two thirds more than there is room for."""
     position_m = np.random.default_rng(3).uniform(0, 200, (60, 2))
-    physical = {"path_loss": {"kind": "log_distance"}, "mac": {}, "max_peers": 100, "queue_frames": 8}
+    physical: dict[str, Any] = {
+        "path_loss": {"kind": "log_distance"},
+        "mac": {},
+        "max_peers": 100,
+        "queue_frames": 8,
+    }
 
     def run(**congestion: Any) -> tuple[float, float, Engine]:
         subject = engine(position_m, **physical, **congestion)

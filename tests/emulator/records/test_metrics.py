@@ -14,6 +14,7 @@ from emulator.stream.messages import beliefs_of, pack
 from emulator.world.world import Instant
 from vnet.node import Report
 
+Values = dict[str, float | list[float]]
 POSITION_M = np.array([[0.0, 0.0], [10.0, 0.0]])
 INSTANT = Instant(0, 0, POSITION_M, np.zeros(2), np.zeros(2), POSITION_M, np.zeros(2))
 
@@ -23,7 +24,9 @@ def metrics() -> Metrics:
 
 
 @pytest.mark.parametrize("covariance", [(-1.0, 0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, -1.0)])
-def test_a_covariance_that_is_not_positive_definite_takes_no_part_in_the_anees(covariance: tuple) -> None:
+def test_a_covariance_that_is_not_positive_definite_takes_no_part_in_the_anees(
+    covariance: tuple[float, float, float, float],
+) -> None:
     honest = Report(0, "a", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0))
     broken = Report(0, "b", (0.0, 0.0), covariance)
     assert metrics().record(INSTANT, [broken]).position_anees is None
@@ -31,7 +34,7 @@ def test_a_covariance_that_is_not_positive_definite_takes_no_part_in_the_anees(c
 
 
 @pytest.mark.parametrize("cloud", [1.0, [1.0], [1.0, 2.0, 3.0]])
-def test_a_cloud_that_is_not_made_of_points_is_not_shown(cloud: object) -> None:
+def test_a_cloud_that_is_not_made_of_points_is_not_shown(cloud: float | list[float]) -> None:
     reports = [Report(0, "a", None, None, {"cloud_m": cloud}), Report(0, "b", None, None, {"cloud_m": [1.0, 2.0]})]
     assert beliefs_of({"a": 0, "b": 1}, reports).clouds == {"b": [1.0, 2.0]}
 
@@ -91,14 +94,14 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
         "reporting": count,
         "common_error_rmse_m": rms(common - truth),
         "deviation_m": rms(common - common.mean(axis=0)),
-        "bias_m": rms([common.mean(axis=0) - truth]),
+        "bias_m": rms(np.array([common.mean(axis=0) - truth])),
         "stacked_rmse_m": rms(stacked - truth),
         "stacked_deviation_m": rms(stacked - stacked.mean(axis=0)),
         "component_rmse_m": [rms(group - truth) for group in groups],
         "component_deviation_m": [rms(group - group.mean(axis=0)) for group in groups],
         "position_rmse_m": rms(estimate - position),
         "fix_rmse_m": rms(fix - position),
-        "consensus_error_m": rms([mean[n] - means[component[n]] for n in range(count)]),
+        "consensus_error_m": rms(np.array([mean[n] - means[component[n]] for n in range(count)])),
         "common_error_anees": anees(common - truth, common_covariance),
         "position_anees": anees(estimate - position, covariance),
         "not_finite": 0,
@@ -141,9 +144,12 @@ def test_the_last_report_of_a_period_counts_and_earlier_ones_are_still_looked_at
 def test_a_number_that_is_none_is_counted_wherever_it_stands_and_spoils_no_other(number: float, place: str) -> None:
     estimate = (number, 0.0) if place == "estimate" else (10.0, 0.0)
     covariance = (1.0, 0.0, 0.0, number) if place == "covariance" else None
-    values: dict = {"value": {"x": number}, "list": {"x": [0.0, number]}}.get(place, {})
-    if place == "common_error_m":
-        values = {place: [0.0, number]}
+    wrong: dict[str, Values] = {
+        "value": {"x": number},
+        "list": {"x": [0.0, number]},
+        "common_error_m": {"common_error_m": [0.0, number]},
+    }
+    values = wrong.get(place, {})
     honest = Report(0, "a", (0.0, 3.0), (1.0, 0.0, 0.0, 1.0), {"common_error_m": [0.0, 2.0]})
     kept = metrics()
     figures = kept.record(INSTANT, [honest, Report(0, "b", estimate, covariance, values)])
@@ -155,7 +161,13 @@ def test_a_number_that_is_none_is_counted_wherever_it_stands_and_spoils_no_other
 
 
 def test_a_value_of_the_wrong_size_is_left_out() -> None:
-    odd = {"common_error_m": [1.0, 2.0, 3.0], "mean_m": 4.0, "cloud_m": 5.0, "heard": 6.0, "weights": [0.5, 0.5]}
+    odd: Values = {
+        "common_error_m": [1.0, 2.0, 3.0],
+        "mean_m": 4.0,
+        "cloud_m": 5.0,
+        "heard": 6.0,
+        "weights": [0.5, 0.5],
+    }
     kept = metrics()
     figures = kept.record(INSTANT, [Report(0, "b", None, None, odd)])
     assert figures.common_error_rmse_m is figures.consensus_error_m is None
@@ -167,7 +179,7 @@ def test_a_value_of_the_wrong_size_is_left_out() -> None:
 def test_the_tables_come_back_from_their_files(tmp_path: Path) -> None:
     kept = metrics()
     kept.record(INSTANT, [])
-    values = {"common_error_m": [1.0, 2.0], "cloud_m": [1.0, 2.0, 3.0, 4.0], "heard": 1.0}
+    values: Values = {"common_error_m": [1.0, 2.0], "cloud_m": [1.0, 2.0, 3.0, 4.0], "heard": 1.0}
     kept.record(instant(POSITION_M, np.ones(2), POSITION_M, 1), [Report(0, "b", (1.0, 1.0), None, values)])
     for name, table in (("states", kept.states_table()), ("metrics", kept.metrics_table())):
         pq.write_table(table, tmp_path / name)

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -127,7 +128,7 @@ def test_too_much_loss_is_found(recorded: RecordedRun) -> None:
     ],
 )
 def test_events_decide_their_checks(
-    recorded: RecordedRun, kind: str, details: dict, check: str, verdict: Verdict
+    recorded: RecordedRun, kind: str, details: dict[str, Any], check: str, verdict: Verdict
 ) -> None:
     event = Event(1_999_000_000, kind, "v01", details)
     assert verdicts(recorded, events=[*recorded.events, event])[check] is verdict

@@ -1,6 +1,8 @@
 """A run's folder is made once, for one run, and says in one line why it cannot be."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -99,7 +101,11 @@ def test_a_place_below_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_a_folder_that_goes_away_during_the_run_is_one_line(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", Scenario())
     folder.path.rename(tmp_path / "elsewhere")
-    for write in (lambda: folder.event(1, "died", "v01"), lambda: folder.put_json("verdict.json", {})):
+    writers: list[Callable[[], object]] = [
+        lambda: folder.event(1, "died", "v01"),
+        lambda: folder.put_json("verdict.json", {}),
+    ]
+    for write in writers:
         with pytest.raises(VnetError, match="cannot write") as refused:
             write()
         assert "\n" not in str(refused.value)
@@ -123,7 +129,7 @@ event_list = st.lists(
 @settings(max_examples=25, deadline=None)
 @given(event_list, st.data())
 def test_events_up_to_the_cut_survive_a_cut_anywhere(
-    tmp_path_factory: pytest.TempPathFactory, events: list[tuple], data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory, events: list[tuple[Any, ...]], data: st.DataObject
 ) -> None:
     folder = RunFolder.create(tmp_path_factory.mktemp("events") / "run", Scenario())
     for time_ns, kind, node, details in events:

@@ -116,8 +116,10 @@ def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
     page = page_of(run)
     assert "busy ratio (%)" in page.text and "expected: " not in page.text
     figures = radio_metrics(read_recorded_run(run))
-    assert f"delivered {100 * figures.totals['delivery_ratio']:.1f} %" in page.text
-    assert f"busy ratio {100 * figures.totals['busy_ratio_mean']:.1f} %" in page.text
+    delivered, busy = figures.totals["delivery_ratio"], figures.totals["busy_ratio_mean"]
+    assert delivered is not None and busy is not None
+    assert f"delivered {100 * delivered:.1f} %" in page.text
+    assert f"busy ratio {100 * busy:.1f} %" in page.text
     assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text
     worst = figures.worst_links(1).to_pylist()[0]
     assert f"{worst['sender']} {worst['receiver']} {worst['pairs']}" in page.text

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import BaseModel
 
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
@@ -57,8 +58,9 @@ def plan(written: list[dict[str, Any]], together: int = 1, duration_s: float = 3
 
 
 def test_the_kinds_are_those_of_the_module() -> None:
-    models = [m for m in vars(faults).values() if isinstance(m, type) and "kind" in getattr(m, "model_fields", {})]
-    assert sorted(KINDS) == sorted(get_args(m.model_fields["kind"].annotation)[0] for m in models)
+    models = [m for m in vars(faults).values() if isinstance(m, type) and issubclass(m, BaseModel)]
+    kinds = [get_args(m.model_fields["kind"].annotation)[0] for m in models if "kind" in m.model_fields]
+    assert sorted(KINDS) == sorted(kinds)
     assert len(KINDS) >= 29
 
 
@@ -277,4 +279,4 @@ def test_no_fault_is_healed_that_is_not_there() -> None:
 def test_a_fault_cannot_be_changed() -> None:
     fault: Fault = parse_fault(minimal("loss"))
     with pytest.raises(ValueError, match="frozen"):
-        fault.at_s = 3.0
+        setattr(fault, "at_s", 3.0)  # noqa: B010 - a type checker refuses the plain assignment

@@ -178,7 +178,7 @@ def test_every_row_of_the_trace_is_told_once(watched: Watched) -> None:
             (r["sender"], r["seq"], r["copy"]): r["size_bytes"] for r in rows if start_ns <= r["sent_ns"] < end_ns
         }
         assert unpack(message["sent_bytes"]).sum() == sum(sent.values())
-        ages_ms = {}
+        ages_ms: dict[tuple[str, str], float] = {}
         for row in delivered:
             link = row["sender"], row["receiver"]
             ages_ms[link] = min(ages_ms.get(link, np.inf), (end_ns - row["sent_ns"]) / 1e6)

@@ -3,6 +3,7 @@
 import io
 import math
 from dataclasses import replace
+from typing import Any, Literal
 
 import pytest
 from rich.console import Console
@@ -27,7 +28,7 @@ EVENTS = (
 )
 
 
-def make(**changes: object) -> Snapshot:
+def make(**changes: Any) -> Snapshot:
     """Twelve vehicles after ten of twenty seconds."""
     falling = tuple(5.0 * 0.9**n for n in range(BINS // 2))
     shot = Snapshot(
@@ -60,7 +61,10 @@ def make(**changes: object) -> Snapshot:
 
 
 def render(
-    dashboard: Dashboard, width: int = 100, height: int = 30, color_system: str | None = "truecolor"
+    dashboard: Dashboard,
+    width: int = 100,
+    height: int = 30,
+    color_system: Literal["truecolor"] | None = "truecolor",
 ) -> Console:
     console = Console(
         record=True,
@@ -73,6 +77,11 @@ def render(
     )
     console.print(dashboard, end="")
     return console
+
+
+def written(console: Console) -> str:
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
 
 
 def rows(shot: Snapshot, width: int = 100, height: int = 30) -> list[str]:
@@ -218,10 +227,10 @@ def test_the_headline_says_how_fast_it_is_or_that_it_stands(
 
 
 def test_colours_and_none() -> None:
-    output = render(Dashboard(make())).file.getvalue()
+    output = written(render(Dashboard(make())))
     assert "\x1b[1;38;2;213;94;0mv04 died: SIGKILL\x1b[0m" in output, "what is bad is red"
     assert "\x1b[1;38;2;213;94;0m  1 down: \x1b[0m" in output
-    plain = render(Dashboard(make()), color_system=None).file.getvalue()
+    plain = written(render(Dashboard(make()), color_system=None))
     assert "\x1b" not in plain
     (bar,) = [line for line in plain.splitlines() if line.startswith("frames")]
     assert bar.split()[1] == "█" * 28 + "▒" * 13 + "▤" * 5, "signs tell outcomes apart"

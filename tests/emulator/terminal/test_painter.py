@@ -33,7 +33,7 @@ class Terminal(io.StringIO):
 
     def resize(self, width: int, height: int) -> None:
         self.screen.resize(width, height)
-        self.console.size = (width, height)  # type: ignore[assignment]
+        self.console.size = (width, height)
 
 
 class Pictures:

@@ -7,8 +7,10 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Future
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -33,7 +35,7 @@ def planted(program: str) -> Scenario:
     )
 
 
-def results_of(folder: Path) -> list[dict]:
+def results_of(folder: Path) -> list[dict[str, Any]]:
     return json.loads((folder / "campaign.json").read_text())["results"]
 
 
@@ -93,7 +95,7 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(futures: list) -> Iterator:
+    def interrupted(futures: list[Future[Any]]) -> Iterator[Future[Any]]:
         futures[0].result()
         yield futures[0]
         signal.raise_signal(signal.SIGTERM)
@@ -152,7 +154,7 @@ class Reader(HTMLParser):
 
     inside = False
 
-    def handle_starttag(self, tag: str, attributes: list) -> None:
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
         if tag in ("script", "link", "img", "iframe") or any("//" in (value or "") for _, value in attributes):
             self.foreign.append(tag)
         if tag == "td":

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ def run_tests(pytester: pytest.Pytester, code: str, *options: str) -> pytest.Run
     return pytester.runpytest(*options)
 
 
-def verdict_of(folder: Path) -> dict:
+def verdict_of(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "verdict.json").read_text())
 
 

@@ -111,7 +111,8 @@ def test_there_is_one_recording_with_a_blueprint(path: Path) -> None:
 
 def test_the_blueprint_has_three_tabs_and_shows_whatever_there_is(path: Path, entities: dict[str, Entity]) -> None:
     reader = RrdReader(str(path))
-    names, origins = [], []
+    names: list[str] = []
+    origins: list[str] = []
     for chunk in reader.stream(store=reader.blueprints()[0]):
         batch = chunk.to_record_batch()
         for found, column in ((names, "ContainerBlueprint:display_name"), (origins, "ViewBlueprint:space_origin")):
@@ -274,8 +275,8 @@ def test_the_weights_are_those_that_were_reported(told: Told, entities: dict[str
 def test_the_links_of_the_radio_are_shares_of_what_was_tried(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/links"].at["Tensor:data"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
-    tried = sum(period.counts()[0] for period in before)
-    delivered = sum(period.counts()[1] for period in before)
+    tried = np.sum([period.counts()[0] for period in before], axis=0)
+    delivered = np.sum([period.counts()[1] for period in before], axis=0)
     tensor = entities["/radio/links"].at["Tensor:data"][times[-1]][0]
     assert tensor["names"] == ["receiver", "sender"]
     share = np.divide(delivered, tried, out=np.full((6, 6), np.nan), where=tried > 0)
@@ -312,7 +313,7 @@ def test_ages_and_times_between_receptions_are_those_of_the_messages(
             assert drawn[period.time_s][2] == pytest.approx(np.mean(gaps_ms), rel=1e-4)
         if period.time_s in bars:
             heard = [[age for (_, at), age in ages_ms.items() if at == node] for node in range(6)]
-            wanted_ms = [np.mean(some) if some else 0.0 for some in heard]
+            wanted_ms = [float(np.mean(some)) if some else 0.0 for some in heard]
             np.testing.assert_allclose(_numbers(bars[period.time_s][0]), wanted_ms, rtol=1e-4)
     assert len(gaps_ms) > 100 and min(gaps_ms) < 150 < max(gaps_ms)
 
@@ -320,7 +321,8 @@ def test_ages_and_times_between_receptions_are_those_of_the_messages(
 def test_latencies_and_loads_are_those_of_the_messages(told: Told, entities: dict[str, Entity]) -> None:
     times = list(entities["/radio/latency"].at["BarChart:values"])
     before = [period for period in periods(told) if period.time_s <= times[-1]]
-    histogram = sum(np.frombuffer(period.message["latency_counts"], dtype="<i4") for period in before)
+    counts = [np.frombuffer(period.message["latency_counts"], dtype="<i4") for period in before]
+    histogram = np.sum(counts, axis=0)
     drawn = _numbers(entities["/radio/latency"].at["BarChart:values"][times[-1]][0])
     np.testing.assert_array_equal(drawn, histogram[: len(drawn)])
     assert histogram[len(drawn) :].sum() == 0
@@ -423,7 +425,7 @@ def test_delivery_by_distance() -> None:
     ],
 )
 def test_the_papers_value_only_where_it_applies(
-    network: dict, program: dict, found: tuple[str, float] | None
+    network: dict[str, Any], program: dict[str, Any], found: tuple[str, float] | None
 ) -> None:
     import tomli_w
 

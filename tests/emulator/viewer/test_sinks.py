@@ -25,10 +25,10 @@ from emulator.viewer.sinks import (
     Sinks,
     choose_sinks,
     is_closed,
-    mend,
-    mending_command,
     open_recording,
     place_to_serve,
+    repair,
+    repair_command,
     viewer_command,
 )
 from emulator.viewer.watch import Inbox, _record_all, _Taker
@@ -129,7 +129,7 @@ def test_a_vehicle_that_is_not_there_is_said_before_anything_has_started(tmp_pat
     scenario.write_text("")
     arguments = ["--out", str(tmp_path / "run"), "--rerun", "save", "--rerun-vehicle", "v99"]
     result = CliRunner().invoke(app, ["run", str(scenario), *arguments])
-    assert (result.exit_code, result.output) == (2, "vnet: --rerun-vehicle v99: no vehicle is called so\n")
+    assert (result.exit_code, result.output) == (2, "vnet: --rerun-vehicle v99: no such vehicle\n")
     assert not (tmp_path / "run").exists()
 
 
@@ -238,20 +238,20 @@ with open_recording(Sinks(Path(sys.argv[1])), "killed") as recording:
 """
 
 
-def test_a_recording_whose_writer_was_killed_can_be_read_and_mended(tmp_path: Path) -> None:
+def test_a_recording_whose_writer_was_killed_can_be_read_and_repaired(tmp_path: Path) -> None:
     path = tmp_path / "torn.rrd"
     done = subprocess.run([sys.executable, "-c", KILLED, str(path)], cwd=ROOT)
     assert done.returncode == -9
     assert not is_closed(path)
     with path.open("r+b") as file:
         file.truncate(path.stat().st_size - 7)  # a write that was cut short
-    program, *arguments = mending_command(path).split()
+    program, *arguments = repair_command(path).split()
     assert program == "rerun"
     assert rrd(*arguments[1:]).returncode == 0
-    mended = path.with_name("torn-mended.rrd")
-    assert is_closed(mended)
-    assert rrd("verify", str(mended)).returncode == 0
-    assert len(_numbers(mended)) >= 180
+    repaired = path.with_name("torn-repaired.rrd")
+    assert is_closed(repaired)
+    assert rrd("verify", str(repaired)).returncode == 0
+    assert len(_numbers(repaired)) >= 180
 
 
 @pytest.mark.parametrize("left", [20, 100, 150, 600, 1400])
@@ -262,8 +262,8 @@ def test_a_recording_of_nothing_but_its_name_is_not_shown(tmp_path: Path, left: 
     assert path.stat().st_size > 3000
     with path.open("r+b") as file:
         file.truncate(left)
-    with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} makes it anew"):
-        mend(path)
+    with pytest.raises(VnetError, match=f"nothing in it: vnet render {tmp_path} rebuilds it"):
+        repair(path)
     assert list(tmp_path.iterdir()) == [path]
 
 

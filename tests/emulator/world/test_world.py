@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,19 +13,20 @@ from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.world.world import World, build_world, components
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
+from vnet.roads.lanes import LaneMap
 
 HALF_WIDTH_M = 0.85
 
 
-def scenario(**sections: dict) -> Scenario:
+def scenario(**sections: dict[str, Any]) -> Scenario:
     return Scenario.model_validate({"network": {"vehicles": 10}, **sections})
 
 
 def lateral_m(world: World) -> np.ndarray:
     """(K, N): signed offsets of all vehicles from their lanes' centre lines, from the truth alone."""
-    return np.array(
-        [world.lane_map.signed_offset_m(world.at(k).position_m, world.lane_of) for k in range(world.periods)]
-    )
+    lanes = world.lane_map
+    assert isinstance(lanes, LaneMap)
+    return np.array([lanes.signed_offset_m(world.at(k).position_m, world.lane_of) for k in range(world.periods)])
 
 
 def correlation(series: np.ndarray, lag: int) -> float:
@@ -167,7 +169,7 @@ def test_vehicles_stand_on_their_lanes_but_for_the_offset() -> None:
 # Streams.
 
 
-def from_rows(folder: Path, count: int, **sections: dict) -> World:
+def from_rows(folder: Path, count: int, **sections: dict[str, Any]) -> World:
     """A world of the first `count` of six vehicles, from a file."""
     rows = [f"v{i},{i * 100},0,0.5" for i in range(6)]
     path = folder / f"{count}.csv"

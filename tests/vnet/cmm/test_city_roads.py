@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
+from vnet.cmm.fusion import condition_on
 from vnet.cmm.map_matching import MOST_LANES, OFF_ROAD_WITHIN_M, CityRoads
 from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.roads.road_map import RoadMap
@@ -76,7 +77,7 @@ def test_hypotheses_add_up(offsets: list[float], sigma_m: float, map_sigma_m: fl
     y = np.array(offsets)
     position = np.stack([np.zeros_like(y), y])[None].repeat(3, axis=0)
     covariance = np.tile(np.eye(2) * sigma_m**2, (3, 1, 1))
-    found = CityRoads(roads, off_road).log_road(position, covariance, np.zeros(3, np.intp), np.arange(3), 1)
+    found = CityRoads(roads, off_road).log_likelihood(position, covariance, np.zeros(3, np.intp), np.arange(3), 1)
     s = np.hypot(sigma_m, map_sigma_m)
     on = sum(ndtr((0.85 - (y - 3.5 * k)) / s) - ndtr((-0.85 - (y - 3.5 * k)) / s) for k in range(3))
     off = off_road / (1 - off_road) * 3 * 0.85 / OFF_ROAD_WITHIN_M
@@ -86,7 +87,7 @@ def test_hypotheses_add_up(offsets: list[float], sigma_m: float, map_sigma_m: fl
 def test_who_has_no_candidate_scores_nothing() -> None:
     matcher = CityRoads(CROSSING, 0.05)
     position = np.zeros((1, 2, 4))
-    found = matcher.log_road(position, np.eye(2)[None], np.array([1]), np.array([0]), 3)
+    found = matcher.log_likelihood(position, np.eye(2)[None], np.array([1]), np.array([0]), 3)
     assert found.shape == (3, 4)
     assert np.array_equal(found[[0, 2]], np.zeros((2, 4)))
     assert (found[1] < 0).all()
@@ -215,8 +216,8 @@ def test_hypotheses_of_others_pay_for_a_road_that_was_left_as_ones_own_do() -> N
     turning = Observation(course[-1] + [1.2, 0.0] + COMMON_M, np.eye(2), float(np.pi / 4))
     for _ in range(4):
         rbpf.step(0.1, {"v0": turning})
-    assert not len(rbpf._lane), "no lane points north-east"
-    own = rbpf.own_log_road[0]
+    assert not len(rbpf.tracks.candidate_lane), "no lane points north-east"
+    own = rbpf.tracks.map_log_likelihood[0]
     assert own @ rbpf.weight < -0.05
-    _, _, log_road = rbpf.condition_on(rbpf.sample(200))
+    log_road = condition_on(rbpf, rbpf.sample(200), np.random.default_rng(0)).map_log_likelihood
     assert log_road[0].mean() == pytest.approx(own @ rbpf.weight, abs=0.3)

@@ -54,8 +54,8 @@ class Net:
         total = sum((node.mass for node in self.nodes.values()), np.zeros(3))
         for i, node in self.nodes.items():
             share = self.said[i]
-            for taker in share.out_neighbours:
-                seen = self.nodes[int(taker[1:])]._seen.get(f"n{i:02d}", 0.0)
+            for receiver in share.out_neighbours:
+                seen = self.nodes[int(receiver[1:])]._seen.get(f"n{i:02d}", 0.0)
                 total = total + np.array(share.running_sum) - seen
             assert node.epoch == share.epoch
         return total
@@ -277,7 +277,9 @@ def test_false_sums_are_not_taken_and_who_says_them_is_left_out() -> None:
 
     net, rejected = deceived(8, lie)
     agreed_without_the_first(net)
-    assert all(set(counts) == {"sums", "exile"} and counts["sums"] <= 4 for counts in rejected[1:])
+    assert all(
+        set(counts) == {"implausible_mass", "banned"} and counts["implausible_mass"] <= 4 for counts in rejected[1:]
+    )
 
 
 def test_a_peer_that_starts_epoch_after_epoch_is_left_out_and_not_those_who_took_them_over() -> None:
@@ -286,7 +288,7 @@ def test_a_peer_that_starts_epoch_after_epoch_is_left_out_and_not_those_who_took
 
     net, rejected = deceived(6, lie, lambda _, j, i: abs(i - j) <= 2)
     agreed_without_the_first(net)
-    assert all(set(counts) == {"exile"} for counts in rejected[1:3])
+    assert all(set(counts) == {"banned"} for counts in rejected[1:3])
     assert max(net.epochs()) <= 20, "a burst, and then one in 100 rounds"
 
 
@@ -296,7 +298,7 @@ def test_an_average_is_not_drawn_to_a_state_beyond_the_gate() -> None:
     for _ in range(20):
         node.round(np.zeros(2), {"b": Share(0, (50.0, 0.0, 2.0), frozenset("a"), frozenset("a"))})
     assert node.mean_m == pytest.approx([0.0, 0.0])
-    assert rejected == {"sums": 20}
+    assert rejected == {"implausible_mass": 20}
 
 
 @pytest.mark.parametrize("alive_rounds", [20, 80])

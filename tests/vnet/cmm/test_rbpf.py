@@ -1,10 +1,11 @@
 """The filter against textbook filters and closed forms."""
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from vnet.cmm.map_matching import log_on_lane
-from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig, systematic
+from vnet.cmm.rbpf import REST_SPEED_M_S, Observation, Rbpf, RbpfConfig
 from vnet.errors import VnetError
 from vnet.roads.lanes import LaneMap
 
@@ -12,7 +13,7 @@ DT_S = 0.1
 NOWHERE = LaneMap(np.empty((0, 2)), np.empty(0), 0.85)
 
 
-def observation(position: np.ndarray, heading: float = 0.3) -> Observation:
+def observation(position: npt.ArrayLike, heading: float = 0.3) -> Observation:
     return Observation(np.asarray(position, dtype=float), np.eye(2), heading)
 
 
@@ -74,8 +75,8 @@ def test_one_gain_serves_all_particles() -> None:
     rng = np.random.default_rng(2)
     for _ in range(10):
         rbpf.step(DT_S, {"v": observation(rng.normal(size=2)), "w": observation(rng.normal(size=2), 1.2)})
-    assert rbpf.mean.shape == (2, 4, 50)
-    assert rbpf.covariance.shape == (2, 4, 4)
+    assert rbpf.tracks.mean.shape == (2, 4, 50)
+    assert rbpf.tracks.covariance.shape == (2, 4, 4)
 
 
 def test_an_outlier_is_left_out() -> None:
@@ -94,22 +95,26 @@ def test_a_fix_that_is_far_off_may_be_explained_by_an_uncertain_common_error(spr
     rbpf = known_error((0.0, 0.0), particles=100)
     rbpf.step(DT_S, {"v": observation([0.0, 0.0])})
     rbpf.common_m[:] = spread_m * np.random.default_rng(2).standard_normal(rbpf.common_m.shape)
-    before = rbpf.covariance.copy()
+    before = rbpf.tracks.covariance.copy()
     rbpf.step(DT_S, {"v": observation([10.0, 0.0])})
-    assert (np.trace(rbpf.covariance[0, :2, :2]) < np.trace(before[0, :2, :2])) == taken
+    assert (np.trace(rbpf.tracks.covariance[0, :2, :2]) < np.trace(before[0, :2, :2])) == taken
 
 
 def test_vehicles_on_no_lane_on_one_and_between_two_are_weighed_each_by_its_own() -> None:
     lanes = LaneMap(np.array([[0.0, 0.0], [0.0, 3.5], [900.0, 0.0]]), np.array([0.0, 0.0, np.pi / 2]), 0.85)
     rbpf = Rbpf(RbpfConfig(particles=50), lanes, np.random.default_rng(1))
-    places = {"a": ([0.0, 1.75], 0.0), "b": ([500.0, 500.0], 0.0), "c": ([900.0, 9.0], np.pi / 2)}
+    places: dict[str, tuple[list[float], float]] = {
+        "a": ([0.0, 1.75], 0.0),
+        "b": ([500.0, 500.0], 0.0),
+        "c": ([900.0, 9.0], np.pi / 2),
+    }
     rbpf.step(DT_S, {name: observation(place, heading) for name, (place, heading) in places.items()})
-    across = np.sqrt(rbpf.covariance[:, 0, 0])[:, None]
-    two = [log_on_lane(rbpf.mean[:1, 1] - north, across[:1], 0.85) for north in (0.0, 3.5)]
-    one = log_on_lane(rbpf.mean[2:, 0] - 900.0, across[2:], 0.85)
-    score = rbpf.log_road(rbpf.mean, rbpf.covariance)
+    across = np.sqrt(rbpf.tracks.covariance[:, 0, 0])[:, None]
+    two = [log_on_lane(rbpf.tracks.mean[:1, 1] - north, across[:1], 0.85) for north in (0.0, 3.5)]
+    one = log_on_lane(rbpf.tracks.mean[2:, 0] - 900.0, across[2:], 0.85)
+    score = rbpf.map_evidence.log_likelihood(rbpf.tracks, rbpf.tracks.mean)
     assert score == pytest.approx(np.concatenate([np.logaddexp(*two), np.zeros(one.shape), one]), abs=1e-9)
-    some = rbpf.log_road(rbpf.mean, rbpf.covariance, np.array([0, 2]))
+    some = rbpf.map_evidence.log_likelihood(rbpf.tracks, rbpf.tracks.mean, np.array([0, 2]))
     assert np.array_equal(some, score[[0, 2]])
 
 
@@ -121,33 +126,7 @@ def test_a_vehicle_not_heard_for_a_while_is_forgotten_and_may_come_back() -> Non
     assert rbpf.vehicles == ["v"]
     rbpf.step(DT_S, {"w": observation([5, 5])})
     assert rbpf.vehicles == ["v", "w"]
-    assert np.isfinite(rbpf.mean).all()
-
-
-def test_systematic_resampling_is_within_one_of_what_is_expected() -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(50):
-        weight = rng.dirichlet(np.ones(20))
-        counts = np.bincount(systematic(weight, 100, rng), minlength=20)
-        assert np.all(np.abs(counts - 100 * weight) <= 1 + 1e-9)
-        assert counts.sum() == 100
-
-
-def test_a_collapsed_cloud_supplies_means_with_slope_minus_one() -> None:
-    rbpf = known_error((1.0, 1.0), particles=20)
-    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    assert np.array_equal(rbpf.regression_on_common_error()[0][0, :2], -np.eye(2))
-    supplied, _, _ = rbpf.condition_on(np.array([[2.0, 1.0]]))
-    assert supplied[0, :2, 0] == pytest.approx([1.0, 3.0])
-
-
-def test_regression_finds_that_a_new_vehicle_is_where_its_fix_says_less_c() -> None:
-    rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
-    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    assert rbpf.regression_on_common_error()[0][0, :2] == pytest.approx(-np.eye(2), abs=1e-9)
-    supplied, past, _ = rbpf.condition_on(np.array([[1.0, 1.0]] * 5))
-    assert pytest.approx(np.array([[2.0, 3.0]] * 5)) == supplied[0, :2].T
-    assert pytest.approx(np.array([[1.0, 1.0]] * 5)) == past[0].T
+    assert np.isfinite(rbpf.tracks.mean).all()
 
 
 def test_an_old_fix_is_held_against_the_common_error_of_its_own_time() -> None:
@@ -171,7 +150,7 @@ def test_the_common_error_is_remembered_for_its_time_and_no_longer(dt_s: float) 
         fix = np.full(2, float(step - steps_ago))
         rbpf.step(dt_s, {f"v{step}": Observation(fix, np.eye(2), 0.3, age_s=steps_ago * dt_s)})
         row = rbpf.vehicles.index(f"v{step}")
-        assert np.abs(rbpf.mean[row, :2]).max() < 1e-6
+        assert np.abs(rbpf.tracks.mean[row, :2]).max() < 1e-6
     rbpf.step(dt_s, {"late": Observation(np.zeros(2), np.eye(2), 0.3, age_s=1.5 + dt_s)})
     assert "late" not in rbpf.vehicles
 
@@ -180,24 +159,12 @@ def test_a_fix_that_is_not_new_or_too_old_changes_nothing() -> None:
     rbpf = known_error((0.0, 0.0))
     for _ in range(10):
         rbpf.step(DT_S, {"v": observation([0.0, 0.0])})
-    before = rbpf.covariance.copy()
+    before = rbpf.tracks.covariance.copy()
     rbpf.step(DT_S, {"v": Observation(np.zeros(2), np.eye(2), 0.3, age_s=0.1)})
     rbpf.step(DT_S, {"v": Observation(np.zeros(2), np.eye(2), 0.3, age_s=0.5)})
     rbpf.step(DT_S, {"w": Observation(np.zeros(2), np.eye(2), 0.3, age_s=100.0)})
-    assert np.array_equal(rbpf.covariance, before)
+    assert np.array_equal(rbpf.tracks.covariance, before)
     assert rbpf.vehicles == ["v"]
-
-
-def test_a_shift_moves_the_cloud_and_the_vehicles_the_other_way() -> None:
-    rbpf = Rbpf(RbpfConfig(particles=200), NOWHERE, np.random.default_rng(5))
-    rbpf.step(DT_S, {"v": observation([3.0, 4.0])})
-    estimate, place = rbpf.estimate_m, rbpf.position_m("v")[0]
-    covariance = rbpf.estimate_covariance_m2
-    by = np.array([0.5, -0.25])
-    rbpf.shift(by)
-    assert rbpf.estimate_m == pytest.approx(estimate + by)
-    assert rbpf.position_m("v")[0] == pytest.approx(place - by)
-    assert rbpf.estimate_covariance_m2 == pytest.approx(covariance)
 
 
 def test_lanes_bounded_on_one_side_let_a_vehicle_walk_off_on_the_other() -> None:
@@ -206,7 +173,7 @@ def test_lanes_bounded_on_one_side_let_a_vehicle_walk_off_on_the_other() -> None
     for one_sided, north_m, expected in ((True, 5.0, True), (True, -5.0, False), (False, 5.0, False)):
         rbpf = Rbpf(RbpfConfig(2, one_sided=one_sided, start_sigma_m=0.0), lane, np.random.default_rng(0))
         rbpf.step(DT_S, {"v": Observation(np.array([0.0, north_m]), 0.01 * np.eye(2), 0.0)})
-        likely = float(rbpf.own_log_road.max()) > -1.0
+        likely = float(rbpf.tracks.map_log_likelihood.max()) > -1.0
         assert likely == expected
 
 

@@ -28,13 +28,13 @@ def test_who_knows_little_and_says_so_is_inside() -> None:
     assert not near_the_median(estimates, np.array([sure] * 5), 3.0)[-1]
 
 
-def error_with_one_off_its_road(by_m: float, least_log_road: float) -> float:
+def error_with_one_off_its_road(by_m: float, min_map_log_likelihood: float) -> float:
     """How far the common error is off when one of eight vehicles has a receiver that is off by `by_m`."""
     rng = np.random.default_rng(3)
     point, heading = rng.uniform(0, 3000, (8, 2)), np.linspace(0, np.pi, 8, endpoint=False)
     lanes = LaneMap(point, heading, 0.85)
     common = np.array([1.0, -2.0])
-    rbpf = Rbpf(RbpfConfig(least_log_road=least_log_road), lanes, rng)
+    rbpf = Rbpf(RbpfConfig(min_map_log_likelihood=min_map_log_likelihood), lanes, rng)
     for _ in range(30):
         fix = point + common + rng.normal(size=point.shape)
         fix[0] += by_m * lanes.normal[0]

@@ -134,11 +134,14 @@ def test_two_seconds_are_two_on_the_clock_by_which_they_were_set(
 ) -> None:
     """A skew is no change of pace, a drift is; what was set before either fires at its true time."""
     world = Clocks({"v1": [fault]})
-    took_ns = []
+    took_ns: list[int] = []
 
     async def program(node: Node) -> None:
         loop = asyncio.get_running_loop()
-        world_ns = lambda: world.loop.now_ns  # noqa: E731
+
+        def world_ns() -> int:
+            return world.loop.now_ns
+
         await asyncio.sleep(from_s - 0.001 if from_s > 5 else from_s)
         while world_ns() < from_s * S:  # from a true instant on, whatever the clock says
             await asyncio.sleep(0.0005)
@@ -152,9 +155,13 @@ def test_two_seconds_are_two_on_the_clock_by_which_they_were_set(
 
 
 def test_the_node_and_its_loop_show_the_same_wrong_time_and_the_right_one_again_after_it() -> None:
-    for fault, shown in ((SKEW, lambda t: t - 1.5), (DRIFT, lambda t: t + 0.25 * (t - 5))):
+    clocks: list[tuple[PlannedFault, Callable[[float], float]]] = [
+        (SKEW, lambda t: t - 1.5),
+        (DRIFT, lambda t: t + 0.25 * (t - 5)),
+    ]
+    for fault, shown in clocks:
         world = Clocks({"v1": [fault]}, packet_every_ns=S // 2)
-        seen = []
+        seen: list[Any] = []
 
         async def program(node: Node, world: Clocks = world, seen: list[Any] = seen) -> None:
             loop = asyncio.get_running_loop()
@@ -163,9 +170,9 @@ def test_the_node_and_its_loop_show_the_same_wrong_time_and_the_right_one_again_
 
         world.run(program)
         assert len(seen) == 39
-        for true_s, *clocks in seen:
+        for true_s, *said_s in seen:
             expected = shown(true_s) if 5 <= true_s < 10 else true_s
-            assert clocks == pytest.approx([expected] * 3, abs=2e-9)
+            assert said_s == pytest.approx([expected] * 3, abs=2e-9)
 
 
 def test_a_packet_bears_the_time_that_the_clock_showed_when_it_came_and_not_when_it_was_read() -> None:
@@ -250,7 +257,7 @@ def test_any_drifts_together_go_on_without_a_jump_while_they_act_and_never_stand
 
 def test_timers_for_never_do_not_wake_anybody() -> None:
     world = Clocks({"v1": [DRIFT]})
-    woken = []
+    woken: list[float] = []
 
     async def program(node: Node) -> None:
         for seconds in (1e12, float("inf")):

@@ -43,5 +43,5 @@ def test_what_is_started_meanwhile_has_the_default() -> None:
 
 
 def test_elsewhere_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scheduling.platform, "machine", lambda: "abacus")
+    monkeypatch.setattr("platform.machine", lambda: "abacus")
     assert not set_time_slice(PROMPT_SLICE_NS)

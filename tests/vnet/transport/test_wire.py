@@ -40,6 +40,7 @@ traffic = st.builds(
     st.lists(reports, max_size=3),
     st.lists(endings, max_size=2),
 )
+histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(
     st.builds(wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names),
     st.builds(wire.Yield, st.binary(), times, st.none() | times, st.lists(names), st.lists(names), traffic),
@@ -50,7 +51,7 @@ agent_messages = st.one_of(
         times,
         st.lists(st.tuples(times, times), max_size=3),
         traffic,
-        st.none() | st.builds(wire.Lateness, st.lists(times, max_size=5)),
+        st.none() | st.builds(wire.Lateness, histograms),
         st.booleans(),
     ),
     st.builds(wire.StackDump, st.binary(), names),
@@ -114,6 +115,14 @@ def test_times_are_integers_within_bounds(time_ns: object) -> None:
         wire.decode_rx(grant)
 
 
+@pytest.mark.parametrize("bins", [0, wire.LATENESS_BINS - 1, wire.LATENESS_BINS + 1])
+def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
+    """The emulator adds up the histograms of all processes."""
+    frames = wire.Frames(b"n", 0, 0, [], wire.Traffic(), wire.Lateness([0] * bins))
+    with pytest.raises(WireError, match="length"):
+        wire.decode_tx(wire.encode(frames))
+
+
 @pytest.mark.parametrize("decode", [wire.decode_tx, wire.decode_report])
 def test_what_is_too_large_is_not_even_decoded(decode: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "LARGEST_MESSAGE_BYTES", 10)
@@ -148,6 +157,6 @@ def test_lateness_bins_have_an_edge_at_the_limit() -> None:
 @settings(max_examples=100, deadline=None)
 @given(emulator_messages)
 def test_batches_are_told_from_their_first_bytes(message: wire.EmulatorMessage) -> None:
-    batch = isinstance(message, wire.Batch)
-    assert wire.is_batch(wire.encode(message)) == batch
-    assert wire.is_packets_only(wire.encode(message)) == (batch and not message.fixes)
+    assert wire.is_batch(wire.encode(message)) == isinstance(message, wire.Batch)
+    packets_only = isinstance(message, wire.Batch) and not message.fixes
+    assert wire.is_packets_only(wire.encode(message)) == packets_only

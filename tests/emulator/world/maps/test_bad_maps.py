@@ -72,7 +72,7 @@ def test_a_file_that_is_cut_off_is_not_half_read(tmp_path: Path, kind: str) -> N
     elif kind == "osm.pbf":
         maps.write_pbf(path)
     else:
-        path.write_text({"osm": maps.osm_xml, "net.xml": maps.sumo_net, "geojson": maps.geojson}[kind]())
+        path.write_text({"osm": maps.osm_xml(), "net.xml": maps.sumo_net(), "geojson": maps.geojson()}[kind])
     whole = path.read_bytes()
     for share in (0.3, 0.6, 0.9, 0.99):
         refusal(write(tmp_path, f"cut.{kind}", whole[: int(share * len(whole))]))

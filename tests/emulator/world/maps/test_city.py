@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +128,7 @@ def test_where_nobody_drives_it_is_said(city: Roads) -> None:
         drives(city, vehicles=3, periods=1)
 
 
-def write_graph(path: Path, node_m: list[tuple[float, float]], edges: list[tuple[int, int]]) -> Roads:
+def write_graph(path: Path, node_m: Sequence[tuple[float, float]], edges: list[tuple[int, int]]) -> Roads:
     x, y = np.array(node_m).T
     np.savez(path, node_x_m=x, node_y_m=y, edges=np.array(edges))
     return read_roads(path)

@@ -15,7 +15,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
 from emulator.stream.messages import scene_message, unpack
 from emulator.world.world import build_world
-from tests.support.motion import Course, along, scenario_of_trips, write_trips
+from tests.support.motion import Course, Stay, along, scenario_of_trips, write_trips
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
 
@@ -96,7 +96,7 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
 
 def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
     """The next one has been filtering beside it, and goes on; who comes later does not take over."""
-    courses = {
+    courses: dict[str, list[Stay]] = {
         "a": [(3.0, 12.0, along(-150, 12, -RIGHT_M))],
         "b": [(0, 8.0, along(150, -11, RIGHT_M))],
         "c": [(0, 12.0, north(-150, 12, RIGHT_M))],
@@ -110,7 +110,8 @@ def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> 
     simulate(emulation)
     error = [row.common_error_rmse_m for row in emulation.metrics.rows]
     left = 41  # the period after the one in which b leaves
-    assert error[left - 3] is not None and error[left - 3] < 1.5
+    before = error[left - 3]
+    assert before is not None and before < 1.5
     after = [value for value in error[left : left + 10] if value is not None]
     assert len(after) == 10 and max(after) < 1.5, "it does not begin anew from three metres"
 

@@ -209,7 +209,7 @@ def test_a_wrong_matrix_is_refused_with_its_array(tmp_path: Path) -> None:
         ({"id": np.array(["a", "b/c"])}, "row 2: id = 'b/c'"),
         ({"x_m": np.full((2, 3), np.nan), "y_m": np.full((2, 3), np.nan)}, "no samples"),
     ):
-        arrays = {name: value for name, value in {**good, **change}.items() if value is not None}
+        arrays: dict[str, Any] = {name: value for name, value in {**good, **change}.items() if value is not None}
         np.savez(path, **arrays)
         assert named in refusal(path), change
     pickled = np.array([[{"a": 1}]], dtype=object)

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -16,7 +17,9 @@ RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0)
 TENTH_NS = 100_000_000
 
 
-def trip(time_s: object, x_m: object, y_m: object = 0.0, name: str = "a", **known: np.ndarray) -> Trip:
+def trip(
+    time_s: npt.ArrayLike, x_m: npt.ArrayLike, y_m: npt.ArrayLike = 0.0, name: str = "a", **known: np.ndarray
+) -> Trip:
     time = np.asarray(time_s, dtype=float)
     position_m = np.column_stack([np.broadcast_to(x_m, time.shape), np.broadcast_to(y_m, time.shape)])
     return Trip(name, time, position_m.astype(float), **known)
@@ -118,7 +121,9 @@ def test_what_is_mostly_jumps_is_no_trip() -> None:
     st.floats(5, 100),
     st.floats(0.5, 20),
 )
-def test_what_is_believed_has_no_jump_and_no_gap(steps: list, fastest_mps: float, gap_s: float) -> None:
+def test_what_is_believed_has_no_jump_and_no_gap(
+    steps: list[tuple[float, float]], fastest_mps: float, gap_s: float
+) -> None:
     rules = Rules(fastest_mps, gap_s)
     time_s, x_m = np.cumsum(np.array(steps), axis=0).T
     one = trip(time_s, x_m)
@@ -217,9 +222,9 @@ def test_given_headings_are_taken_and_go_the_short_way_round() -> None:
 
 def test_a_given_speed_says_who_stands() -> None:
     time_s = np.arange(0, 10, 0.1)
-    crawling = {"x_m": 0.4 * time_s, "y_m": 0.0 * time_s}
-    stands = drive(trip(time_s, **crawling), seconds=9.9).heading_rad[:99, 0]
-    drives = drive(trip(time_s, **crawling, speed_mps=np.full(100, 0.6)), seconds=9.9).heading_rad[:99, 0]
+    x_m, y_m = 0.4 * time_s, 0.0 * time_s
+    stands = drive(trip(time_s, x_m, y_m), seconds=9.9).heading_rad[:99, 0]
+    drives = drive(trip(time_s, x_m, y_m, speed_mps=np.full(100, 0.6)), seconds=9.9).heading_rad[:99, 0]
     assert np.isnan(stands).all() and drives == pytest.approx(np.zeros(99))
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emulator.drivers.lockstep import lateness_figures
+from emulator.drivers.realtime import lateness_figures
 from vnet.transport import wire
 
 

@@ -10,6 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from emulator.pages.palette import PALETTE
 from emulator.world.maps.classes import NAMES
 from emulator.world.maps.roads import Roads
 from vnet.types import Array
@@ -17,19 +18,19 @@ from vnet.types import Array
 LANES_SHOWN_M = 800.0
 """Largest extent of a picture that shows lanes."""
 
-# Colour (of Okabe and Ito's palette) and line width in points of each class.
+# Colour and line width in points of each class. Similar classes differ only in width.
 _STYLES = {
-    "motorway": ("#D55E00", 2.6),
-    "trunk": ("#D55E00", 2.2),
-    "primary": ("#E69F00", 2.0),
-    "secondary": ("#009E73", 1.6),
-    "tertiary": ("#0072B2", 1.2),
-    "unclassified": ("#56B4E9", 0.9),
-    "residential": ("#56B4E9", 0.8),
-    "living_street": ("#CC79A7", 0.8),
-    "service": ("#999999", 0.6),
-    "road": ("#0072B2", 0.7),
-    "crossing": ("#999999", 0.6),
+    "motorway": (PALETTE["red"].light, 2.6),
+    "trunk": (PALETTE["red"].light, 2.2),
+    "primary": (PALETTE["orange"].light, 2.0),
+    "secondary": (PALETTE["green"].light, 1.6),
+    "tertiary": (PALETTE["blue"].light, 1.2),
+    "unclassified": (PALETTE["sky"].light, 0.9),
+    "residential": (PALETTE["sky"].light, 0.8),
+    "living_street": (PALETTE["purple"].light, 0.8),
+    "service": ("0.6", 0.6),
+    "road": (PALETTE["blue"].light, 0.7),
+    "crossing": ("0.6", 0.6),
 }
 _SIDE_INCHES = 9.0
 """Length of the picture's longer side."""
@@ -86,10 +87,10 @@ def _draw_lanes(axes: Axes, roads: Roads) -> None:
     end = start + lanes.length_m[:, None] * lanes.direction
     aside = lanes.half_width_m[:, None] * lanes.normal
     strips = np.stack([start - aside, end - aside, end + aside, start + aside], axis=1)
-    axes.add_collection(PolyCollection(list(strips), facecolors="#DDDDDD", linewidths=0))
+    axes.add_collection(PolyCollection(list(strips), facecolors="0.867", linewidths=0))
     long = lanes.length_m > 12.0
     middle = (start + end)[long] / 2
     ahead = 4.0 * lanes.direction[long]
     axes.quiver(
-        *middle.T, *ahead.T, angles="xy", scale_units="xy", scale=1, width=0.0018, headwidth=5, color="#555555"
+        *middle.T, *ahead.T, angles="xy", scale_units="xy", scale=1, width=0.0018, headwidth=5, color="0.333"
     )

@@ -1,4 +1,4 @@
-"""Fusion weights against a general solver; and what fusion does to a filter."""
+"""Fusion weights against a general solver."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from vnet.cmm.fusion import Cloud, fuse
-from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
 from vnet.cmm.weights import (
     OptimizedWeights,
     constant_weights,
@@ -18,7 +16,6 @@ from vnet.cmm.weights import (
     random_weights,
 )
 from vnet.errors import VnetError
-from vnet.roads.lanes import LaneMap
 
 
 def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -119,60 +116,3 @@ def test_weights_stay_weights_when_the_mean_is_absurd() -> None:
     weights = OptimizedWeights().solve(estimates, covariances, np.array([1e14, -1e14]))
     assert weights.sum() == pytest.approx(1.0)
     assert np.all((weights >= 0) & (weights <= 1))
-
-
-LANES = LaneMap(np.array([[0.0, 0.0], [0.0, 0.0]]), np.array([0.0, np.pi / 2]), 0.85)
-
-
-def settled(seed: int = 0) -> Rbpf:
-    """A filter that has seen two crossing roads for two seconds; the common error is (2, −1)."""
-    rbpf = Rbpf(RbpfConfig(particles=100), LANES, np.random.default_rng(seed))
-    rng = np.random.default_rng(seed + 1)
-    for _ in range(20):
-        noisy = np.array([2.0, -1.0]) + rng.normal(0, 0.5, (2, 2))
-        noise = 0.25 * np.eye(2)
-        rbpf.step(0.1, {"a": Observation(noisy[0], noise, 0.0), "b": Observation(noisy[1], noise, np.pi / 2)})
-    return rbpf
-
-
-ALL = frozenset({"a", "b"})
-
-
-def test_all_weight_on_oneself_keeps_ones_own_hypotheses() -> None:
-    rbpf = settled()
-    before = rbpf.estimate_m
-    far = Cloud(np.full((10, 2), 99.0), ALL)
-    stacked, imported = fuse(rbpf, [far], np.array([1.0, 0.0]), np.random.default_rng(2))
-    assert stacked == pytest.approx(before)
-    assert imported == 0
-    assert np.abs(rbpf.common_m).max() < 20
-
-
-def test_the_stacked_estimate_is_the_weighted_mean_of_the_clouds() -> None:
-    rbpf = settled()
-    rbpf.resample()
-    own = rbpf.estimate_m
-    cloud = Cloud(np.tile([1.0, 1.0], (50, 1)), ALL)
-    stacked, imported = fuse(rbpf, [cloud], np.array([0.5, 0.5]), np.random.default_rng(2))
-    assert stacked == pytest.approx((own + 1.0) / 2, abs=0.05)
-    assert imported == 50
-    assert rbpf.common_m.shape == (2, 100)
-    assert rbpf.mean.shape == (2, 4, 100)
-
-
-def test_roads_that_a_neighbour_does_not_know_weigh_its_hypotheses() -> None:
-    wrong = np.tile([-8.0, 9.0], (50, 1))  # puts both vehicles far off their roads
-    knowing, ignorant = settled(), settled()
-    fuse(knowing, [Cloud(wrong, ALL)], np.array([0.5, 0.5]), np.random.default_rng(2))
-    fuse(ignorant, [Cloud(wrong, frozenset())], np.array([0.5, 0.5]), np.random.default_rng(2))
-    assert np.sum(knowing.common_m[0] == -8.0) == 50
-    assert np.sum(ignorant.common_m[0] == -8.0) == 0
-    assert ignorant.estimate_m == pytest.approx([2.0, -1.0], abs=1.0)
-
-
-def test_imported_hypotheses_get_this_filters_own_vehicles() -> None:
-    rbpf = settled()
-    position, _ = rbpf.position_m("a")
-    fix = position + rbpf.estimate_m
-    fuse(rbpf, [Cloud(np.tile([3.0, -1.0], (50, 1)), ALL)], np.array([0.0, 1.0]), np.random.default_rng(2))
-    assert rbpf.position_m("a")[0] == pytest.approx(fix - [3.0, -1.0], abs=0.3)

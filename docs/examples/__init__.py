@@ -1,0 +1,1 @@
+"""Programs of the documentation: small, complete, and run by tests."""

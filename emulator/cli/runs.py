@@ -1,0 +1,265 @@
+"""`vnet run`, `vnet simulate` and `vnet emulator`: a scenario from its file to its verdict."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from emulator.cli.access import DEFAULT_ADDRESS, DEFAULT_LISTEN, create_access, load_or_create_access
+from emulator.cli.options import (
+    DeterminismOption,
+    DurationOption,
+    LogFormatOption,
+    OutOption,
+    Pacing,
+    PacingOption,
+    ProgramOption,
+    QuietOption,
+    RerunOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    load,
+)
+from emulator.cli.report import ReportOption, report_at_end
+from emulator.cli.viewing import RerunBindOption, RerunPortOption, RerunVehicleOption
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.conclude import conclude, run_again
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.live import run_live
+from emulator.drivers.observers import Messages
+from emulator.drivers.router import SeparateRouter
+from emulator.drivers.signals import signals_ignored
+from emulator.drivers.simulate import simulate as run_simulation
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.terminal.console import LogFormat, one_line_errors
+from emulator.terminal.progress import Progress, show_progress
+from emulator.terminal.summary import print_summary
+from emulator.viewer.sinks import Sinks, choose_sinks
+from emulator.world.world import World, build_world
+from vnet.errors import ScenarioError, VnetError
+from vnet.runtime.host import fix_hash_seed
+from vnet.transport.session import quiet_zenoh
+
+
+class RouterKind(StrEnum):
+    """Router of a run that `vnet run` starts."""
+
+    EMBEDDED = "embedded"
+    SEPARATE = "separate"
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Output that was asked for beside the run itself."""
+
+    log_format: LogFormat
+    quiet: bool
+    check_determinism: bool = False
+    report: bool = True
+
+
+def run(
+    scenario: ScenarioArgument,
+    program: ProgramOption = None,
+    pacing: PacingOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
+    check_determinism: DeterminismOption = False,
+    report: ReportOption = True,
+    router: Annotated[
+        RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
+    ] = RouterKind.EMBEDDED,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
+) -> None:
+    """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
+    with one_line_errors(log_format):
+        loaded = load(scenario, overrides, program, pacing, seed, duration)
+        if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
+            raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
+        _check_restarts(loaded, router is RouterKind.SEPARATE)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
+        world = build_world(loaded)
+        _check_vehicle(sinks, world)
+        access = create_access(loaded, world)
+        with ExitStack() as stack:
+            separate = None
+            if router is RouterKind.SEPARATE:
+                private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
+                separate = SeparateRouter(access, Path(private))
+            options = LiveOptions(access, router=separate, record=sinks)
+            asked = OutputOptions(log_format, quiet, check_determinism, report)
+            _run_live(loaded, world, RunFolder.create(out, loaded), options, asked)
+
+
+def simulate(
+    scenario: ScenarioArgument,
+    program: ProgramOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
+    check_determinism: DeterminismOption = False,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
+    report: ReportOption = True,
+) -> None:
+    """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
+    fix_hash_seed("emulator.cli")
+    with one_line_errors(log_format):
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+        world = build_world(loaded)
+        _check_vehicle(sinks, world)
+        sys.path.append(str(Path.cwd()))
+        emulation = Emulation(loaded, world, RunFolder.create(out, loaded))
+        with show_progress(emulation, log_format, quiet) as progress:
+            with ExitStack() as stack:
+                if sinks is not None:
+                    _record_here(emulation, sinks, stack)
+                wall_s, interrupted = run_simulation(emulation)
+            asked = OutputOptions(log_format, quiet, check_determinism, report)
+            _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
+
+
+def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
+    """Record a simulation from within its own process."""
+    from emulator.viewer.recorder import Recorder  # Rerun is slow to import, and only recordings need it
+
+    name = emulation.scenario.run.name
+    recorder = stack.enter_context(Recorder(sinks.inside(emulation.folder.path), name))
+    messages = Messages(emulation)
+    recorder.take("scene", messages.scene())
+    emulation.watch(lambda view: recorder.take("period", messages.period(view)))
+    stack.callback(lambda: recorder.take("end", messages.end()))
+
+
+def emulator(
+    scenario: ScenarioArgument,
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ENDPOINT",
+            help=f"Be the router, at tcp/HOST:PORT or tls/HOST:PORT. Default: {DEFAULT_LISTEN}.",
+        ),
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option(metavar="ENDPOINT", help="Be a client of the zenohd that is there.")
+    ] = None,
+    access: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Users, as vnet access wrote them; made if not there. Default: OUT/access."
+        ),
+    ] = None,
+    program: ProgramOption = None,
+    pacing: PacingOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: OutOption = None,
+    overrides: SetOption = None,
+    rerun: RerunOption = None,
+    rerun_bind: RerunBindOption = None,
+    rerun_port: RerunPortOption = None,
+    rerun_vehicle: RerunVehicleOption = None,
+    log_format: LogFormatOption = LogFormat.TEXT,
+    quiet: QuietOption = False,
+    report: ReportOption = True,
+) -> None:
+    """Run a scenario for agents that are started by hand, here or on other machines."""
+    with one_line_errors(log_format):
+        if listen is not None and connect is not None:
+            raise VnetError("--listen and --connect exclude each other")
+        loaded = load(scenario, overrides, program, pacing, seed, duration)
+        _check_restarts(loaded, own_router=False)
+        sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
+        world = build_world(loaded)
+        _check_vehicle(sinks, world)
+        folder = RunFolder.create(out, loaded)
+        access = access or folder.path / "access"
+        users = load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
+        listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
+        options = LiveOptions(users, listen, connect, launch=False, record=sinks)
+        where = f"credentials of the agents: {access}/credentials/NODE.json"
+        _run_live(loaded, world, folder, options, OutputOptions(log_format, quiet, report=report), where)
+
+
+def _run_live(
+    scenario: Scenario,
+    world: World,
+    folder: RunFolder,
+    options: LiveOptions,
+    asked: OutputOptions,
+    first_of_all: str | None = None,
+) -> None:
+    """A live run from its folder to its summary; exits with the verdict's status."""
+    quiet_zenoh()
+    emulation = Emulation(scenario, world, folder)
+    sinks = None if options.record is None else options.record.inside(folder.path)
+    options = replace(options, record=sinks)
+    with show_progress(emulation, asked.log_format, asked.quiet) as progress:
+        if first_of_all is not None:
+            progress.state(first_of_all)
+        if sinks is not None and sinks.serve is not None:
+            progress.state(sinks.serve.announcement())
+        with signals_ignored():  # a second Ctrl-C must not lose the records
+            running = run_live(emulation, options, progress.state, on_missing=progress.awaits)
+            wall_s, interrupted = asyncio.run(running)
+            _finish(emulation, progress, wall_s, interrupted, "run", asked)
+
+
+def _check_vehicle(sinks: Sinks | None, world: World) -> None:
+    """The vehicle to be looked at closely must be there."""
+    if sinks is not None and sinks.vehicle is not None and sinks.vehicle not in world.node_ids:
+        raise VnetError(f"--rerun-vehicle {sinks.vehicle}: no such vehicle")
+
+
+def _check_restarts(scenario: Scenario, own_router: bool) -> None:
+    """Only a router that the run itself has started can be restarted."""
+    kinds = {fault.kind for fault in scenario.fault}
+    if "router_restart" in kinds and not own_router:
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+
+
+def _finish(
+    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: OutputOptions
+) -> None:
+    """Judge a run and print its summary; exits with the verdict's status."""
+    progress.judging()
+    judgement, verdict = conclude(emulation, wall_s, command)
+    progress.close()
+    if asked.check_determinism and not interrupted:
+        again = ["--quiet"] if asked.quiet or asked.log_format is LogFormat.JSON else []
+        verdict = run_again(emulation, judgement, verdict, command, again)
+    status = 130 if interrupted else judgement.exit_status
+    folder = emulation.folder.path
+    progress.ended(verdict, str(folder), status)
+    if asked.log_format is LogFormat.JSON:
+        print(json.dumps(verdict))
+    elif asked.quiet:
+        print(f"verdict: {judgement.verdict}  {folder}")
+    else:
+        print_summary(judgement, verdict, folder, Console(), asked.report)
+    if asked.report:
+        report_at_end(folder)
+    raise typer.Exit(status)

@@ -1,0 +1,72 @@
+"""`vnet analyze` and `vnet campaign`: what a network's graph says, and many runs under random faults."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from emulator.cli.options import (
+    DurationOption,
+    Pacing,
+    ProgramOption,
+    ScenarioArgument,
+    SeedOption,
+    SetOption,
+    load,
+)
+from emulator.terminal.console import one_line_errors
+from vnet.runtime.host import fix_hash_seed
+
+
+def analyze(
+    scenario: ScenarioArgument,
+    run: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Folder of a run: set beside what its filters did.")
+    ] = None,
+    overrides: SetOption = None,
+) -> None:
+    """Analyze the network without a run: components, degrees, convergence of each rule of weights."""
+    from emulator.experiments.analyze import analysis_table
+    from emulator.experiments.analyze import analyze as analyze_scenario
+
+    with one_line_errors():
+        Console().print(analysis_table(analyze_scenario(load(scenario, overrides), run)))
+
+
+def campaign(
+    scenario: ScenarioArgument,
+    runs: Annotated[int, typer.Option(min=1, metavar="N", help="How many runs.")] = 200,
+    faults: Annotated[
+        str, typer.Option(metavar="KINDS", help="random, or the kinds to draw from: kill,partition.")
+    ] = "random",
+    program: ProgramOption = None,
+    seed: SeedOption = None,
+    duration: DurationOption = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the campaign's files.")] = None,
+    overrides: SetOption = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
+    ] = None,
+    shrink_steps: Annotated[
+        int, typer.Option(min=0, max=50, metavar="N", help="Runs to shrink a failure with.")
+    ] = 50,
+    time_limit: Annotated[
+        float, typer.Option(min=1.0, metavar="SECONDS", help="Wall clock that a run may take.")
+    ] = 300.0,
+) -> None:
+    """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
+    fix_hash_seed("emulator.cli")
+    from emulator.testing.campaign import Plan, run_campaign
+
+    with one_line_errors():
+        sys.path.append(str(Path.cwd()))
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        options = {"jobs": jobs} if jobs else {}
+        plan = Plan.of(
+            loaded, faults, runs, loaded.run.seed, limit_s=time_limit, shrink_steps=shrink_steps, **options
+        )
+        raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))

@@ -1,0 +1,85 @@
+"""What the drivers of both pacings have in common: faults are applied to processes in one order."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from emulator.drivers.attachment import Attachment
+from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.join import Membership
+from emulator.drivers.launch import Launcher
+from emulator.drivers.live.inbox import Inbox
+from emulator.drivers.live.reconnection import Reconnection
+from emulator.drivers.live.supervisor import Supervisor
+from emulator.drivers.live.waiting import ChangeSignal
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a live run that its driver uses."""
+
+    emulation: Emulation
+    members: Membership
+    supervisor: Supervisor
+    launcher: Launcher
+    attachment: Attachment
+    inbox: Inbox
+    reconnection: Reconnection
+    changes: ChangeSignal
+
+
+class Driver(ABC):
+    """Moves the messages of one pacing between the emulation and the processes, from time 0 to the end."""
+
+    message_type: ClassVar[type]
+    """The messages of agents that `take` takes while the pacing is on."""
+
+    def __init__(self, parts: Parts, processes: Sequence[Sequence[str]]) -> None:
+        self._parts = parts
+        self._emulation = parts.emulation
+        self._supervisor = parts.supervisor
+        self._changes = parts.changes
+        self._send = parts.attachment.send
+        parts.supervisor.begin(processes)
+        parts.inbox.handlers[self.message_type] = self.take
+
+    @property
+    @abstractmethod
+    def time_ns(self) -> int:
+        """Emulated time, for events."""
+
+    @abstractmethod
+    def take(self, process_id: str, message: Any) -> None:
+        """Take a message of a process. Raises ProtocolError to refuse it."""
+
+    @abstractmethod
+    async def run(self) -> None:
+        """Run from time 0 to the end. Raises Stalled if a process does not answer."""
+
+    @abstractmethod
+    async def finish(self, deadline_s: float) -> None:
+        """Wait for the last messages of the processes, at most until `deadline_s` on the monotonic clock."""
+
+    async def _apply_process_faults(self, actions: ProcessActions) -> None:
+        """Do to the processes what the faults and the trips of an instant do."""
+        process_of = self._parts.members.process_of
+        for process_id, killed in {process_of(node): killed for node, killed in actions.stop.items()}.items():
+            await self._supervisor.end(process_id, killed, self._reason(process_id, killed))
+        begun = list(dict.fromkeys(map(process_of, actions.start)))
+        self._supervisor.begin_again(begun)
+        await self._await_returned(begun)
+        self._supervisor.pause({process_of(node) for node in actions.paused})
+        for fault in actions.restarts:
+            await self._parts.reconnection.restart(fault)
+
+    def _reason(self, process_id: str, killed: bool) -> str:
+        if killed:
+            return "killed by a fault"
+        return "it has left" if self._emulation.presence.is_outside(process_id) else "restarted by a fault"
+
+    @abstractmethod
+    async def _await_returned(self, process_ids: Sequence[str]) -> None:
+        """Wait for processes that have been started, where the pacing cannot go on without them."""

@@ -1,0 +1,68 @@
+"""The driver of a live run in real time: what is due goes out in batches, by the monotonic clock."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+
+from emulator.drivers.live.driver import Driver, Parts
+from emulator.drivers.realtime import RealTime
+from vnet.transport import wire
+
+
+class RealTimeDriver(Driver):
+    """Sends batches when they are due and takes frames when they come."""
+
+    message_type = wire.Frames
+
+    def __init__(self, parts: Parts, processes: Sequence[Sequence[str]]) -> None:
+        super().__init__(parts, processes)
+        self._realtime = RealTime(parts.emulation, processes)
+        self._origin_ns = time.monotonic_ns()
+        parts.supervisor.on_death = self._take_deaths
+
+    @property
+    def time_ns(self) -> int:
+        """Emulated time: the time since the start, or 0 before it."""
+        return max(self._now_ns(), 0)
+
+    def _now_ns(self) -> int:
+        return time.monotonic_ns() - self._origin_ns
+
+    def take(self, process_id: str, message: wire.Frames) -> None:
+        """Take frames and acknowledgements."""
+        self._realtime.receive(self.time_ns, process_id, message)
+        self._changes.set()
+
+    def _take_deaths(self) -> None:
+        for process_id, details in self._supervisor.take_deaths().items():
+            self._realtime.died(self._now_ns(), process_id, **details)
+
+    async def run(self) -> None:
+        """Start all processes at one instant and send what is due until the end."""
+        self._origin_ns = time.monotonic_ns() + wire.HEAD_START_NS
+        duration_ns = self._emulation.duration_ns
+        for process_id, batch in self._realtime.start(self._origin_ns).items():
+            self._send(process_id, batch)
+        await asyncio.sleep(wire.HEAD_START_NS / 1e9)
+        while (now_ns := self._now_ns()) < duration_ns:
+            batches = self._realtime.due(now_ns)
+            for actions in self._realtime.take_actions():
+                await self._apply_process_faults(actions)
+            for process_id, batch in batches.items():
+                self._send(process_id, batch)
+            for process_id in self._supervisor.take_returned():
+                self._send(process_id, self._realtime.returned(self._now_ns(), process_id))
+            next_ns = min(self._realtime.next_time_ns() or duration_ns, duration_ns)
+            await self._changes.wait((next_ns - self._now_ns()) / 1e9)
+
+    async def _await_returned(self, process_ids: Sequence[str]) -> None:
+        """Wait for nobody: `run` sees which processes have returned."""
+
+    async def finish(self, deadline_s: float) -> None:
+        """Wait for the last acknowledgements, and decide what nobody has acknowledged."""
+        while not self._realtime.all_final and await self._changes.wait(deadline_s - time.monotonic()):
+            pass
+        self._realtime.finish()
+        await self._supervisor.all_ended()

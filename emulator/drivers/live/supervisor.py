@@ -1,0 +1,276 @@
+"""The supervisor of a live run: it starts, pauses, ends and restarts processes, and knows the state of each.
+
+Faults and trips decide what a process is to do; the operating system and the connections say what it does. Both
+meet in one state a process (`ProcessState`), and only `_TRANSITIONS` lead from one to the next.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from emulator.drivers.attachment import Attachment, LiveOptions
+from emulator.drivers.join import Membership
+from emulator.drivers.launch import Exit, Launcher
+from emulator.drivers.live.waiting import ChangeSignal
+from emulator.drivers.signals import gets_signals, signals_handled
+from emulator.records.run_folder import RunFolder
+from vnet.errors import VnetError
+from vnet.transport import wire
+
+DEATH_GRACE_S = 0.3
+"""Seconds for which the last messages of a process that has ended may still arrive."""
+SHUT_DOWN_S = 1.0
+"""Seconds that a process which was told to end has for it, before it is killed."""
+CHILDREN_POLL_S = 0.05
+"""Seconds between two looks for ended processes on a thread that gets no signals."""
+REALTIME_AGENT_NICE = 10
+"""Niceness of agents in real time: on a full machine the emulator, which all wait for, comes first."""
+
+
+class ProcessState(StrEnum):
+    """What a process of agents is doing, as far as the emulator knows."""
+
+    RUNNING = "running"
+    PAUSED = "paused"
+    """Under the fault `pause`: stopped in real time, given no grant in lockstep."""
+    AWAY = "away"
+    """Not there: its vehicles have not entered yet or have left, or a fault has ended it."""
+    RETURNING = "returning"
+    """Started, and not ready yet."""
+    DEAD = "dead"
+    """It has ended without being told to."""
+
+
+_TRANSITIONS = {
+    ProcessState.RUNNING: {ProcessState.PAUSED, ProcessState.AWAY, ProcessState.DEAD},
+    ProcessState.PAUSED: {ProcessState.RUNNING, ProcessState.AWAY, ProcessState.DEAD},
+    ProcessState.AWAY: {ProcessState.RETURNING},
+    ProcessState.RETURNING: {ProcessState.RUNNING, ProcessState.AWAY, ProcessState.DEAD},
+    ProcessState.DEAD: {ProcessState.AWAY},
+}
+
+
+@dataclass
+class _Process:
+    state: ProcessState
+    death: dict[str, Any] | None = None
+    """How it has ended, until the pacing has taken it."""
+
+
+class Supervisor:
+    """The processes of a run.
+
+    Before `begin` a process that ends is the reason why the run cannot start (`failure`). From then on each has a
+    state, and `on_death` is called when one has died: `take_deaths` says which. In `realtime` a paused process is
+    stopped with a signal, and nobody waits for one that has been told to end.
+    """
+
+    def __init__(
+        self,
+        *,
+        launcher: Launcher,
+        members: Membership,
+        attachment: Attachment,
+        options: LiveOptions,
+        folder: RunFolder,
+        time_ns: Callable[[], int],
+        changes: ChangeSignal,
+        realtime: bool,
+    ) -> None:
+        self._launcher = launcher
+        self._members = members
+        self._attachment = attachment
+        self._options = options
+        self._folder = folder
+        self._time_ns = time_ns
+        self._changes = changes
+        self._realtime = realtime
+        self._processes: dict[str, _Process] = {}
+        self._to_pause: Collection[str] = ()
+        self._ending: set[asyncio.Task[None]] = set()
+        self.failure: VnetError | None = None
+        self.on_death: Callable[[], None] = changes.set
+        self.reconnecting = False
+        """Whether the emulator itself is not connected: that connections are lost then says nothing."""
+
+    def begin(self, processes: Iterable[Sequence[str]]) -> None:
+        """Give each process (its nodes, its id first) a state, now that every node that must be there is ready."""
+        for nodes in processes:
+            away = nodes[0] in self._members.later
+            self._processes[nodes[0]] = _Process(ProcessState.AWAY if away else ProcessState.RUNNING)
+
+    def state(self, process_id: str) -> ProcessState:
+        """State of a process."""
+        return self._processes[process_id].state
+
+    def processes_in(self, *states: ProcessState) -> list[str]:
+        """The ids of all processes in one of these states."""
+        return [process_id for process_id, process in self._processes.items() if process.state in states]
+
+    def _change(self, process_id: str, state: ProcessState) -> None:
+        process = self._processes[process_id]
+        assert state in _TRANSITIONS[process.state], f"{process_id}: {process.state} -> {state}"
+        process.state = state
+        if state is not ProcessState.DEAD:
+            process.death = None
+
+    # What the run has them do.
+
+    def launch(self, nodes: Sequence[str]) -> None:
+        """Start the process of these nodes."""
+        nice = REALTIME_AGENT_NICE if self._realtime else 0
+        self._launcher.start_agent(self._attachment.endpoint, self._options.access, nodes, nice)
+
+    def pause(self, process_ids: Collection[str]) -> None:
+        """Pause these processes and no others; one that is returning is paused when it has returned."""
+        self._to_pause = process_ids
+        for process_id in self.processes_in(ProcessState.PAUSED):
+            if process_id not in process_ids:
+                self._resume(process_id)
+        for process_id in self.processes_in(ProcessState.RUNNING):
+            self._pause_if_planned(process_id)
+
+    def _pause_if_planned(self, process_id: str) -> None:
+        if process_id in self._to_pause:
+            self._change(process_id, ProcessState.PAUSED)
+            if self._realtime:
+                self._launcher.signal(process_id, signal.SIGSTOP)
+
+    def _resume(self, process_id: str) -> None:
+        self._change(process_id, ProcessState.RUNNING)
+        if self._realtime:
+            self._launcher.signal(process_id, signal.SIGCONT)
+
+    async def end(self, process_id: str, killed: bool, reason: str) -> None:
+        """End a process. Those started by hand are told to go, and whoever started them may start them again."""
+        if killed and self._options.launch:
+            self._change(process_id, ProcessState.AWAY)
+            self._launcher.kill(process_id)
+            return
+        if self.state(process_id) is ProcessState.PAUSED:
+            self._resume(process_id)  # or it could not go
+        self._change(process_id, ProcessState.AWAY)
+        self._attachment.send(process_id, wire.End(None, reason))
+        if self._options.launch:
+            ending = asyncio.create_task(asyncio.to_thread(self._launcher.detach(process_id), SHUT_DOWN_S))
+            if self._realtime:
+                self._ending.add(ending)
+                ending.add_done_callback(self._ending.discard)
+            else:
+                await ending
+
+    def begin_again(self, process_ids: Iterable[str]) -> None:
+        """Start processes that are away; `take_returned` tells when they are ready."""
+        for process_id in process_ids:
+            self._change(process_id, ProcessState.RETURNING)
+            nodes = self._members.nodes_with(process_id)
+            if process_id in self._members.later:
+                if self._members.enter(process_id):
+                    continue
+            else:
+                self._members.expect(nodes)
+            if self._options.launch:
+                self.launch(nodes)
+
+    def returning_nodes(self, process_ids: Iterable[str]) -> list[str]:
+        """The nodes of these processes that are not ready yet, and still may be."""
+        missing = set(self._members.missing)
+        returning = [id_ for id_ in process_ids if self.state(id_) is ProcessState.RETURNING]
+        return [node for id_ in returning for node in self._members.nodes_with(id_) if node in missing]
+
+    def take_returned(self) -> list[str]:
+        """The processes that have become ready since the last call; they run, or are paused if they should be."""
+        returned = [
+            process_id
+            for process_id in sorted(self.processes_in(ProcessState.RETURNING))
+            if not self.returning_nodes([process_id])
+        ]
+        for process_id in returned:
+            self._change(process_id, ProcessState.RUNNING)
+            self._pause_if_planned(process_id)
+        return returned
+
+    async def all_ended(self) -> None:
+        """Wait for those that have been told to end."""
+        await asyncio.gather(*self._ending)
+
+    # What becomes of them by themselves.
+
+    @contextmanager
+    def watching_children(self) -> Iterator[None]:
+        """Notice within the block which of the processes that the run has started end."""
+        loop = asyncio.get_running_loop()
+        if gets_signals():
+            with signals_handled(lambda *_: loop.call_soon_threadsafe(self._children_ended), signal.SIGCHLD):
+                yield
+            return
+        polling = loop.create_task(self._poll_children())
+        try:
+            yield
+        finally:
+            polling.cancel()
+
+    async def _poll_children(self) -> None:
+        while True:
+            self._children_ended()
+            await asyncio.sleep(CHILDREN_POLL_S)
+
+    def _children_ended(self) -> None:
+        loop = asyncio.get_running_loop()
+        for name, how in self._launcher.ended().items():
+            loop.call_later(DEATH_GRACE_S, self.child_ended, name, how)
+
+    def child_ended(self, name: str, how: Exit) -> None:
+        """Take note that a process that the run has started has ended by itself."""
+        if not self._attachment.knows(name):
+            self._folder.event(self._time_ns(), "observer_ended", name, how=how.how)
+        elif self._processes:
+            self._died(name, how=how.how, log_tail=how.log_tail)
+        else:
+            last = how.log_tail.splitlines()[-1:] or ["its log is empty"]
+            self.failure = VnetError(f"agent {name} ended before the start ({how.how}): {last[0]}")
+            self._changes.set()
+
+    def disconnected(self, node: str) -> None:
+        """Take note that the connection of a node is gone: it tells the end of a process started by hand."""
+        if node in self._members.later:
+            self._members.expect([node])
+        elif self.reconnecting or node not in self._members.joined or node in self._launcher.pids:
+            return
+        elif not self._processes:
+            self._members.leave(node)
+        elif not self._options.launch and self._is_there(node):
+            process = self._members.describe(node)
+            asyncio.get_running_loop().call_later(DEATH_GRACE_S, self._connection_closed, node, process)
+
+    def _is_there(self, node: str) -> bool:
+        there = (ProcessState.RUNNING, ProcessState.PAUSED)
+        return node in self._processes and self.state(node) in there
+
+    def _connection_closed(self, process_id: str, process: str) -> None:
+        if self._is_there(process_id):
+            self._died(process_id, how="its connection closed", process=process)
+
+    def _died(self, process_id: str, **details: Any) -> None:
+        over = (ProcessState.AWAY, ProcessState.DEAD)
+        if self.state(process_id) in over or process_id in self._launcher.pids:
+            return  # a fault was faster, and may have started the next process of this name since
+        self._change(process_id, ProcessState.DEAD)
+        self._processes[process_id].death = details
+        self.on_death()
+        self._changes.set()
+
+    def take_deaths(self, among: Collection[str] | None = None) -> dict[str, dict[str, Any]]:
+        """The deaths that have not been taken yet, of all processes or `among` these, with their details."""
+        deaths = {}
+        for process_id in sorted(self.processes_in(ProcessState.DEAD)):
+            process = self._processes[process_id]
+            if process.death is not None and (among is None or process_id in among):
+                deaths[process_id], process.death = process.death, None
+        return deaths

@@ -1,0 +1,26 @@
+"""What both pacings ask of the messages of a process, and how they encode packets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vnet.errors import VnetError
+from vnet.node import Packet
+from vnet.transport import wire
+
+
+class ProtocolError(VnetError):
+    """A message that does not fit what its process was told, or speaks for others."""
+
+
+def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
+    """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
+    named = [part.node for parts in (traffic.frames, traffic.reports, traffic.endings) for part in parts]
+    for node in [*named, *waiting]:
+        if node not in nodes:
+            raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")
+
+
+def wire_packet(node: str, packet: Packet) -> wire.WirePacket:
+    """Encode a packet for its receiver `node`."""
+    return wire.WirePacket(node, packet.sender, packet.sent_ns, packet.received_ns, packet.payload)

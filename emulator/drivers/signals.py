@@ -1,0 +1,67 @@
+"""Signal handlers of a run: set for as long as it lasts, and afterwards as they were before.
+
+Python gives signals to its main thread alone. On any other thread nothing is set here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import threading
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from types import FrameType
+from typing import Any
+
+ENDING = (signal.SIGINT, signal.SIGTERM)
+"""The signals that end a run early."""
+
+
+def gets_signals() -> bool:
+    """Return whether this thread is the one to which Python gives signals."""
+    return threading.current_thread() is threading.main_thread()
+
+
+@contextmanager
+def signals_handled(
+    handler: Callable[[int, FrameType | None], Any] | signal.Handlers, *numbers: signal.Signals
+) -> Iterator[None]:
+    """Handle these signals so within the block; restore what was set before on every way out of it."""
+    if not gets_signals():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, earlier in before.items():
+            # None: a handler that Python has not set, and cannot set again.
+            signal.signal(number, signal.SIG_DFL if earlier is None else earlier)
+
+
+@asynccontextmanager
+async def cancelled_by_signals() -> AsyncIterator[None]:
+    """Let the first Ctrl-C or SIGTERM cancel the task that runs the block; any further one changes nothing.
+
+    Set with `signal.signal`: `loop.add_signal_handler` could not give back a handler of the caller's loop.
+    """
+    loop = asyncio.get_running_loop()
+    task = asyncio.current_task()
+    assert task is not None
+    interrupted = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal interrupted
+        if not interrupted:
+            interrupted = True
+            loop.call_soon_threadsafe(task.cancel)  # which wakes the loop, unlike a call of cancel itself
+
+    with signals_handled(interrupt, *ENDING):
+        yield
+
+
+@contextmanager
+def signals_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C and SIGTERM within the block, but where a run in it handles them: records are kept."""
+    with signals_handled(signal.SIG_IGN, *ENDING):
+        yield

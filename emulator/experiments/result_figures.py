@@ -1,0 +1,301 @@
+"""Figures of results: errors against time, the paper's Table I, ratios to the hears-all bound.
+
+Each function writes a PNG and an SVG next to each other and returns the PNG's path; its `draw_…` only makes the
+figure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from emulator.experiments.style import (
+    BLACK,
+    BLUE,
+    GREY,
+    RED,
+    Look,
+    label_levels,
+    looks_of,
+    save,
+    shown,
+    styled,
+)
+from emulator.experiments.tables import mean_and_standard_error, paired_ratio
+from vnet.types import Array
+
+RATIO_LINES = {1.0: "the limit", 1.05: "1.05", 1.35: "1.35"}
+TIME_COLUMNS = {
+    "common_error_rmse_m": "RMSE of the\ncommon error (m)",
+    "deviation_m": "deviation across\nthe network (m)",
+}
+
+
+def against_time(
+    series: Mapping[str, Sequence[pa.Table]],
+    out: Path,
+    title: str,
+    references: Mapping[str, float] | None = None,
+    log: bool = False,
+    columns: Mapping[str, str] = TIME_COLUMNS,
+) -> Path:
+    """RMSE of the common error and network deviation (m) against time (s): means over seeds ± 1 standard error.
+
+    `series` has the metrics of each seed for each mechanism. `references` are levels of the RMSE (m) by label, as
+    the paper's; one whose label ends with a mechanism's name has its colour. `columns` are those of the metrics
+    that are drawn, a panel each, with its title.
+    """
+    return save(draw_against_time(series, title, references or {}, log, columns), out)
+
+
+@styled
+def draw_against_time(
+    series: Mapping[str, Sequence[pa.Table]],
+    title: str,
+    references: Mapping[str, float],
+    log: bool,
+    columns: Mapping[str, str] = TIME_COLUMNS,
+) -> Figure:
+    figure = Figure(figsize=(9, 6.4), layout="constrained")
+    panels = figure.subplots(len(columns), 1, sharex=True)
+    looks = looks_of(list(series))
+    for axes, (column, label) in zip(panels, columns.items(), strict=True):
+        for number, (mechanism, tables) in enumerate(series.items()):
+            _draw_band(axes, tables, column, looks[mechanism], mechanism, number / len(series))
+        axes.set_ylabel(label)
+        axes.margins(x=0.01)
+    for label, value in references.items():
+        named = [looks[mechanism].colour for mechanism in series if label.endswith(mechanism)]
+        panels[0].axhline(value, color=(named or [GREY])[-1], linewidth=1, linestyle=(0, (1, 2)), zorder=1.5)
+    for axes in panels:
+        if log:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        else:
+            axes.set_ylim(0, None)
+    labels = {value: f"{label} {value:.2f} m" for label, value in references.items()}
+    label_levels(panels[0], list(references.values()), [labels[value] for value in references.values()])
+    panels[-1].set_xlabel("time (s)")
+    figure.suptitle(f"{title}\n{_seeds_note(series)}")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, handlelength=3.5)
+    return figure
+
+
+def _draw_band(axes: Axes, tables: Sequence[pa.Table], column: str, look: Look, label: str, shift: float) -> None:
+    """Mean over seeds as a line, and ± 1 standard error where there are two seeds or more."""
+    time_s, values = _by_time(tables, column)
+    pairs = [mean_and_standard_error(row.tolist()) for row in values]
+    mean, error = np.array(pairs).reshape(-1, 2).T
+    every = (0.1 * shift, 0.1)
+    axes.plot(
+        time_s, mean, color=look.colour, linestyle=look.line, marker=look.marker, markersize=5, markevery=every,
+        linewidth=1.6, label=label,
+    )  # fmt: skip
+    axes.fill_between(time_s, mean - error, mean + error, color=look.colour, alpha=0.2, linewidth=0)
+
+
+def _by_time(tables: Sequence[pa.Table], column: str) -> tuple[Array, Array]:
+    """Times (K,) in seconds of any seed, and values (K, seeds), NaN where a seed has none."""
+    columns = [
+        (table["time_ns"].to_numpy(), table[column].cast(pa.float64()).to_numpy(zero_copy_only=False))
+        for table in tables
+    ]
+    time_ns = np.unique(np.concatenate([times for times, _ in columns])) if columns else np.zeros(0)
+    values = np.full((len(time_ns), len(columns)), np.nan)
+    for number, (times, found) in enumerate(columns):
+        values[np.searchsorted(time_ns, times), number] = found
+    return time_ns / 1e9, values
+
+
+def _seeds_note(series: Mapping[str, Sequence[pa.Table]]) -> str:
+    counts = sorted({len(tables) for tables in series.values()})
+    if not counts or counts[-1] < 2:
+        return "one seed"
+    return f"mean of {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} seeds, band ± 1 standard error"
+
+
+def alpha_curve(
+    rows: Sequence[Mapping[str, Any]],
+    paper: Mapping[float | str, tuple[float, float]],
+    out: Path,
+    columns: tuple[str, str] = ("stacked_deviation_m", "stacked_rmse_m"),
+) -> Path:
+    """Table I: √variance and √MSE (m) against constant α, and with optimized weights.
+
+    `rows` are results with `weights` ("optimized" or a number), `seed` and the two `columns`; `paper` has the
+    paper's √variance and √MSE (m) by α, and by "optimized" if wanted.
+    """
+    return save(draw_alpha_curve(rows, paper, columns), out)
+
+
+@styled
+def draw_alpha_curve(
+    rows: Sequence[Mapping[str, Any]], paper: Mapping[float | str, tuple[float, float]], columns: tuple[str, str]
+) -> Figure:
+    figure = Figure(figsize=(8.5, 5.2), layout="constrained")
+    axes = figure.subplots()
+    names = (("√variance", BLUE, "o", (0, (5, 2))), ("√MSE", RED, "s", (0, (1, 1.5))))
+    for column, (name, colour, marker, line) in zip(columns, names, strict=True):
+        found = _by_weights(rows, column)
+        constant = {weights: pair for weights, pair in found.items() if weights != OPTIMIZED_AT}
+        solid: dict[str, Any] = {"color": colour, "marker": marker, "capsize": 3, "linewidth": 1.6}
+        if constant:
+            mean, error = np.array([*constant.values()]).T
+            axes.errorbar([*constant], mean, error, label=f"{name}, constant α", **solid)
+        if OPTIMIZED_AT in found:
+            mean, error = found[OPTIMIZED_AT]
+            axes.errorbar([OPTIMIZED_AT], [mean], [error], **solid)
+            axes.axhline(mean, color=colour, linewidth=1.2, linestyle=line, label=f"{name}, optimized weights")
+    for number, (name, colour, marker, _) in enumerate(names):
+        points = {_alpha(weights): pair[number] for weights, pair in paper.items()}
+        open_marker: dict[str, Any] = {
+            "marker": marker,
+            "markersize": 9,
+            "markerfacecolor": "none",
+            "linestyle": "none",
+        }
+        if points:
+            axes.plot([*points], [*points.values()], color=colour, label=f"{name}, the paper's", **open_marker)
+    _dress_alpha_axis(axes)
+    axes.set_ylim(0, None)
+    axes.set_ylabel("√variance and √MSE (m)")
+    axes.set_title("Fusion weights on the ring of four vehicles: spread and error, ± 1 standard error", pad=10)
+    figure.legend(loc="outside lower center", ncols=2, handlelength=3)
+    return figure
+
+
+OPTIMIZED_AT = 1.12
+"""Position of the optimized weights on the axis of α."""
+
+
+def _dress_alpha_axis(axes: Axes) -> None:
+    ticks = {0.05: "0.05", 0.2: "0.2", 0.4: "0.4", 0.5: "0.5", 0.6: "0.6", 0.8: "0.8", 0.95: "0.95"}
+    axes.set_xticks([*ticks, OPTIMIZED_AT], [*ticks.values(), "optimized"])
+    axes.set_xlim(0, 1.2)
+    axes.axvline(1.035, color="0.6", linewidth=0.8)
+    axes.set_xlabel("α, the weight of a vehicle's own estimate")
+
+
+def _alpha(weights: float | str) -> float:
+    return OPTIMIZED_AT if weights == "optimized" else float(weights)
+
+
+def _by_weights(rows: Sequence[Mapping[str, Any]], column: str) -> dict[float, tuple[float, float]]:
+    """Mean and standard error over seeds by place on the axis, sorted; without those that have no value."""
+    values: dict[float, list[float | None]] = {}
+    for row in rows:
+        values.setdefault(_alpha(row["weights"]), []).append(row[column])
+    pairs = {place: mean_and_standard_error(values[place]) for place in sorted(values)}
+    return {place: pair for place, pair in pairs.items() if not np.isnan(pair[0])}
+
+
+def ratio_bars(
+    rows: Sequence[Mapping[str, Any]],
+    out: Path,
+    column: str = "rmse_m",
+    limit: str = "limit",
+    lines: Mapping[float, str] | None = None,
+) -> Path:
+    """The default profile: RMSE relative to the limit's, by network and mechanism, with ± 1 standard error.
+
+    `rows` are results with `network`, `mechanism`, `seed` and `column`; seeds are paired. `lines` are levels to
+    mark, and what to write there.
+    """
+    return save(draw_ratio_bars(rows, column, limit, RATIO_LINES if lines is None else lines), out)
+
+
+@styled
+def draw_ratio_bars(
+    rows: Sequence[Mapping[str, Any]], column: str, limit: str, lines: Mapping[float, str]
+) -> Figure:
+    ratios = _ratios(rows, column, limit)
+    networks = list(dict.fromkeys(str(row["network"]) for row in rows))
+    mechanisms = [name for name in dict.fromkeys(str(row["mechanism"]) for row in rows) if name != limit]
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    axes = figure.subplots()
+    axes.set_yscale("log")
+    width = 0.86 / max(1, len(mechanisms))
+    looks = looks_of(mechanisms)
+    for number, mechanism in enumerate(mechanisms):
+        place: Array = np.arange(len(networks), dtype=np.float64) + (number - (len(mechanisms) - 1) / 2) * width
+        pairs = [ratios.get((network, mechanism), (np.nan, np.nan)) for network in networks]
+        _draw_bars(axes, place, 0.88 * width, np.array(pairs, dtype=np.float64), looks[mechanism], mechanism)
+    for level in lines:
+        axes.axhline(level, color=BLACK, linewidth=1, linestyle="-" if level == 1 else (0, (4, 3)), zorder=2.5)
+    found = [mean + s * np.nan_to_num(error) for mean, error in ratios.values() for s in (-1, 1)]
+    _scale_ratios(axes, [value for value in (*found, *lines) if value > 0])
+    label_levels(axes, list(lines), list(lines.values()))
+    axes.set_xticks(range(len(networks)), [shown(network) for network in networks])
+    axes.set_xlim(-0.5, len(networks) - 0.5)
+    axes.grid(axis="x", visible=False)
+    axes.set_ylabel("RMSE of the common error,\nratio to the limit (log scale)")
+    axes.set_title("How near each mechanism comes to the limit of its network, ± 1 standard error", pad=10)
+    figure.legend(loc="outside lower center", ncols=4, handlelength=2.6, handleheight=1.3)
+    return figure
+
+
+def _ratios(
+    rows: Sequence[Mapping[str, Any]], column: str, limit: str
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Ratio to the limit and its standard error by network and mechanism; without those that have none."""
+    values: dict[tuple[str, str], dict[Any, float | None]] = {}
+    for row in rows:
+        values.setdefault((str(row["network"]), str(row["mechanism"])), {})[row["seed"]] = row[column]
+    ratios = {}
+    for (network, mechanism), by_seed in values.items():
+        reference = values.get((network, limit), {})
+        pair = paired_ratio([*by_seed.values()], [reference.get(seed) for seed in by_seed])
+        if mechanism != limit and not np.isnan(pair[0]):
+            ratios[network, mechanism] = pair
+    return ratios
+
+
+def _draw_bars(axes: Axes, place: Array, width: float, pairs: Array, look: Look, label: str) -> None:
+    """Bars that rise or fall from 1, with error bars and the ratio written beyond them; none where it is NaN."""
+    ratio, error = pairs.T
+    axes.bar(
+        place, ratio - 1, width, bottom=1, facecolor=_pale(look), edgecolor=look.colour, hatch=look.hatch,
+        linewidth=1, label=label,
+    )  # fmt: skip
+    down = np.minimum(error, 0.99 * ratio)
+    axes.errorbar(place, ratio, [down, error], fmt="none", ecolor=BLACK, capsize=2.5, linewidth=1.1, zorder=3)
+    for x, mean, bar in zip(place, ratio, np.nan_to_num(error), strict=True):
+        if np.isnan(mean):
+            axes.annotate("none", (x, 1), (0, 4), textcoords="offset points", ha="center", fontsize=8, rotation=90)
+            continue
+        end, offset, edge = (mean + bar, 3, "bottom") if mean >= 1 else (max(mean - bar, 0.01 * mean), -3, "top")
+        place_of: dict[str, Any] = {
+            "textcoords": "offset points",
+            "ha": "center",
+            "va": edge,
+            "fontsize": 8,
+            "zorder": 4,
+        }
+        axes.annotate(f"{mean:.2f}", (x, end), (0, offset), **place_of)
+
+
+def _pale(look: Look) -> tuple[float, float, float]:
+    """The colour, two thirds white: a hatch stays visible on it."""
+    r, g, b = to_rgb(look.colour)
+    return (2 + r) / 3, (2 + g) / 3, (2 + b) / 3
+
+
+def _scale_ratios(axes: Axes, values: Sequence[float]) -> None:
+    """A log axis from a little below the smallest to a little above the largest value, ticks written plainly."""
+    low, high = min(values), max(values)
+    room = (high / low) ** 0.08
+    axes.set_ylim(low / room, high * room)
+    marks = np.array([m * 10.0**e for e in range(-2, 4) for m in (1, 1.2, 1.5, 2, 3, 5, 7)])
+    if high / low < 2.5:
+        marks = np.round(np.arange(0.1, 10, 0.1), 1)
+    axes.yaxis.set_major_locator(FixedLocator(marks.tolist()))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -1,0 +1,72 @@
+"""What can be wrong with a single message of an agent, whatever came before it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from emulator.testing.conformance.findings import Findings
+from vnet.node import Report
+from vnet.transport import wire
+
+OF_TRAFFIC = ("own_node", "payload", "numbers", "report_time")
+OF_YIELDS = ("timers", "wakes", *OF_TRAFFIC)
+SLACK_NS = 50_000_000
+"""Real time: how much the two clocks of one machine may seem to differ."""
+OLDEST_NS = 1_000_000_000
+"""Real time: a report is on its way for less than this."""
+
+
+class Inspection:
+    """Checks messages of `node` and notes what is wrong in `findings`."""
+
+    def __init__(self, findings: Findings, node: str, max_payload: int) -> None:
+        self._findings = findings
+        self._node = node
+        self._max_payload = max_payload
+
+    def inspect_yield(self, message: wire.Yield, data: bytes, now_ns: int, shown_ns: int) -> None:
+        """Check the answer to a grant of `now_ns`, at which the vehicle's clock shows `shown_ns`."""
+        self._findings.expect(*OF_YIELDS)
+        timer_ns = message.next_timer_ns
+        if timer_ns is not None and timer_ns <= now_ns:
+            self._findings.fail("timers", f"next_timer_ns = {timer_ns} at {now_ns}", data)
+        for node in [*message.waiting_radio, *message.waiting_gnss]:
+            self._check_node(node, "a waiting node", data)
+        waits = timer_ns is not None or message.waiting_radio or message.waiting_gnss
+        if not waits and not message.traffic.endings:
+            self._findings.fail("wakes", "it waits for nothing and is never granted again", data)
+        self._inspect_traffic(message.traffic, data)
+        for report in message.traffic.reports:
+            if report.time_ns != shown_ns:
+                self._findings.fail("report_time", f"time_ns = {report.time_ns}, and not {shown_ns}", data)
+
+    def inspect_frames(self, message: wire.Frames, data: bytes, now_ns: int) -> None:
+        """Check traffic in real time that came at `now_ns`."""
+        self._findings.expect(*OF_TRAFFIC)
+        self._inspect_traffic(message.traffic, data)
+        for report in message.traffic.reports:
+            if not now_ns - OLDEST_NS <= report.time_ns <= now_ns + SLACK_NS:
+                self._findings.fail("report_time", f"time_ns = {report.time_ns}, received at {now_ns}", data)
+
+    def _inspect_traffic(self, traffic: wire.Traffic, data: bytes) -> None:
+        parts: list[wire.Frame | Report | wire.Ending] = [*traffic.frames, *traffic.reports, *traffic.endings]
+        for part in parts:
+            self._check_node(part.node, f"a {type(part).__name__.lower()}", data)
+        for frame in traffic.frames:
+            if (size := len(frame.payload)) > self._max_payload:
+                self._findings.fail("payload", f"{size} bytes, where {self._max_payload} are allowed", data)
+        for report in traffic.reports:
+            if not all(map(math.isfinite, _numbers(report))):
+                self._findings.fail("numbers", "a report with a number that is not finite", data)
+
+    def _check_node(self, node: str, what: str, data: bytes) -> None:
+        if node != self._node:
+            self._findings.fail("own_node", f"{what} of {node!r}", data)
+
+
+def _numbers(report: Report) -> Iterator[float]:
+    yield from report.estimate_m or ()
+    yield from report.covariance_m2 or ()
+    for value in report.values.values():
+        yield from value if isinstance(value, list) else [value]

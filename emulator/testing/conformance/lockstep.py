@@ -1,0 +1,162 @@
+"""Scenes in lockstep: a small emulator that grants what the agent waits for, and checks each yield."""
+
+from __future__ import annotations
+
+from emulator.testing.conformance.joining import absence, ask_stack, orphan
+from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError
+from vnet.transport import wire
+from vnet.units import NS_PER_S
+
+DURATION_NS = NS_PER_S
+MOST_GRANTS = 2000
+PACKET_AFTER_NS = 30_000_000
+"""How long after each fix a packet arrives."""
+CLOCK_ERROR_NS = 5_000_000
+MALFORMED = (b"\xc1", b"", b"\x93\xa5Grant\xa1x", b"\x91\xa9Nonsense1", b"\x81\x01\x02")
+"""No msgpack, nothing, a wrong type, an unknown kind, a map."""
+
+
+class Barrier:
+    """Grants one agent what it waits for, from `now_ns` on."""
+
+    def __init__(self, scene: Scene, now_ns: int = 0) -> None:
+        self.scene = scene
+        self.now_ns = now_ns
+        self.seq = 0
+        self._offset_ns = 0
+        self._next_fix = -(-now_ns // scene.world.period_ns)
+        self._next_packet_ns = now_ns + PACKET_AFTER_NS
+        self._packets: list[wire.WirePacket] = []
+        self._count = 0
+        self._answer: wire.Yield | None = None
+
+    def run(self, until_ns: int, clock_error_at_ns: int | None = None) -> None:
+        """Grant the first instant, and each before `until_ns` that the agent waits for."""
+        answer = self._answer or self.grant()
+        while (wake_ns := self._wake_ns(answer)) is not None and wake_ns < until_ns and self.seq < MOST_GRANTS:
+            self.now_ns = wake_ns
+            clocks = []
+            if clock_error_at_ns is not None and wake_ns >= clock_error_at_ns:
+                self._offset_ns, clock_error_at_ns = CLOCK_ERROR_NS, None
+                clocks = [wire.ClockError(self.scene.bench.node, wake_ns, CLOCK_ERROR_NS)]
+            answer = self.grant(clocks)
+
+    def _wake_ns(self, answer: wire.Yield) -> int | None:
+        """When the agent must be granted next."""
+        due_ns = [answer.next_timer_ns]
+        due_ns += [self._next_fix * self.scene.world.period_ns] if answer.waiting_gnss else []
+        due_ns += [self._next_packet_ns] if answer.waiting_radio else []
+        return min((time_ns for time_ns in due_ns if time_ns is not None), default=None)
+
+    def grant(self, clocks: list[wire.ClockError] | None = None) -> wire.Yield:
+        """Grant this instant with all that is due, and check the yield."""
+        scene = self.scene
+        while self._next_packet_ns <= self.now_ns:
+            sent_ns = self._next_packet_ns - 1_000_000
+            self._packets.append(scene.packet(self._count, sent_ns, self._next_packet_ns))
+            self._count += 1
+            self._next_packet_ns += scene.world.period_ns
+        fixes = []
+        while self._next_fix * scene.world.period_ns <= self.now_ns:
+            fixes.append(scene.fix(self._next_fix))
+            self._next_fix += 1
+        packets, self._packets = self._packets, []
+        scene.bench.say(wire.Grant(self.seq, self.now_ns, packets, fixes, clocks or []))
+        answer, said = scene.await_message(wire.Yield, "yields", scene.patience_s)
+        if answer.seq != self.seq:
+            scene.findings.fail("yields", f"seq = {answer.seq}, and not {self.seq}", said.data)
+            raise SceneOverError
+        self.seq += 1
+        scene.inspection.inspect_yield(answer, said.data, self.now_ns, self.now_ns + self._offset_ns)
+        if answer.next_timer_ns is not None and answer.next_timer_ns <= self.now_ns:
+            raise SceneOverError
+        self._answer = answer
+        return answer
+
+    def check_quiet(self) -> None:
+        """Nothing is said without a grant."""
+        self.scene.findings.expect("unasked")
+        said = self.scene.hear(QUIET_S)
+        if said is not None and isinstance(said.message, wire.Yield):
+            self.scene.findings.fail("unasked", f"Yield {said.message.seq}", said.data)
+
+
+def run(scene: Scene) -> None:
+    """A second of a run: fixes, packets, a clock that goes wrong, and the end."""
+    scene.join()
+    barrier = Barrier(scene)
+    barrier.run(DURATION_NS // 2)
+    barrier.check_quiet()
+    ask_stack(scene, scene.patience_s)
+    barrier.run(DURATION_NS, clock_error_at_ns=DURATION_NS * 7 // 10)
+    barrier.check_quiet()
+    scene.end()
+
+
+def restart(scene: Scene) -> None:
+    """The process is started again by a fault, in the middle of a run."""
+    scene.join()
+    Barrier(scene).run(DURATION_NS // 4)
+    before = scene.nonce
+    scene.bench.say(wire.End(None, "restarted by a fault"))
+    scene.await_exit("ends", scene.patience_s, fails=False)
+    scene.nonce, scene.silent = b"", True
+    scene.join(incarnation=1)
+    scene.findings.expect("new_nonce")
+    if scene.nonce == before:
+        scene.findings.fail("new_nonce", "the same")
+    Barrier(scene, now_ns=2_345_000_000).run(2_345_000_000 + DURATION_NS // 4)
+    scene.end()
+
+
+def ended(scene: Scene) -> None:
+    """The program has ended before the process was started again: it takes part, and says nothing."""
+    scene.join(incarnation=1, runs=False)
+    scene.findings.expect("no_traffic")
+    scene.bench.say(wire.Grant(0, NS_PER_S, [], [scene.fix(NS_PER_S // scene.world.period_ns)]))
+    answer, said = scene.await_message(wire.Yield, "yields", scene.patience_s)
+    traffic = answer.traffic
+    if traffic.frames or traffic.reports or answer.waiting_gnss or answer.waiting_radio:
+        scene.findings.fail("no_traffic", "traffic, or a node that waits", said.data)
+    scene.end()
+
+
+def malformed(scene: Scene) -> None:
+    """Bytes that are no message come between two grants."""
+    scene.join()
+    barrier = Barrier(scene)
+    barrier.run(DURATION_NS // 4)
+    if survives(scene):
+        barrier.run(DURATION_NS // 2)
+        scene.end()
+
+
+def survives(scene: Scene) -> bool:
+    """Say what is malformed; returns whether the agent goes on. If it ends, then with an error."""
+    scene.findings.expect("malformed")
+    for data in MALFORMED:
+        scene.bench.say(data)
+    while (said := scene.hear(QUIET_S)) is not None:
+        if isinstance(said.message, wire.Yield):
+            scene.findings.fail("malformed", "a Yield", said.data)
+    status = scene.bench.agent.exit_status
+    if status == 0:
+        scene.findings.fail("malformed", "exit status 0")
+    return status is None
+
+
+def lost(scene: Scene) -> None:
+    """The emulator is killed."""
+    scene.join()
+    Barrier(scene).run(DURATION_NS // 4)
+    orphan(scene)
+
+
+def away(scene: Scene) -> None:
+    """The emulator is restarted."""
+    scene.join()
+    barrier = Barrier(scene)
+    barrier.run(DURATION_NS // 4)
+    absence(scene)
+    barrier.run(DURATION_NS // 2)
+    scene.end()

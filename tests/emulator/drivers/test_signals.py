@@ -1,0 +1,92 @@
+"""Signal handlers are set for a block, and given back on every way out of it."""
+
+import asyncio
+import os
+import signal
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from emulator.drivers.signals import ENDING, cancelled_by_signals, gets_signals, signals_handled, signals_ignored
+
+
+def usual(number: int, frame: object) -> None:
+    """A handler of the caller's."""
+
+
+@pytest.fixture(params=[usual, signal.SIG_IGN, signal.SIG_DFL], ids=["own", "ignored", "default"], autouse=True)
+def before(request: pytest.FixtureRequest) -> Iterator[object]:
+    """Each of the ways in which a caller may handle signals."""
+    earlier = {number: signal.signal(number, request.param) for number in ENDING}
+    yield request.param
+    for number, handler in earlier.items():
+        signal.signal(number, handler)
+
+
+def test_handlers_are_restored_however_the_block_is_left(before: object) -> None:
+    with signals_ignored():
+        assert [signal.getsignal(number) for number in ENDING] == [signal.SIG_IGN] * 2
+    assert [signal.getsignal(number) for number in ENDING] == [before] * 2
+    with pytest.raises(ZeroDivisionError), signals_ignored():
+        raise ZeroDivisionError
+    assert [signal.getsignal(number) for number in ENDING] == [before] * 2
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_the_first_signal_cancels_the_task_and_a_second_one_does_not_disturb_its_end(
+    number: signal.Signals, before: object
+) -> None:
+    steps = []
+
+    async def work() -> None:
+        async with cancelled_by_signals():
+            try:
+                os.kill(os.getpid(), number)
+                await asyncio.sleep(60)
+            except asyncio.CancelledError:
+                os.kill(os.getpid(), number)
+                for _ in range(5):
+                    await asyncio.sleep(0)
+                steps.append("records are written")
+                raise
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(work())
+    assert steps == ["records are written"]
+    assert [signal.getsignal(number) for number in ENDING] == [before] * 2
+
+
+def test_a_handler_of_the_caller_s_loop_goes_on_afterwards() -> None:
+    heard: list[str] = []
+
+    async def work() -> None:
+        loop = asyncio.get_running_loop()
+        loop.add_signal_handler(signal.SIGTERM, heard.append, "SIGTERM")
+        async with cancelled_by_signals():
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        while not heard:
+            await asyncio.sleep(0)
+
+    asyncio.run(asyncio.wait_for(work(), 30))
+    assert heard == ["SIGTERM"]
+
+
+def test_on_another_thread_nothing_is_set(before: object) -> None:
+    seen: list[object] = []
+
+    async def work() -> None:
+        async with cancelled_by_signals():
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    def run() -> None:
+        seen.append(gets_signals())
+        with signals_handled(usual, signal.SIGUSR2):
+            seen.append(signal.getsignal(signal.SIGUSR2) is usual)
+        asyncio.run(work())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [False, False, before]

@@ -1,0 +1,159 @@
+"""Conformance finds no fault with agents that have none, and tells agents with a mistake which one."""
+
+import sys
+from collections.abc import Sequence
+
+import pytest
+
+from emulator.cli.commands import app
+from emulator.scenario.scenario import Scenario
+from emulator.terminal.console import run_app
+from emulator.testing.conformance.findings import CHECKS, Findings, decoding_problem, described
+from emulator.testing.conformance.play import SCENES, Conformance
+from tests.support.paths import ROOT
+from vnet.errors import VnetError
+
+VALUES = ["--connect", "{endpoint}", "--run", "{run}", "--node", "{node}", "--credentials", "{credentials}"]
+FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py", *VALUES]
+VNET_AGENT = [sys.executable, "-P", "-m", "agents.cli", *VALUES]
+
+
+def play(
+    command: Sequence[str], *scenes: str, patience_s: float = 20.0, listen: str = "tcp/127.0.0.1:0"
+) -> Findings:
+    return Conformance(command, Scenario(), scenes or list(SCENES), listen, patience_s).play()
+
+
+def wrong(mistake: str) -> list[str]:
+    return [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_agent", mistake, *VALUES]
+
+
+@pytest.fixture(autouse=True)
+def at_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
+@pytest.mark.parametrize("command", [FOREIGN, VNET_AGENT], ids=["foreign", "vnet-agent"])
+def test_an_agent_without_a_mistake_passes_every_check(command: list[str]) -> None:
+    found = play(command)
+    assert found.failed == {}
+    assert found.made.keys() == CHECKS.keys()
+
+
+def test_an_agent_passes_over_tls() -> None:
+    assert play(FOREIGN, "lockstep", listen="tls/127.0.0.1:0").failed == {}
+
+
+@pytest.mark.parametrize(
+    ("mistake", "scene", "check", "came"),
+    [
+        ("SaysHelloOnce", "joining", "hello_repeats", "no Hello within"),
+        ("ReadyAtOnce", "refusal", "hello", "ready = True"),
+        ("ShortNonce", "refusal", "hello", "a nonce of 1 byte;"),
+        ("CannotLoadItsProgram", "lockstep-ended", "ready", "no module beacon"),
+        ("TakesAnyWelcome", "joining", "others_nonce", "ready after another's welcome"),
+        ("EndsThoughItIsRefused", "refusal", "refused", "exit status 0"),
+        ("Deaf", "refusal", "refused", "it still runs after"),
+        ("SaysTextForInteger", "lockstep-ended", "decodes", "(Yield.seq)"),
+        ("ForgetsItsNonce", "lockstep-ended", "nonce", "Yield with another"),
+        ("CountsByItself", "lockstep", "yields", "seq = 1, and not 0"),
+        ("YieldsTwice", "lockstep", "yields", "seq = 0, and not 1"),
+        ("YieldsBeforeTheGrant", "lockstep-ended", "silence", "Yield"),
+        ("TimerInThePast", "lockstep", "timers", "next_timer_ns = 0 at 0"),
+        ("WaitsForNothing", "lockstep-lost", "wakes", "it waits for nothing"),
+        ("AnswersLate", "lockstep-lost", "yields", "no Yield within 1 s"),
+        ("SpeaksForOthers", "lockstep-lost", "own_node", "a frame of 'v02'"),
+        ("SendsTooMuch", "lockstep-lost", "payload", "100000 bytes, where"),
+        ("ReportsNan", "lockstep-lost", "numbers", "not finite"),
+        ("ReportsWallClock", "lockstep-lost", "report_time", "and not 0"),
+        ("RunsThoughItHasEnded", "lockstep-ended", "no_traffic", "traffic"),
+        ("KeepsItsNonce", "lockstep-restart", "new_nonce", "the same"),
+        ("IgnoresStackRequests", "lockstep", "stack", "no StackDump within"),
+        ("EndsWithAnError", "lockstep-ended", "ends", "exit status 1: an error at the very end"),
+        ("GivesUpAtOnce", "lockstep-lost", "orphan", "it ended after 0."),
+        ("GivesUpAtOnce", "lockstep-away", "waits", "exit status 3"),
+        ("TakesGarbageForTheEnd", "lockstep-malformed", "malformed", "exit status 0"),
+        ("CountsFramesWrongly", "realtime-restart", "frames_seq", "seq = 7, and not 0"),
+        ("NeverAcknowledges", "realtime", "acknowledges", "received_seq = 0"),
+        ("HidesGaps", "realtime", "missed", "nothing of [[4, 5]]"),
+        ("TooFewBins", "realtime-restart", "decodes", "(Frames.lateness)"),
+        ("NoLastWords", "realtime-restart", "final", "no such Frames"),
+        ("ReportsWallClock", "realtime-restart", "report_time", "received at"),
+    ],
+)
+def test_an_agent_is_told_its_mistake(mistake: str, scene: str, check: str, came: str) -> None:
+    found = play(wrong(mistake), scene, patience_s=1.0)
+    assert came in dict(found.failed[check])[scene]
+
+
+def test_an_agent_that_does_not_start_is_told_what_it_printed() -> None:
+    command = [sys.executable, "-c", "print('no such library'); exit(4)", *VALUES]
+    assert play(command, "refusal").failed == {"starts": [("refusal", "exit status 4: no such library")]}
+
+
+def test_an_agent_that_never_says_hello_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulator.testing.conformance.scene.START_UP_S", 0.2)
+    command = [sys.executable, "-c", "import time; time.sleep(60)", *VALUES]
+    found = play(command, "refusal", patience_s=0.2)
+    assert found.failed["hello"] == [("refusal", "no Hello within 0.2 s")]
+
+
+def conformance(*arguments: str) -> int:
+    return run_app(app, ["conformance", *arguments])
+
+
+def test_the_command_prints_a_line_for_each_check_and_ends_with_0(capsys: pytest.CaptureFixture[str]) -> None:
+    assert conformance("--scene", "refusal", "--", *FOREIGN) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [line.split()[1] for line in lines] == list(CHECKS)
+    assert {line.split()[0] for line in lines} == {"ok", "-"}
+    assert last == "5 checks: 0 wrong"
+
+
+def test_the_command_shows_the_bytes_of_what_is_wrong_and_ends_with_1(capsys: pytest.CaptureFixture[str]) -> None:
+    assert conformance("--scene", "refusal", "--", *wrong("OfAnotherProcess")) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrong")]
+    assert "came in refusal: node 'v01', process_id 'v02'; ['Hello', 'v01', 'v02', b'" in line
+    assert "bytes: 98 a5 48 65 6c 6c 6f" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scene", "lockstepp", "--", *FOREIGN], "--scene lockstepp: unknown (did you mean lockstep?)"),
+        (["--", "./agent", "{endpoint}", "{run}", "{node}"], "the command has no {credentials}"),
+        (["--", "./no-such-agent", *VALUES], "cannot start './no-such-agent': No such file or directory"),
+        ([], "missing argument"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_ends_with_2(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert conformance(*arguments) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_command_that_cannot_know_the_node_is_refused() -> None:
+    with pytest.raises(VnetError, match=r"the command has no \{node\}"):
+        Conformance(["agent", "{endpoint}", "{run}", "{credentials}"], Scenario(), ["refusal"])
+
+
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (b"\x97\xa5Yield\xc4\x01n\xa10\xc0\x90\x90\x93\x90\x90\x90", "(Yield.seq)"),
+        (b"\x93\xa9StackDump\x01\xa0", "(StackDump.nonce)"),
+        (b"\xc1", "no message"),
+        (b"\x91\xa9Nonsense1", "no message"),
+    ],
+)
+def test_what_does_not_decode_is_named_by_its_field(data: bytes, problem: str) -> None:
+    message, why = decoding_problem(data)
+    assert message is None
+    assert problem in why
+
+
+def test_bytes_that_are_no_msgpack_are_shown_all_the_same() -> None:
+    assert described(b"\xc1" * 60).startswith("no msgpack (")
+    assert described(b"\xc1" * 60).endswith("60 bytes: " + " ".join(["c1"] * 48) + " …")

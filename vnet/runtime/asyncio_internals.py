@@ -1,0 +1,94 @@
+"""The parts of asyncio outside its documented interface on which virtual time depends, each behind one function.
+
+No other module of vnet touches them. `tests/vnet/runtime/test_asyncio_internals.py` has a test for each, which
+names what is missing or different when a new version of Python changes it. What is assumed:
+
+- The loop keeps callbacks that are ready in the queue `_ready`: it puts them in with `append` alone, and takes
+  them out with `popleft`, in rounds. The queue may be exchanged between two rounds.
+- The loop keeps timers in the heap `_scheduled`, ordered by `TimerHandle.__lt__`; the flag `_scheduled` of a timer
+  says that it is there. Cancelled timers have left the head of the heap before the loop waits.
+- A round waits in `select(timeout)` of the selector given to the loop: `timeout` is 0 or less if a callback is
+  ready or a timer is due, and None if there is no timer.
+- Timers that are earlier than `time()` plus `_clock_resolution` are due; `call_later` sets its timer by `call_at`.
+- `_default_executor`, `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import Context
+from typing import Any, cast
+
+
+def ready_queue(loop: asyncio.AbstractEventLoop) -> deque[asyncio.Handle]:
+    """Return the loop's own queue of callbacks that are ready to run."""
+    return cast("deque[asyncio.Handle]", _private(loop)._ready)
+
+
+def replace_ready_queue(loop: asyncio.AbstractEventLoop, queue: deque[asyncio.Handle]) -> None:
+    """Let the loop use `queue`, which holds what was ready, from its next round on."""
+    _private(loop)._ready = queue
+
+
+def push_timer(loop: asyncio.AbstractEventLoop, timer: asyncio.TimerHandle) -> None:
+    """Add a timer to the loop's heap."""
+    heapq.heappush(_private(loop)._scheduled, timer)
+    _private(timer)._scheduled = True
+
+
+def next_timer(loop: asyncio.AbstractEventLoop) -> asyncio.TimerHandle | None:
+    """Return the head of the loop's heap of timers; while the loop waits, this timer is not cancelled."""
+    timers: list[asyncio.TimerHandle] = _private(loop)._scheduled
+    return timers[0] if timers else None
+
+
+def set_clock_resolution(loop: asyncio.AbstractEventLoop, seconds: float) -> None:
+    """Set by how much a timer may fire before its time."""
+    _private(loop)._clock_resolution = seconds
+
+
+def check_not_closed(loop: asyncio.AbstractEventLoop) -> None:
+    """Raise RuntimeError if the loop is closed, as its own methods do."""
+    _private(loop)._check_closed()
+
+
+def default_executor(loop: asyncio.AbstractEventLoop, thread_name_prefix: str) -> ThreadPoolExecutor:
+    """Return the loop's default executor, which the loop shuts down; make one if there is none."""
+    if _private(loop)._default_executor is None:
+        loop.set_default_executor(ThreadPoolExecutor(thread_name_prefix=thread_name_prefix))
+    return cast("ThreadPoolExecutor", _private(loop)._default_executor)
+
+
+def context_of(handle: asyncio.Handle) -> Context:
+    """Return the context in which a callback will run."""
+    return cast("Context", _private(handle)._context)
+
+
+def abandon(task: asyncio.Task[Any]) -> None:
+    """Let a pending task be destroyed without a message in the log."""
+    _private(task)._log_destroy_pending = False
+
+
+class NumberedTimer(asyncio.TimerHandle):
+    """A timer with a number: timers of one instant fire in the order in which they were set.
+
+    asyncio leaves that order to the shape of its heap, and so to how many other nodes share the loop.
+    """
+
+    __slots__ = ("_number",)
+
+    def __init__(self, number: int, *rest: Any) -> None:
+        super().__init__(*rest)
+        self._number = number
+
+    def __lt__(self, other: asyncio.TimerHandle) -> bool:
+        assert isinstance(other, NumberedTimer)
+        return (self.when(), self._number) < (other.when(), other._number)
+
+
+def _private(owner: object) -> Any:
+    """The same object without its published type, which lacks the attributes of this module."""
+    return owner
