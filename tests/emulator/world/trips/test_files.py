@@ -1,4 +1,4 @@
-"""Files of trips: what each reader reads, and that a wrong file is refused in one line that names its place."""
+"""Files of trips: the readers, and refusals in one line that names the row or line."""
 
 import math
 from pathlib import Path
@@ -57,7 +57,7 @@ def world_of(path: Path, duration_s: float = 2.0, rate_hz: float = 10.0, **netwo
 
 
 def refusal(path: Path, **network: Any) -> str:
-    """What is said of a file that cannot be used: one line, which begins with its name."""
+    """Return the error of a bad file without its name, with which it must begin."""
     with pytest.raises(ScenarioError) as caught:
         world_of(path, **network)
     text = str(caught.value)
