@@ -1,4 +1,4 @@
-"""vnet: what vehicle programs and the emulator agree on. A program needs only `from vnet import Node`."""
+"""vnet: the interface between vehicle programs and the emulator. A program needs only `from vnet import Node`."""
 
 from vnet.node import Fix, Node, Packet
 

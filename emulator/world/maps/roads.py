@@ -191,7 +191,7 @@ class _Row:
 
 
 class RoadsBuilder:
-    """Collects roads as a file is read; points with the same key, which the reader chooses, are the same point."""
+    """Builder of `Roads` from a file; points with the same key, which the reader chooses, are the same point."""
 
     def __init__(self, source: object) -> None:
         self._source = source
