@@ -81,7 +81,7 @@ def test_a_column_without_a_text_is_refused() -> None:
 def event_kinds() -> set[str]:
     """The kinds of events that the emulator's code names; f-strings aside."""
     found = set()
-    for path in (ROOT / "emulator" / "drivers").glob("*.py"):
+    for path in (ROOT / "emulator" / "drivers").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             match node:
                 case ast.Call(func=ast.Attribute(attr="event"), args=[_, ast.Constant(value=str(kind)), *_]):
