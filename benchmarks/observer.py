@@ -22,10 +22,9 @@ from typing import Any
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import RECORDING, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.bound import Limit
-from emulator.viewer.sinks import RECORDING
 from emulator.world.world import build_world
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access

@@ -28,8 +28,9 @@ from typing import Any
 from PIL import Image
 from rerun.experimental import ViewerClient
 
+from emulator.records.run_folder import RECORDING
 from emulator.viewer.blueprints import blueprint
-from emulator.viewer.sinks import RECORDING, place_to_serve, viewer_command
+from emulator.viewer.sinks import place_to_serve, viewer_command
 
 SCENARIO = Path(__file__).parent / "pictures" / "pictures.toml"
 VEHICLE = "v08"

@@ -1,17 +1,20 @@
-"""What holds for all tests, wherever they are started from."""
+"""Fixtures for tests of all packages."""
 
 import signal
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 
-@pytest.fixture(autouse=True)
-def signals_are_heard() -> None:
-    """No test begins deaf to Ctrl-C or SIGTERM, which all that it starts would be, too.
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM do what they do by default, in this process and in those that the test starts.
 
-    A shell that runs tests in the background, as CI may, ignores Ctrl-C for them; and a live run in this process
-    ends with both ignored, so that a second Ctrl-C does not lose its records.
+    A shell that runs the tests in the background has them ignore Ctrl-C, and so would all that they start.
     """
-    for number, usual in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
-        if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(number, usual)
+    defaults: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)

@@ -6,7 +6,7 @@ assertions, not members of this family.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 LONGEST_MESSAGE = 2000
@@ -39,6 +39,12 @@ def shown(value: object) -> str:
         return printable(repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits; a value nested too deeply
         return f"({type(value).__name__})"
+
+
+def first_names(names: Sequence[object], most: int = 8, with_total: bool = False) -> str:
+    """Return the first `most` names; an ellipsis, with the total if wanted, ends a longer list."""
+    total = f" ({len(names)})" if with_total else ""
+    return ", ".join(map(str, names[:most])) + (f", …{total}" if len(names) > most else "")
 
 
 def did_you_mean(word: object, known: Iterable[str]) -> str:

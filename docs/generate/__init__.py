@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from docs.generate import commands, faults, files, node, scenario
+from docs.generate import checks, commands, faults, files, node, scenario
 
 REFERENCE = Path(__file__).parents[1] / "reference"
 PAGES: dict[str, Callable[[], str]] = {
+    "checks.md": checks.page,
     "commands.md": commands.page,
     "faults.md": faults.page,
     "files.md": files.page,

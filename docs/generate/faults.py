@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, get_args
+from collections.abc import Iterator, Mapping
 
 from docs.generate.keys import key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
-from emulator.scenario import faults
+from emulator.scenario.fault_families import Fault, Selector
+from emulator.scenario.faults import KINDS
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a
@@ -41,58 +41,39 @@ payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, f
 INFRASTRUCTURE = """
 Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
 """
-GROUPS: dict[str, tuple[Any, str]] = {
-    "Processes": (faults.ProcessFault, ""),
-    "The network": (faults.Partition | faults.LinkFault | faults.Throttle | faults.Range | faults.Swizzle, ""),
-    "GNSS receivers": (faults.GnssOutage | faults.GnssJump | faults.GnssRamp | faults.GnssFreeze, ""),
-    "Clocks": (faults.ClockFault, ""),
-    "Misbehaviour": (faults.ConstPosOffset | faults.RandomPos | faults.SenderFault, MISBEHAVIOUR),
-    "Infrastructure": (faults.Infrastructure, INFRASTRUCTURE),
-}
-"""Titles, the kinds below them, and what is to be said of all of these."""
-OF = {faults._LinkFault: "links", faults._NodeFault: "vehicles", faults._Fault: "the whole"}
-TIMES = ("at_s", "duration_s")
-SHARED = ("kind", *TIMES, "nodes", "senders", "receivers")
-
-Kind = type[faults._Fault]
+NOTES = {"Misbehaviour": MISBEHAVIOUR, "Infrastructure": INFRASTRUCTURE}
+"""Notes below the titles of chapters."""
+SHARED = ("nodes", "senders", "receivers")
+"""Selectors, which the introduction describes."""
 
 
 def page() -> str:
-    """The whole page. Raises LookupError if a kind is in no group."""
-    named = {_name(kind) for group, _ in GROUPS.values() for kind in get_args(group)}
-    if missing := set(faults.KINDS) - named:
-        raise LookupError(f"in no group of docs.generate.faults: {', '.join(sorted(missing))}")
-    parts = [INTRODUCTION, "## What all have", key_table(faults._Fault), COMMON]
-    parts += ["## Selectors", SELECTORS, key_table(faults.Selector)]
-    for title, (group, said) in GROUPS.items():
-        parts += [f"## {title}", said, *_group(get_args(group))]
+    """Return the whole page: a chapter for each `chapter` that a kind names, in the order of the kinds."""
+    parts = [INTRODUCTION, "## Common keys", key_table(Fault, without=("kind",)), COMMON]
+    parts += ["## Selectors", SELECTORS, key_table(Selector)]
+    for title in dict.fromkeys(kind.chapter for kind in KINDS.values()):
+        chapter = {name: kind for name, kind in KINDS.items() if kind.chapter == title}
+        parts += [f"## {title}", NOTES.get(title, ""), *_chapter(chapter)]
     return whole_page("Faults", *parts)
 
 
-def _group(kinds: tuple[Kind, ...]) -> Iterator[str]:
-    """All kinds of a group in a table, and the keys of those that have some."""
-    own = {kind: key_table(kind, without=_without(kind)) for kind in kinds}
-    rows = ([_linked(kind, keys), _of(kind), docstring(kind)] for kind, keys in own.items())
-    yield table(["kind", "of", "what happens"], rows)
-    for kind in kinds:
-        if own[kind]:
-            yield f"### `{_name(kind)}`"
-            yield own[kind]
+def _chapter(kinds: Mapping[str, type[Fault]]) -> Iterator[str]:
+    """Yield the table of all kinds of a chapter, and the keys of those that have their own."""
+    own = {name: key_table(kind, without=_without(kind)) for name, kind in kinds.items()}
+    rows = ([_linked(name, own[name]), kind.acts_on, docstring(kind)] for name, kind in kinds.items())
+    yield table(["kind", "acts on", "what happens"], rows)
+    for name, keys in own.items():
+        if keys:
+            yield f"### `{name}`"
+            yield keys
 
 
-def _name(kind: Kind) -> str:
-    return str(get_args(kind.model_fields["kind"].annotation)[0])
-
-
-def _linked(kind: Kind, keys: str) -> str:
-    name = _name(kind)
+def _linked(name: str, keys: str) -> str:
     return f"[`{name}`](#{name.lower()})" if keys else f"`{name}`"
 
 
-def _of(kind: Kind) -> str:
-    return next(words for base, words in OF.items() if issubclass(kind, base))
-
-
-def _without(kind: Kind) -> tuple[str, ...]:
-    """What need not be said again: what is as for other kinds."""
-    return tuple(name for name in SHARED if name not in TIMES or name not in kind.__annotations__)
+def _without(kind: type[Fault]) -> tuple[str, ...]:
+    """The keys that need not be repeated: selectors, and those that every fault has with the same default."""
+    common = Fault.model_fields
+    same = [name for name in common if kind.model_fields[name].default == common[name].default]
+    return ("kind", *SHARED, *same)

@@ -32,6 +32,8 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
+from emulator.records.atomic import whole, write_atomically
+from emulator.records.divergence import first_divergences
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.world import build_world
@@ -41,8 +43,6 @@ from vnet.transport.session import quiet_zenoh
 from vnet.types import Array
 
 FORMAT = 1
-DIVERGENT_M, DIVERGENT_S = 10.0, 5.0
-"""A vehicle is divergent whose common error is larger for so long (MODEL 6)."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +173,12 @@ def run_cell(cell: Cell, store: Path, live: bool = False) -> None:
             event = broken[0]
             raise VnetError(f"cell {cell.labels}: {event.node} {event.kind}: {event.details.get('error', '')}")
     figures = measure(emulation, cell.from_s)
-    series = store / f"{cell.digest}.parquet"
-    pq.write_table(emulation.metrics.metrics_table(), series.with_suffix(".tmp"))
-    series.with_suffix(".tmp").rename(series)
+    with whole(store / f"{cell.digest}.parquet") as part:
+        pq.write_table(emulation.metrics.metrics_table(), part)
     if cell.keeps_states:
-        pq.write_table(emulation.metrics.states_table(), _states_path(store, cell))
-    result = _result_path(store, cell)
-    result.with_suffix(".tmp").write_text(json.dumps(figures))
-    result.with_suffix(".tmp").rename(result)
+        with whole(_states_path(store, cell)) as part:
+            pq.write_table(emulation.metrics.states_table(), part)
+    write_atomically(_result_path(store, cell), json.dumps(figures))
 
 
 def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
@@ -232,16 +230,9 @@ def _points(states: pa.Table, name: str) -> Array:
 
 
 def _divergent(states: pa.Table, vehicles: int, period_ns: int) -> int:
-    """How many vehicles' common error was over 10 m for 5 s on end, at any time."""
-    error = np.hypot(*(_points(states, "common_error_estimate_m") - _points(states, "common_error_m")).T)
-    wrong = (error > DIVERGENT_M).reshape(-1, vehicles)
-    needed = max(1, round(DIVERGENT_S * 1e9 / period_ns))
-    run = np.zeros(vehicles, dtype=int)
-    longest = run
-    for row in wrong:
-        run = np.where(row, run + 1, 0)
-        longest = np.maximum(longest, run)
-    return int(np.sum(longest >= needed))
+    """The number of vehicles that diverged at any time."""
+    error_m = np.hypot(*(_points(states, "common_error_estimate_m") - _points(states, "common_error_m")).T)
+    return len(first_divergences(error_m.reshape(-1, vehicles), period_ns))
 
 
 def _mean_value(states: pa.Table, name: str) -> float | None:

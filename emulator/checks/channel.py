@@ -11,7 +11,8 @@ from scipy.stats import binom
 from emulator.radio.outcomes import Outcome
 from emulator.records.recorded_run import ARRIVED, NEVER_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
-from emulator.scenario.faults import SenderFault, StaleMessages
+from emulator.scenario.fault_families import SenderFault
+from emulator.scenario.faults import StaleMessages
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 

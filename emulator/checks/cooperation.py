@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from emulator.checks.channel import admitted_by_cap
+from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, first_divergences
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
-from emulator.scenario.faults import GnssFault
+from emulator.scenario.fault_families import GnssFault
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
@@ -21,8 +21,6 @@ AT_REST_S = 5.0
 WITHIN_S = 10.0
 BACK_FACTOR, BACK_LEAST_M = 2.0, 0.3
 LEVEL_PERIODS = 20
-LOST_M, LOST_S = 10.0, 5.0
-"""MODEL 6: a vehicle is divergent when its common error is over 10 m for 5 s."""
 
 
 def honest(recorded: RecordedRun) -> Mask:
@@ -168,19 +166,15 @@ def check_bounded_error(recorded: RecordedRun) -> Finding:
         return NotExercised(name, "the program reports no common error")
     error_m = np.hypot(*np.moveaxis(common_m - recorded.vectors("common_error_m"), 2, 0))
     judged = np.isfinite(error_m) & ups(recorded) & honest(recorded) & ~_deceived(recorded)
-    over = judged & (error_m > LOST_M)
-    need = max(1, round(LOST_S * NS_PER_S / recorded.scenario.period_ns))
-    run_length = np.zeros(over.shape[1], dtype=int)
-    lost: dict[int, dict[str, Any]] = {}
-    for period in range(len(over)):
-        run_length = np.where(over[period], run_length + 1, 0)
-        for node in np.flatnonzero(run_length == need).tolist():
-            row = {"node": recorded.node_ids[node], "period": period, "error_m": float(error_m[period, node])}
-            lost.setdefault(node, row)
+    diverged = first_divergences(np.where(judged, error_m, np.nan), recorded.scenario.period_ns)
+    rows = [
+        {"node": recorded.node_ids[node], "period": period, "error_m": float(error_m[period, node])}
+        for node, period in diverged.items()
+    ]
     worst = float(error_m[judged].max(initial=0))
-    text = f"no common error over {LOST_M:g} m for {LOST_S:g} s; {worst:.1f} m at most"
-    broken_text = f"{len(lost)} vehicles' common error was over {LOST_M:g} m for {LOST_S:g} s"
-    return result(name, len(lost), text, broken_text, list(lost.values()), worst_m=worst, lost=len(lost))
+    text = f"no common error over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s; {worst:.1f} m at most"
+    broken_text = f"{len(rows)} vehicles' common error was over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s"
+    return result(name, len(rows), text, broken_text, rows, worst_m=worst, lost=len(rows))
 
 
 def _deceived(recorded: RecordedRun) -> Mask:

@@ -1,13 +1,17 @@
-"""The "sometimes" checks: that each fault of the plan did act on something, and that the run shows it."""
+"""The checks `effect:LABEL`: each fault of the plan acted on something, and the run shows it.
+
+`effect` is a function of the fault's class: it dispatches to the function that is registered for the class or the
+nearest of its families.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import singledispatch
 
 import numpy as np
 
 from emulator.checks.channel import changed_bytes
-from emulator.checks.faults import CUTTING, LOSING, SENDING
 from emulator.checks.latency import bounds
 from emulator.checks.senders import is_noise
 from emulator.faults.plan import PlannedFault
@@ -15,20 +19,29 @@ from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, unknown
-from emulator.scenario.faults import ClockFault, GnssFault, Infrastructure, ProcessFault, SenderFault, Throttle
+from emulator.scenario.fault_families import (
+    ClockFault,
+    DelayFault,
+    Fault,
+    GnssFault,
+    Infrastructure,
+    ProcessFault,
+    SenderFault,
+)
+from emulator.scenario.faults import Corrupt, GnssFreeze, GnssOutage, Throttle
 from vnet.types import Mask
 from vnet.units import NS_PER_MS
 
-IN_ROWS = (*CUTTING, *LOSING, *SENDING, "duplicate")
-DELAYING = ("delay", "jitter", "reorder", "throttle")
 PHASE_NS = 1_000_000
+"""Within a period, a program that sends by the clock does so at times no further apart."""
 STEADY_FRAMES = 5
+"""Frames that show that a program sends by the clock."""
 
 
-def check_bits(recorded: RecordedRun) -> Iterator[Finding]:
-    """One finding for each fault of the plan: it bit, or nothing shows that it did."""
+def check_fault_effects(recorded: RecordedRun) -> Iterator[Finding]:
+    """Yield a finding for each fault of the plan: it took effect, or nothing shows that it did."""
     for planned in recorded.plan:
-        name = f"bit:{planned.label}"
+        name = f"effect:{planned.label}"
         if planned.start_ns == planned.end_ns:
             yield NotExercised(name, "it was healed before it began")
         elif planned.start_ns >= recorded.closed_ns:
@@ -36,36 +49,83 @@ def check_bits(recorded: RecordedRun) -> Iterator[Finding]:
         elif isinstance(planned.fault, SenderFault) and _held_down(recorded, planned):
             yield NotExercised(name, "other faults kept its vehicles from sending all the while")
         else:
-            yield _bit(recorded, planned, name)
+            yield effect(planned.fault, recorded, planned, name)
 
 
-def _bit(recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    kind = planned.fault.kind
-    if kind == "corrupt":
-        changed = changed_bytes(recorded) & (recorded.cause == planned.number)
-        return _found(name, int(changed.sum()), "pairs arrive with other bytes", "no pair arrives with other bytes")
-    if kind in IN_ROWS:
-        return _found(name, int((recorded.cause == planned.number).sum()), "pairs name it", "no pair names it")
-    if kind in DELAYING:
-        text = "arrivals are later than they could be without it"
-        return _found(name, _delayed(recorded, planned), text, "no arrival is later than it could be without it")
-    if kind in ("kill", "restart", "pause"):
-        text = "nodes fell silent or deaf"
-        return _found(name, _silenced(recorded, planned), text, "no node had sent or reported before and then not")
-    if isinstance(planned.fault, GnssFault):
-        text = "fixes are where no receiver's noise puts them, or not there"
-        return _found(name, _bent(recorded, planned), text, "the fixes could be those of a sound receiver")
-    if isinstance(planned.fault, ClockFault):
-        return _clocks(recorded, planned, name)
-    assert isinstance(planned.fault, Infrastructure), planned.fault
-    return _restarts(recorded, planned, name)
+@singledispatch
+def effect(fault: Fault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    """Return what shows that a planned fault took effect: unless its class says otherwise, rows that name it."""
+    count = int((recorded.cause == planned.number).sum())
+    return _found(name, count, "receptions name it", "no reception names it")
+
+
+@effect.register
+def _(fault: Corrupt, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    changed = changed_bytes(recorded) & (recorded.cause == planned.number)
+    return _found(name, int(changed.sum()), "receptions with changed bytes", "no reception with changed bytes")
+
+
+@effect.register
+def _(fault: DelayFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    return _later(name, _delayed(recorded, planned))
+
+
+@effect.register
+def _(fault: Throttle, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    return _later(name, _delayed(recorded, planned) + _overflowed(recorded, planned))
+
+
+def _later(name: str, count: int) -> CheckResult:
+    text = "arrivals are later than they could be without it"
+    return _found(name, count, text, "no arrival is later than it could be without it")
+
+
+@effect.register
+def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    count = _silenced(recorded, planned)
+    return _found(
+        name, count, "nodes neither sent nor received", "no node had sent or reported before and then not"
+    )
+
+
+@effect.register
+def _(fault: GnssFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    error_m = (recorded.vectors("fix_m") - recorded.vectors("position_m") - recorded.vectors("common_error_m"))[
+        _affected(recorded, planned)
+    ]
+    error_m = error_m[np.isfinite(error_m).all(axis=1)]
+    as_noise = not len(error_m) or is_noise(error_m, recorded.scenario.world.gnss.sigma_m)
+    return _wrong_fixes(name, 0 if as_noise else len(error_m))
+
+
+@effect.register
+def _(fault: GnssOutage, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    fix_m = recorded.vectors("fix_m")[_affected(recorded, planned)]
+    return _wrong_fixes(name, int((~np.isfinite(fix_m).all(axis=1)).sum()))
+
+
+@effect.register
+def _(fault: GnssFreeze, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    fix_m = recorded.vectors("fix_m")
+    repeated = (fix_m[1:] == fix_m[:-1]).all(axis=2)
+    return _wrong_fixes(name, int(repeated[_affected(recorded, planned)[1:]].sum()))
+
+
+def _affected(recorded: RecordedRun, planned: PlannedFault) -> Mask:
+    """The fixes (periods, N) of vehicles in the network on whose receivers a fault acts."""
+    return np.asarray(recorded.struck(planned) & np.isfinite(recorded.vectors("position_m")[..., 0]))
+
+
+def _wrong_fixes(name: str, count: int) -> CheckResult:
+    text = "fixes are missing, repeated, or further off than receiver noise"
+    return _found(name, count, text, "the fixes could be those of a receiver without faults")
 
 
 def _held_down(recorded: RecordedRun, planned: PlannedFault) -> bool:
     """Whether each of a fault's nodes was down or stood still, by other faults, from its start to its end."""
     spans = [(span.node, span.start_ns, span.end_ns) for span in recorded.down if span.planned]
     for pause in recorded.plan:
-        if pause.fault.kind == "pause":
+        if isinstance(pause.fault, ProcessFault) and not pause.fault.ends:
             spans += [(node, pause.start_ns, pause.end_ns) for node in np.flatnonzero(pause.nodes).tolist()]
     for node in np.flatnonzero(planned.nodes).tolist():
         free_ns = planned.start_ns
@@ -84,9 +144,7 @@ def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
 
 
 def _delayed(recorded: RecordedRun, planned: PlannedFault) -> int:
-    return int((recorded.arrived & (recorded.arrival_ns > bounds(recorded, planned).latest_ns)).sum()) + (
-        _overflowed(recorded, planned) if planned.fault.kind == "throttle" else 0
-    )
+    return int((recorded.arrived & (recorded.arrival_ns > bounds(recorded, planned).latest_ns)).sum())
 
 
 def _overflowed(recorded: RecordedRun, planned: PlannedFault) -> int:
@@ -125,38 +183,25 @@ def _silenced(recorded: RecordedRun, planned: PlannedFault) -> int:
     before, during = end_ns <= planned.start_ns, (start_ns >= planned.start_ns) & (end_ns <= planned.end_ns)
     sends_before = recorded.sent_ns < planned.start_ns
     sends_during = recorded.acting(planned, recorded.sent_ns, -recorded.guard_ns)
+    ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
     count = 0
     for node in np.flatnonzero(planned.nodes).tolist():
         sent = recorded.sender == node
         spoke = bool((sent & sends_before).any() or recorded.reported[before, node].any())
         speaks = bool((sent & sends_during).any() or recorded.reported[during, node].any())
         quiet = spoke and not speaks and int(during.sum()) >= 2
-        deaf = planned.fault.kind != "pause" and bool(_unheard(recorded, planned)[recorded.receiver == node].any())
-        count += quiet or deaf
+        missed = ends and bool(_missed(recorded, planned)[recorded.receiver == node].any())
+        count += quiet or missed
     return count
 
 
-def _unheard(recorded: RecordedRun, planned: PlannedFault) -> Mask:
+def _missed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
     return np.asarray(recorded.outcome_is("receiver_down") & recorded.acting(planned, recorded.arrival_ns))
 
 
-def _bent(recorded: RecordedRun, planned: PlannedFault) -> int:
-    """Fixes that show the fault: none, the same again, or all in all too far from the truth."""
-    struck = recorded.struck(planned) & np.isfinite(recorded.vectors("position_m")[..., 0])
-    fix_m = recorded.vectors("fix_m")
-    if planned.fault.kind == "gnss_outage":
-        return int((~np.isfinite(fix_m[struck]).all(axis=1)).sum())
-    if planned.fault.kind == "gnss_freeze":
-        again = (fix_m[1:] == fix_m[:-1]).all(axis=2)
-        return int(again[struck[1:]].sum())
-    error_m = (fix_m - recorded.vectors("position_m") - recorded.vectors("common_error_m"))[struck]
-    error_m = error_m[np.isfinite(error_m).all(axis=1)]
-    sound = not len(error_m) or is_noise(error_m, recorded.scenario.world.gnss.sigma_m)
-    return 0 if sound else len(error_m)
-
-
-def _clocks(recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    """A clock shows only in when within the period its vehicle sends, if that was always the same before."""
+@effect.register
+def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    """Return whether vehicles that always sent at the same time within the period send at another time."""
     phase_ns = recorded.sent_ns % recorded.scenario.period_ns
     originals = recorded.copy == 0
     acting = recorded.acting(planned, recorded.sent_ns, -recorded.guard_ns)
@@ -181,8 +226,9 @@ def _disturbed(recorded: RecordedRun) -> Mask:
     return disturbed
 
 
-def _restarts(recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    done = [e for e in recorded.event(f"{planned.fault.kind}ed") if e.time_ns >= planned.start_ns]
+@effect.register
+def _(fault: Infrastructure, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
+    done = [e for e in recorded.event(f"{fault.kind}ed") if e.time_ns >= planned.start_ns]
     if done:
         return _found(name, len(done), "restarts", "")
     started = recorded.event("started")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import singledispatch
 from math import log, sqrt
 from typing import Any
 
@@ -12,22 +13,30 @@ from emulator.checks.channel import binomial_band, received_twice
 from emulator.faults.plan import PlannedFault
 from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
-from emulator.scenario.faults import BurstLoss, Corrupt, Loss, StaleMessages
+from emulator.scenario.fault_families import Fault, LossFault, ProcessFault, SenderFault
+from emulator.scenario.faults import BurstLoss, Corrupt, Duplicate, GnssOutage, StaleMessages
 from vnet.types import Array, Mask
 
-CUTTING = ("partition", "block", "range", "swizzle")
-LOSING = ("loss", "burst_loss")
-SENDING = ("DataReplay", "StaleMessages", "DoS", "Sybil")
 RATE_BAND = 1 - 1e-6
 RATE_SIGMAS = 4.9
 """As wide as RATE_BAND: a run may have dozens of faults, and each has a check."""
 
 
-def of_kinds(recorded: RecordedRun, kinds: Iterable[str]) -> list[PlannedFault]:
-    """The planned faults of these kinds that had begun when the run ended."""
-    named = set(kinds)
-    begun = [planned for planned in recorded.plan if planned.start_ns < recorded.closed_ns]
-    return [planned for planned in begun if planned.fault.kind in named]
+def begun(recorded: RecordedRun, is_meant: Callable[[Fault], bool]) -> list[PlannedFault]:
+    """Return the faults that `is_meant` accepts and that had begun when the run ended."""
+    return [p for p in recorded.plan if p.start_ns < recorded.closed_ns and is_meant(p.fault)]
+
+
+def _cuts(fault: Fault) -> bool:
+    return fault.cuts
+
+
+def _loses(fault: Fault) -> bool:
+    return isinstance(fault, LossFault)
+
+
+def _pauses(fault: Fault) -> bool:
+    return isinstance(fault, ProcessFault) and not fault.ends
 
 
 def check_causes(recorded: RecordedRun) -> Finding:
@@ -41,7 +50,7 @@ def check_causes(recorded: RecordedRun) -> Finding:
         explained = recorded.cause == NO_FAULT
         for planned in recorded.plan:
             mine = recorded.cause == planned.number
-            explained |= mine & recorded.reached(planned, recorded.guard_ns) & _may(recorded, planned)
+            explained |= mine & recorded.reached(planned, recorded.guard_ns) & can_cause(planned.fault, recorded)
         broken = ~explained | (recorded.outcome_is("fault") & (recorded.cause == NO_FAULT))
         broken |= recorded.cause == UNHEARD_OF
     count, named = int(broken.sum()), int((recorded.cause != NO_FAULT).sum())
@@ -50,25 +59,41 @@ def check_causes(recorded: RecordedRun) -> Finding:
     return result(name, count, text, broken_text, recorded.rows(broken), named=named, wrong=count)
 
 
-def _may(recorded: RecordedRun, planned: PlannedFault) -> Mask:
-    """The rows of which a fault of this kind can be the cause."""
-    match planned.fault:
-        case fault if fault.kind in (*CUTTING, *LOSING):
-            return recorded.outcome_is("fault")
-        case Corrupt():
-            return recorded.arrived
-        case StaleMessages():
-            return np.asarray((recorded.copy == 0) & ~recorded.outcome_is("fault"))
-        case fault if fault.kind == "duplicate":
-            return np.asarray((recorded.copy > 0) & recorded.arrived)
-        case _:
-            return np.asarray((recorded.copy > 0) & ~recorded.outcome_is("fault"))
+@singledispatch
+def can_cause(fault: Fault, recorded: RecordedRun) -> Mask:
+    """Return the rows that may name a fault of this kind as their cause: none, or those lost where it loses."""
+    return recorded.outcome_is("fault") if fault.cuts else np.zeros(len(recorded.trace), dtype=bool)
+
+
+@can_cause.register
+def _(fault: LossFault, recorded: RecordedRun) -> Mask:
+    return recorded.outcome_is("fault")
+
+
+@can_cause.register
+def _(fault: Corrupt, recorded: RecordedRun) -> Mask:
+    return recorded.arrived
+
+
+@can_cause.register
+def _(fault: Duplicate, recorded: RecordedRun) -> Mask:
+    return np.asarray((recorded.copy > 0) & recorded.arrived)
+
+
+@can_cause.register
+def _(fault: SenderFault, recorded: RecordedRun) -> Mask:
+    return np.asarray((recorded.copy > 0) & ~recorded.outcome_is("fault"))
+
+
+@can_cause.register
+def _(fault: StaleMessages, recorded: RecordedRun) -> Mask:
+    return np.asarray((recorded.copy == 0) & ~recorded.outcome_is("fault"))
 
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:
     """Nothing that was sent across a cut (partition, block, range, swizzle) while it acted went on."""
     name = "partition_respected"
-    cuts = of_kinds(recorded, CUTTING)
+    cuts = begun(recorded, _cuts)
     if not cuts:
         return NotExercised(name, "no fault cuts links" if recorded.plan else NO_FAULTS)
     across = np.zeros(len(recorded.trace), dtype=bool)
@@ -116,7 +141,7 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
 def check_pause_respected(recorded: RecordedRun) -> Finding:
     """A node that stands still sends nothing and reports nothing."""
     name = "pause_respected"
-    pauses = of_kinds(recorded, ["pause"])
+    pauses = begun(recorded, _pauses)
     if not pauses:
         return NotExercised(name, "no node was paused" if recorded.plan else NO_FAULTS)
     speaking = np.zeros(len(recorded.trace), dtype=bool)
@@ -151,7 +176,7 @@ def _reports_within(recorded: RecordedRun, spans: Iterable[tuple[int, int, int]]
 def check_outage_respected(recorded: RecordedRun) -> Finding:
     """A receiver has no fix exactly while an outage acts on it."""
     name = "outage_respected"
-    outages = of_kinds(recorded, ["gnss_outage"])
+    outages = begun(recorded, lambda fault: isinstance(fault, GnssOutage))
     there = np.isfinite(recorded.vectors("position_m")[..., 0])
     without = there & np.isnan(recorded.vectors("fix_m")[..., 0])
     if not outages and not without.any():
@@ -171,7 +196,7 @@ def check_outage_respected(recorded: RecordedRun) -> Finding:
 
 def check_fault_loss(recorded: RecordedRun) -> Iterator[Finding]:
     """Each fault that loses pairs by chance does so at its rate."""
-    for planned in of_kinds(recorded, LOSING):
+    for planned in begun(recorded, _loses):
         yield _loss_of(recorded, planned)
 
 
@@ -182,12 +207,7 @@ def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
     drawn, lost = int(drawing.sum()), int((hit & drawing).sum())
     if not drawn:
         return unknown(name, "no pair came as far as this fault", pairs=0)
-    if isinstance(planned.fault, BurstLoss):
-        expected, low, high = _burst_band(recorded, planned.fault, planned, drawing)
-    else:
-        assert isinstance(planned.fault, Loss)
-        expected = planned.fault.probability
-        low, high = binomial_band(drawn, expected, RATE_BAND)
+    expected, low, high = loss_band(planned.fault, recorded, planned, drawing)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": expected, "low": low, "high": high}
     text = f"{lost:,} of {drawn:,} pairs lost, {lost / drawn:.2%}; {expected:.2%} expected"
     outside = not low <= lost <= high
@@ -198,15 +218,23 @@ def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
 def _drew_for(recorded: RecordedRun, planned: PlannedFault) -> Mask:
     """Pairs that came as far as a fault of chance: cut by none, and lost to none of those before it."""
     reached = recorded.reached(planned, -recorded.guard_ns) & ~received_twice(recorded)
-    later = [other.number for other in of_kinds(recorded, LOSING) if other.number >= planned.number]
+    later = [other.number for other in begun(recorded, _loses) if other.number >= planned.number]
     further = recorded.outcome_is(*ON_AIR) | (recorded.outcome_is("fault") & np.isin(recorded.cause, later))
     return np.asarray(reached & further)
 
 
-def _burst_band(
-    recorded: RecordedRun, fault: BurstLoss, planned: PlannedFault, drawing: Mask
+@singledispatch
+def loss_band(
+    fault: Fault, recorded: RecordedRun, planned: PlannedFault, drawing: Mask
 ) -> tuple[float, float, float]:
-    """Expected rate, and least and most losses, of a two-state chain a link that starts good (Gilbert, Elliott).
+    """Return the expected rate of losses, and the least and the most of the rows `drawing` that may be lost."""
+    assert isinstance(fault, LossFault), fault
+    return fault.mean_loss, *binomial_band(int(drawing.sum()), fault.mean_loss, RATE_BAND)
+
+
+@loss_band.register
+def _(fault: BurstLoss, recorded: RecordedRun, planned: PlannedFault, drawing: Mask) -> tuple[float, float, float]:
+    """Return the same for a two-state chain a link that starts good (Gilbert, Elliott).
 
     Losses of a link are correlated over 1 / (1 - λ) frames, λ = 1 - enter - leave, which widens the band.
     """

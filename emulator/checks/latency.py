@@ -12,7 +12,8 @@ from emulator.checks.channel import nothing_seen, received_twice
 from emulator.faults.plan import PlannedFault
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
-from emulator.scenario.faults import Delay, Duplicate, Jitter, Reorder, Throttle
+from emulator.scenario.fault_families import DelayFault
+from emulator.scenario.faults import Duplicate, Throttle
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS
 
@@ -144,13 +145,10 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
     guard_ns = recorded.guard_ns
     for planned in plan:
         match planned.fault:
-            case Delay(delay_ms=delay_ms):
-                least += np.where(recorded.reached(planned, -guard_ns), delay_ms, 0)
-                most += np.where(recorded.reached(planned, guard_ns), delay_ms, 0)
-            case Jitter(jitter_ms=jitter_ms):
-                most += np.where(recorded.reached(planned, guard_ns), jitter_ms, 0)
-            case Reorder(delay_ms=delay_ms):
-                most += np.where(recorded.reached(planned, guard_ns), delay_ms, 0)
+            case DelayFault(bounds_ms=(least_ms, most_ms)):
+                if least_ms:
+                    least += np.where(recorded.reached(planned, -guard_ns), least_ms, 0)
+                most += np.where(recorded.reached(planned, guard_ns), most_ms, 0)
             case Duplicate(delay_ms=delay_ms, copies=copies):
                 mine = (recorded.cause == planned.number) & (recorded.copy > 0)
                 least += np.where(mine, delay_ms, 0)

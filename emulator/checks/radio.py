@@ -42,7 +42,7 @@ def check_fading(recorded: RecordedRun) -> Finding:
     name = "fading"
     radio = recorded.scenario.radio
     if not radio.is_physical:
-        return NotExercised(name, "signals have no power: a frame fades nowhere within the range")
+        return NotExercised(name, "unit-disc radio: no fading")
     drawing = np.flatnonzero(recorded.outcome_is(*ON_AIR) & ~received_twice(recorded) & recorded.placed)
     if not len(drawing):
         return nothing_seen(name, recorded, "no pair came as far as the receiver")
@@ -174,7 +174,7 @@ def check_medium(recorded: RecordedRun) -> Finding:
     """
     name = "medium"
     if not recorded.shares_air:
-        return NotExercised(name, "senders share no medium")
+        return NotExercised(name, "no MAC configured ([radio.mac])")
     if not len(recorded.trace):
         return nothing_seen(name, recorded, "no frame was sent")
     air = _Air.of(recorded)

@@ -10,6 +10,7 @@ import numpy as np
 from emulator.records.recorded_run import NEVER_NS, RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
+from emulator.scenario.fault_families import ProcessFault
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
@@ -55,7 +56,7 @@ def _was_killed(recorded: RecordedRun, event: Event) -> bool:
     if event.kind != "died" or event.node not in recorded.number:
         return False
     node = recorded.number_of(event.node)
-    ended = [p for p in recorded.plan if p.fault.kind in ("kill", "restart") and p.nodes[node]]
+    ended = [p for p in recorded.plan if isinstance(p.fault, ProcessFault) and p.fault.ends and p.nodes[node]]
     return any(p.start_ns <= event.time_ns <= p.end_ns + recorded.guard_ns for p in ended)
 
 
@@ -64,7 +65,8 @@ def check_progress(recorded: RecordedRun) -> Finding:
     name = "progress"
     if spun := recorded.event("spun"):
         event = spun[0]
-        text = f"{event.node} goes on for ever at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
+        when = f"at {event.time_ns / 1e9:.3f} s"
+        text = f"{event.node} does not let time advance (busy loop) {when}: {event.details.get('error')}"
         return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
     if stalled := recorded.event("stalled"):
         event = stalled[0]
@@ -223,7 +225,7 @@ def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
     number = recorded.number[node]
     if recorded.deaths_ns.get(number, NEVER_NS) <= time_ns or recorded.scenario.run.pacing == "realtime":
         return True
-    ended = [p for p in recorded.plan if p.fault.kind in ("kill", "restart") and p.nodes[number]]
+    ended = [p for p in recorded.plan if isinstance(p.fault, ProcessFault) and p.fault.ends and p.nodes[number]]
     return any(planned.acts_at(time_ns) for planned in ended)
 
 
@@ -247,7 +249,7 @@ def check_memory(recorded: RecordedRun) -> Finding:
     name = "memory"
     series = [event for event in recorded.event("memory") if event.node in recorded.number]
     if not series:
-        return NotExercised(name, "nobody measured the processes' memory")
+        return NotExercised(name, "not measured by vnet simulate")
     growing, judged, most = [], 0, 0.0
     for event in series:
         time_s, rss_kb = np.array(event.details["time_s"]), np.array(event.details["rss_kb"])

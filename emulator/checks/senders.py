@@ -12,7 +12,8 @@ from emulator.checks.channel import received_twice
 from emulator.faults.plan import PlannedFault
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
-from emulator.scenario.faults import ConstPosOffset, DataReplay, DoS, GnssFault, GnssJump, GnssRamp, Sybil
+from emulator.scenario.fault_families import GnssFault
+from emulator.scenario.faults import DataReplay, DoS, Sybil
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -116,7 +117,7 @@ def check_gnss(recorded: RecordedRun) -> Finding:
         if isinstance(planned.fault, GnssFault):
             mine = recorded.struck(planned)
             groups["no fault"] &= ~mine
-            if isinstance(planned.fault, GnssJump | GnssRamp | ConstPosOffset):
+            if planned.fault.displacement_m(0) is not None:
                 groups[planned.label] = mine & usable
             else:
                 usable &= ~mine
@@ -133,15 +134,11 @@ def check_gnss(recorded: RecordedRun) -> Finding:
 
 def _displaced(recorded: RecordedRun, planned: PlannedFault) -> Array:
     """What a fault adds to the fixes (periods, N, 2)."""
-    start_ns = recorded.period_starts_ns()
-    match planned.fault:
-        case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
-            moved = np.tile(np.array(offset_m), (len(start_ns), 1))
-        case GnssRamp(rate_m_s=rate_m_s):
-            moved = np.outer((start_ns - planned.start_ns) / NS_PER_S, rate_m_s)
-        case _:
-            return np.zeros((len(start_ns), len(planned.nodes), 2))
-    return np.asarray(moved[:, None] * recorded.struck(planned)[:, :, None])
+    fault, start_ns = planned.fault, recorded.period_starts_ns()
+    moved = np.zeros((len(start_ns), 2))
+    if isinstance(fault, GnssFault) and fault.displacement_m(0) is not None:
+        moved = np.array([fault.displacement_m(since) for since in (start_ns - planned.start_ns).tolist()])
+    return np.asarray(moved.reshape(-1, 1, 2) * recorded.struck(planned)[:, :, None])
 
 
 def is_noise(error_m: Array, sigma_m: float) -> bool:

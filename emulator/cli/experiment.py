@@ -13,6 +13,7 @@ from rich.markdown import Markdown
 
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.experiments import paper
+from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
 from vnet.runtime.host import fix_hash_seed
@@ -251,11 +252,11 @@ def _select(cells: Sequence[Cell], only: Sequence[str]) -> list[Cell]:
 
 
 def _draw_against_time(cells: Sequence[Cell], cells_from: Path, folder: Path) -> None:
-    from emulator.experiments import reports, result_figures
+    from emulator.experiments import result_figures
 
     for network in ("n2", "n3"):
         title = f"{network.upper()}, the paper's profile, lanes bounded on one side"
-        references = {f"the paper's {m}": rmse[network] for m, rmse in reports.PAPER_TABLE2.items()}
+        references = {f"the paper's {m}": rmse[network] for m, rmse in PAPER_RMSE_M.items()}
         series = _series(cells, cells_from, network)
         print(result_figures.against_time(series, folder / f"{network}_against_time", title, references))
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -21,6 +19,7 @@ from emulator.cli.viewing import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
+from emulator.records.atomic import disk_errors, whole
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
@@ -65,10 +64,11 @@ def radio(
         metrics = radio_metrics(read_recorded_run(run), bin_m)
         if out is not None:
             tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
-            with _disk(out):
+            with disk_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
-                for name, table in tables.items():
-                    pq.write_table(table, out / f"{name}.parquet", compression="zstd")
+            for name, table in tables.items():
+                with whole(out / f"{name}.parquet") as part:
+                    pq.write_table(table, part, compression="zstd")
         _print(metrics, Console())
 
 
@@ -129,41 +129,19 @@ def export(
 
 
 def _write(path: Path, recorded: RecordedRun, writer: Callable[[RecordedRun, BinaryIO], int]) -> int:
-    """Have a file written beside its place, and put there when it is whole."""
+    """Write a file in one step; return what `writer` counts."""
     _refuse_existing(path)
-    part = path.with_name(f".{path.name}.part")
-    with _disk(path):
-        try:
-            with part.open("wb") as file:
-                count = writer(recorded, file)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    return count
+    with whole(path) as part, part.open("wb") as file:
+        return writer(recorded, file)
 
 
 def _write_folder(path: Path, recorded: RecordedRun) -> list[str]:
     _refuse_existing(path)
-    part = path.with_name(f".{path.name}.part")
-    with _disk(path):
-        try:
-            shutil.rmtree(part, ignore_errors=True)
-            part.mkdir(parents=True)
-            names = write_csv(recorded, part)
-            part.replace(path)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-    return names
+    with whole(path) as part:
+        part.mkdir(parents=True)
+        return write_csv(recorded, part)
 
 
 def _refuse_existing(path: Path) -> None:
     if path.exists():
         raise VnetError(f"{path}: exists; remove it, or say --out")
-
-
-@contextlib.contextmanager
-def _disk(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None

@@ -21,7 +21,7 @@ from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import Painter
 from emulator.terminal.progress import terminal
-from vnet.errors import ScenarioError, VnetError
+from vnet.errors import ScenarioError, VnetError, first_names
 
 app = typer.Typer(no_args_is_help=True, help="Inject faults into a running emulator, and heal them.")
 
@@ -139,6 +139,6 @@ def _show(faults: list[dict[str, Any]]) -> None:
     table = Table("fault", "state", "from", "to", "nodes")
     for fault in faults:
         nodes = fault["nodes"]
-        shown = ", ".join(nodes[:6]) + (f", … ({len(nodes)})" if len(nodes) > 6 else "")
+        shown = first_names(nodes, 6, with_total=True)
         table.add_row(fault["fault"], fault["state"], f"{fault['start_s']:.3f} s", f"{fault['end_s']:.3f} s", shown)
     Console().print(table)

@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import track
 
 from emulator.cli.viewing import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import RECORDING, RunFolder
 from emulator.stream.pace import play as play_scheduled
 from emulator.stream.pace import schedule
 from emulator.stream.playback import Message, messages
 from emulator.terminal.console import one_line_errors
-from emulator.viewer.sinks import RECORDING, Sinks, has_display, place_to_serve
+from emulator.viewer.sinks import Sinks, has_display, place_to_serve
 from vnet.errors import VnetError
 from vnet.units import NS_PER_S
 

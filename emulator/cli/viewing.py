@@ -14,10 +14,9 @@ import typer
 
 from emulator.cli.options import RerunOption
 from emulator.drivers.control import read_control_file
-from emulator.records.run_folder import check_is_run
+from emulator.records.run_folder import RECORDING, check_is_run
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
-    RECORDING,
     choose_sinks,
     has_display,
     is_closed,

@@ -21,7 +21,7 @@ from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.run_folder import RunFolder, write_text
-from emulator.scenario.faults import Fault, Infrastructure
+from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.world import Instant, World, components
@@ -207,8 +207,8 @@ class Emulation:
         self.engine.set_faults(active, time_ns)
         self._log_changes(time_ns, active)
         absent = self._absent(time_ns // self.world.period_ns)
-        killed = self._nodes_under(active, "kill")
-        changes = self.presence.change(killed | self._nodes_under(active, "restart"), absent)
+        killed = self._nodes_under(active, lambda fault: fault.forced)
+        changes = self.presence.change(self._nodes_under(active, lambda fault: fault.ends), absent)
         for node in changes.stopped:
             self.engine.set_up(self.number[node], False)
         for node in changes.left:
@@ -218,7 +218,7 @@ class Emulation:
         return ProcessActions(
             stop={node: node in killed for node in changes.stopped},
             start=changes.started,
-            paused=self._nodes_under(active, "pause"),
+            paused=self._nodes_under(active, lambda fault: not fault.ends),
             clocks=[clock_of(active, node, number, time_ns) for node, number in self.number.items()],
             restarts=[p.fault for p in active if isinstance(p.fault, Infrastructure) and p.start_ns == time_ns],
         )
@@ -230,8 +230,9 @@ class Emulation:
             kind = "entered" if entered else "restarted"
             self.folder.event(time_ns, kind, node, incarnation=self.incarnation[node])
 
-    def _nodes_under(self, active: Sequence[PlannedFault], *kinds: str) -> set[str]:
-        chosen = [planned.nodes for planned in active if planned.fault.kind in kinds]
+    def _nodes_under(self, active: Sequence[PlannedFault], is_meant: Callable[[ProcessFault], bool]) -> set[str]:
+        """The nodes on whose processes faults act that `is_meant` accepts."""
+        chosen = [p.nodes for p in active if isinstance(p.fault, ProcessFault) and is_meant(p.fault)]
         return {node for node, number in self.number.items() if any(mask[number] for mask in chosen)}
 
     def _log_changes(self, time_ns: int, active: Sequence[PlannedFault]) -> None:

@@ -18,11 +18,12 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 
 from emulator.cells.cells import Cell, has_result, has_states, read_series, read_states
-from emulator.experiments.paper import RANGE_M, SETTLED_S, everybody
+from emulator.experiments.paper import SETTLED_S, everybody
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.result_figures import against_time
 from emulator.experiments.style import save, styled
 from emulator.experiments.tables import MISSING, in_seeds, markdown_table, mean_and_error
+from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.world.world import build_world
@@ -84,7 +85,7 @@ def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_
     data: dict[str, Any] = {
         "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": 0.0},
         **place,
-        "radio": {"range_m": RANGE_M, "loss": LOSS},
+        "radio": {"range_m": PAPER_RANGE_M, "loss": LOSS},
         "program": {"entry": "agents.cooperative:main", "options": MECHANISMS.get(mechanism, {})},
     }
     if mechanism == "centralized":

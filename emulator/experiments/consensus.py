@@ -28,8 +28,9 @@ from emulator.experiments.analyze import (
     mutual,
     ratio_matrix,
 )
-from emulator.experiments.paper import RANGE_M, network_sections
+from emulator.experiments.paper import network_sections
 from emulator.pages.palette import PALETTE
+from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.cmm.linear_model import convergence_factor
@@ -162,7 +163,7 @@ def _scenario(
             "run": {"name": "consensus", "seed": seed, "duration_s": PERIOD_S * (rounds + 1)},
             "network": network,
             "world": {"gnss": {"rate_hz": 1 / PERIOD_S}},
-            "radio": {"range_m": RANGE_M, "latency_ms": NEAR_MS} | (radio or {}),
+            "radio": {"range_m": PAPER_RANGE_M, "latency_ms": NEAR_MS} | (radio or {}),
             "program": {"entry": "agents.averaging:main", "options": {"rule": rule, "silent": silent or {}}},
         }
     )

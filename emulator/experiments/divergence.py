@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from emulator.cells.cells import DIVERGENT_M, DIVERGENT_S, Cell
+from emulator.cells.cells import Cell
 from emulator.experiments.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table
+from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
 
 LENGTH_S = 30.0
 """A vehicle that goes astray does so at first, before anybody knows the common error."""

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from emulator.cells.cells import Cell
+from emulator.records.paper_values import PAPER_RANGE_M, PAPER_VEHICLES, network_file
 from emulator.scenario.scenario import Scenario
 from emulator.world.networks import generate_network, load_network
 from emulator.world.world import build_world, components
 from vnet.errors import VnetError
 
 Labels = dict[str, str | int | float]
-NETWORKS = {"n1": 50, "n2": 38, "n3": 24}
-RANGE_M = 3000.0
 PAPER_S = 10.0
 DEFAULT_S, SETTLED_S = 100.0, 20.0
 CENTRALIZED_PARTICLES = 2000
@@ -46,10 +45,10 @@ ONE_HOP_ROWS: dict[str, dict[str, Any]] = {
 def network_sections(folder: Path | None) -> dict[str, dict[str, Any]]:
     """`[network]` of N1, N2 and N3: the files network_n1.csv … of `folder`, or generated ones."""
     if folder is None:
-        return {name: {"kind": "generated", "vehicles": count} for name, count in NETWORKS.items()}
+        return {name: {"kind": "generated", "vehicles": count} for name, count in PAPER_VEHICLES.items()}
     sections = {}
-    for name in NETWORKS:
-        path = (folder / f"network_{name}.csv").resolve()
+    for name in PAPER_VEHICLES:
+        path = (folder / network_file(name)).resolve()
         if not path.is_file():
             raise VnetError(f"--networks {folder}: no file {path.name} in it")
         sections[name] = {"kind": "file", "path": str(path)}
@@ -122,7 +121,7 @@ def default_scenario(
         {
             "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
             "network": network,
-            "radio": {"range_m": RANGE_M, "loss": 0.1},
+            "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
             "program": {"entry": "agents.cooperative:main", "options": options},
         }
     )
@@ -137,7 +136,7 @@ def bound_scenario(
 ) -> Scenario:
     """One filter that hears every fix without loss; or one a connected component. `options` are the filter's."""
     world = build_world(default_scenario(network, seed, {}))
-    label = components(world.at(0).position_m, RANGE_M) if by_component else np.zeros(len(world.node_ids))
+    label = components(world.at(0).position_m, PAPER_RANGE_M) if by_component else np.zeros(len(world.node_ids))
     return Scenario.model_validate(
         {
             "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
@@ -158,7 +157,7 @@ def paper_scenario(network: dict[str, Any], seed: int, mechanism: str, sides: in
         return _paper(network, seed, options | {"particles": CENTRALIZED_PARTICLES}, None)
     positions = build_world(Scenario.model_validate({"network": network})).at(0).position_m
     offset = positions[:, None] - positions[None]
-    hears = np.hypot(offset[..., 0], offset[..., 1]) <= RANGE_M
+    hears = np.hypot(offset[..., 0], offset[..., 1]) <= PAPER_RANGE_M
     np.fill_diagonal(hears, False)
     return _paper(network, seed, options | {"fusion": mechanism}, hears)
 

@@ -17,6 +17,7 @@ from emulator.experiments.tables import (
     with_error,
 )
 from emulator.records.metrics import anees_band
+from emulator.records.paper_values import PAPER_RMSE_M
 
 Result = Mapping[str, Any]
 LIMIT_RATIO = 1.35
@@ -36,12 +37,6 @@ PAPER_TABLE1: dict[float | str, tuple[float, float]] = {
 }
 """√variance and √MSE in metres: Table I of Shen, Sun and Zhao, "Semi-Interpenetrating Cooperative Localization in
 Connected Vehicle Networks"."""
-PAPER_TABLE2 = {
-    "centralized": {"n1": 0.67, "n2": 0.64, "n3": 0.64},
-    "optimized": {"n1": 0.76, "n2": 0.72, "n3": 1.04},
-    "random": {"n1": 0.72, "n2": 1.60, "n3": 4.30},
-}
-"""RMSE in metres: Table II of the same."""
 
 
 def select(results: Sequence[Result], **labels: object) -> list[Result]:
@@ -113,7 +108,7 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
         row = [mechanism]
         for network in networks:
             row.append(mean_and_error(column(select(results, network=network, mechanism=mechanism), name)))
-            row.append(f"{PAPER_TABLE2[mechanism][network]:.2f}" if mechanism in PAPER_TABLE2 else "–")
+            row.append(f"{PAPER_RMSE_M[mechanism][network]:.2f}" if mechanism in PAPER_RMSE_M else "–")
         rows.append(row)
     row = ["random / optimized"]
     for network in networks:
@@ -121,7 +116,7 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
             column(select(results, network=network, mechanism=m), name) for m in ("random", "optimized")
         )
         ratio, error = paired_ratio(random, optimized)
-        paper = PAPER_TABLE2["random"][network] / PAPER_TABLE2["optimized"][network]
+        paper = PAPER_RMSE_M["random"][network] / PAPER_RMSE_M["optimized"][network]
         row += [with_error(ratio, error, ".2f"), f"{paper:.2f}"]
     header = ["mechanism", *(name for n in networks for name in (n.upper(), f"paper's {n.upper()}"))]
     return markdown_table(header, [*rows, row])

@@ -6,36 +6,22 @@ any order, without leaving anything behind.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from emulator.faults.selectors import Nodes, links_of, partitioned_links, select
-from emulator.scenario.faults import (
-    ConstPosOffset,
-    Fault,
-    GnssJump,
-    GnssOutage,
-    GnssRamp,
-    Infrastructure,
-    LinkFault,
-    NodeFault,
-    Partition,
-    RandomPos,
-    Range,
-    Swizzle,
-)
+from emulator.scenario import random_streams
+from emulator.scenario.fault_families import Fault, LinkFault, NodeFault, ProcessFault
+from emulator.scenario.faults import Partition, Swizzle
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ScenarioError
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
-NEVER_NS = 0.1
-"""Less than an instant: a fault that lasts so long does not act."""
-FOLLOWING = LinkFault | Range | GnssOutage | GnssJump | GnssRamp | ConstPosOffset | RandomPos
-"""Where vehicles move, a region or degree is looked at anew each period for these; others choose as they begin."""
+NO_DURATION_NS = 0.1
+"""Less than an instant: a fault of this duration does not act."""
 Places = tuple[Mask, Mask | None]
 
 
@@ -110,7 +96,7 @@ class FaultPlan:
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
             raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
-        if not isinstance(fault, FOLLOWING):
+        if not fault.follows_vehicles:
             moving = None
         planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)
         self._refuse_parts_of_processes(planned)
@@ -119,7 +105,7 @@ class FaultPlan:
 
     def _refuse_parts_of_processes(self, planned: PlannedFault) -> None:
         """Nodes of one process live, pause and die together."""
-        if planned.fault.kind not in ("kill", "restart", "pause"):
+        if not isinstance(planned.fault, ProcessFault):
             return
         for start in range(0, len(planned.nodes), self._groups):
             part = planned.nodes[start : start + self._groups]
@@ -165,7 +151,7 @@ class FaultPlan:
 
 
 def _as_written(planned: PlannedFault) -> Fault:
-    lasting_ns = planned.end_ns - planned.start_ns or NEVER_NS  # healed before it began: it keeps its number
+    lasting_ns = planned.end_ns - planned.start_ns or NO_DURATION_NS  # healed before it began: it keeps its number
     update = {"at_s": planned.start_ns / NS_PER_S, "duration_s": lasting_ns / NS_PER_S}
     if isinstance(planned.fault, Swizzle):
         update["over_s"] = planned.fault.over_s or planned.fault.duration_s
@@ -206,10 +192,9 @@ def _places(fault: Fault, nodes: Nodes, rng: np.random.Generator) -> Places:
     if isinstance(fault, LinkFault):
         links = links_of(fault, nodes, rng)
         return _ends(links), links
-    if isinstance(fault, Infrastructure):
-        return np.ones(len(nodes.ids), dtype=bool), None
-    assert isinstance(fault, NodeFault)
-    return select(fault.nodes, nodes, rng), None
+    if isinstance(fault, NodeFault):
+        return select(fault.nodes, nodes, rng), None
+    return np.ones(len(nodes.ids), dtype=bool), None
 
 
 def _ends(links: Mask) -> Mask:
@@ -218,9 +203,8 @@ def _ends(links: Mask) -> Mask:
 
 
 def stream(seed: int, number: int, what: str) -> np.random.Generator:
-    """The random stream of one fault of the plan, by what it decides."""
-    key = int.from_bytes(hashlib.blake2b(f"fault {number} {what}".encode(), digest_size=8).digest(), "little")
-    return np.random.Generator(np.random.Philox(key=np.array([seed, key], dtype=np.uint64)))
+    """Return the random stream of one fault of the plan, named by what it decides."""
+    return random_streams.stream(seed, f"fault {number} {what}")
 
 
 def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, int]]:
@@ -240,7 +224,7 @@ def swizzle_times_ns(planned: PlannedFault, seed: int) -> list[tuple[int, int, i
 def _changes(planned: PlannedFault, seed: int) -> Iterator[int]:
     yield planned.start_ns
     yield planned.end_ns
-    if planned.fault.kind == "swizzle":
+    if isinstance(planned.fault, Swizzle):
         for _, off_ns, back_ns in swizzle_times_ns(planned, seed):
             yield min(off_ns, planned.end_ns)
             yield min(back_ns, planned.end_ns)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.scenario.faults import LinkFault, Partition, Selector
-from vnet.errors import ScenarioError
+from emulator.scenario.fault_families import LinkFault, Selector
+from emulator.scenario.faults import Partition
+from vnet.errors import ScenarioError, first_names
 from vnet.types import Array, Mask
 
 
@@ -28,8 +29,7 @@ class Nodes:
         """The numbers of nodes. Raises ScenarioError for an id that no node has."""
         for node in ids:
             if node not in self.ids:
-                some = ", ".join(self.ids[:8]) + (", …" if len(self.ids) > 8 else "")
-                raise ScenarioError(f"{node!r} is no vehicle of the network; they are {some}")
+                raise ScenarioError(f"{node!r} is no vehicle of the network; they are {first_names(self.ids)}")
         return [self.ids.index(node) for node in ids]
 
 

@@ -17,13 +17,14 @@ from xml.etree import ElementTree
 
 import matplotlib
 import numpy as np
+from markupsafe import Markup
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from emulator.pages.page import escape
 from emulator.pages.palette import PALETTE
+from emulator.pages.text import as_text
 from vnet.types import Array
 
 INK, QUIET, LINE, GRID, PAPER, BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW, GREY, SAND, RUST, NAVY = (
@@ -206,7 +207,7 @@ def thin(time_s: Array, value: Array) -> tuple[Array, Array]:
     return time_s[kept], value[kept]
 
 
-def to_svg(figure: Figure, key: str, label: str) -> str:
+def to_svg(figure: Figure, key: str, label: str) -> Markup:
     """The figure as an `<svg>` element for a page; `key` makes its ids its own, `label` says what it shows."""
     file = io.BytesIO()
     figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
@@ -217,9 +218,10 @@ def to_svg(figure: Figure, key: str, label: str) -> str:
         for child in [child for child in parent if child.tag.endswith(("}metadata", "}style"))]:
             parent.remove(child)
         _make_plain(parent, names)
-    height = root.attrib["viewBox"]
+    view_box = root.attrib["viewBox"]
     body = "".join(ElementTree.tostring(child, encoding="unicode") for child in root)
-    return f'<svg class="chart" viewBox="{height}" role="img" aria-label="{escape(label)}">{body}</svg>'
+    start = Markup('<svg class="chart" viewBox="{}" role="img" aria-label="{}">').format(view_box, as_text(label))
+    return start + Markup(body) + Markup("</svg>")
 
 
 _REFERENCE = re.compile(r"url\(#(.+?)\)")

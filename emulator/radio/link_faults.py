@@ -16,7 +16,8 @@ from emulator.faults.plan import PlannedFault, swizzle_times_ns
 from emulator.radio.frames import Copied, Frame, Receptions
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
-from emulator.scenario.faults import BurstLoss, Corrupt, Delay, Duplicate, Jitter, Loss, Range, Reorder, Throttle
+from emulator.scenario.fault_families import DelayFault, LossFault
+from emulator.scenario.faults import Corrupt, Duplicate, Range, Swizzle, Throttle
 from emulator.scenario.random_streams import Draws
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_MS
@@ -24,7 +25,7 @@ from vnet.units import NS_PER_MS
 
 @dataclass
 class _RandomFault:
-    """A fault that draws for each reception. `bad` (N, N) is the state of a burst loss."""
+    """A fault that draws for each reception. `bad` (N, N) is the state of a loss, by sender and receiver."""
 
     planned: PlannedFault
     draws: Draws
@@ -109,8 +110,8 @@ class LinkFaults:
         self.effects = ActiveLinkFaults(
             cut=[(p.number, cut) for p in active if (cut := self._cut_by(p, time_ns)) is not None],
             shortened=[(p.number, p.nodes, p.fault.range_m) for p in active if isinstance(p.fault, Range)],
-            losing=_of_kind(random, Loss, BurstLoss),
-            delaying=_of_kind(random, Delay, Jitter, Reorder),
+            losing=_of_kind(random, LossFault),
+            delaying=_of_kind(random, DelayFault),
             copying=_of_kind(random, Duplicate),
             corrupting=_of_kind(random, Corrupt),
         )
@@ -122,21 +123,17 @@ class LinkFaults:
         return self._started(planned) if one is None else replace(one, planned=planned)
 
     def _started(self, planned: PlannedFault) -> _RandomFault:
-        bad = np.zeros((self._count, self._count) if isinstance(planned.fault, BurstLoss) else (0, 0), dtype=bool)
+        bad = np.zeros((self._count, self._count) if isinstance(planned.fault, LossFault) else (0, 0), dtype=bool)
         return _RandomFault(planned, Draws(self._seed, f"fault {planned.number}"), bad)
 
     def _cut_by(self, planned: PlannedFault, time_ns: int) -> Mask | None:
         """Return the mask (N, N) of the links that a fault cuts at `time_ns`; None if it cuts none."""
-        match planned.fault.kind:
-            case "partition" | "block":
-                return planned.links
-            case "swizzle":
-                off = np.zeros(self._count, dtype=bool)
-                for node, off_ns, back_ns in swizzle_times_ns(planned, self._seed):
-                    off[node] = off_ns <= time_ns < back_ns
-                return np.asarray(off[:, None] | off[None, :])
-            case _:
-                return None
+        if isinstance(planned.fault, Swizzle):
+            off = np.zeros(self._count, dtype=bool)
+            for node, off_ns, back_ns in swizzle_times_ns(planned, self._seed):
+                off[node] = off_ns <= time_ns < back_ns
+            return np.asarray(off[:, None] | off[None, :])
+        return planned.links if planned.fault.cuts else None
 
     def _throttled(self, active: Sequence[PlannedFault]) -> dict[int, float]:
         """Return the bitrate in Mbit/s of each throttled sender: the lowest of those that apply."""
@@ -152,12 +149,8 @@ class LinkFaults:
 def _lost(one: _RandomFault, frame: Frame) -> Mask:
     fault, count = one.planned.fault, len(_links(one))
     draws = one.draws.uniform(frame.sender, frame.seq, 2 * count, frame.draw).reshape(-1, 2).T
-    if isinstance(fault, Loss):
-        return np.asarray(draws[0] < fault.probability)
-    assert isinstance(fault, BurstLoss), fault
-    bad = one.bad[frame.sender]
-    bad[:] = np.where(bad, draws[0] >= fault.leave, draws[0] < fault.enter)
-    return np.asarray(draws[1] < np.where(bad, fault.loss_bad, fault.loss_good))
+    assert isinstance(fault, LossFault), fault
+    return fault.lost(draws, one.bad[frame.sender])
 
 
 def _corrupt(one: _RandomFault, frame: Frame, index: int, receptions: Receptions, pending: Mask) -> None:
@@ -185,13 +178,5 @@ def _of_kind(random: Mapping[int, _RandomFault], *kinds: type) -> list[_RandomFa
 
 
 def _extra_delay_ns(planned: PlannedFault, draws: Array) -> NDArray[np.int64]:
-    match planned.fault:
-        case Delay(delay_ms=delay_ms):
-            delay_each_ms = np.full(len(draws), delay_ms)
-        case Jitter(jitter_ms=jitter_ms):
-            delay_each_ms = jitter_ms * draws
-        case Reorder(probability=probability, delay_ms=delay_ms):
-            delay_each_ms = np.where(draws < probability, delay_ms, 0.0)
-        case other:
-            raise AssertionError(other)
-    return np.asarray(np.round(delay_each_ms * NS_PER_MS), dtype=np.int64)
+    assert isinstance(planned.fault, DelayFault), planned.fault
+    return np.asarray(np.round(planned.fault.added_ms(draws) * NS_PER_MS), dtype=np.int64)

@@ -11,7 +11,8 @@ import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.radio.frames import NO_CAUSE
-from emulator.scenario.faults import DataReplay, DoS, SenderFault, StaleMessages, Sybil
+from emulator.scenario.fault_families import SenderFault
+from emulator.scenario.faults import DataReplay, DoS, StaleMessages, Sybil
 from vnet.units import NS_PER_S
 
 REMEMBERED_FRAMES = 4096

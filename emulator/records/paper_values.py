@@ -1,4 +1,4 @@
-"""The paper's RMSE of the common error on its three networks (its Table II): a reference beside runs of them."""
+"""Table II of the paper: its RMSE of the common error on its three networks, a reference beside runs of them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,32 @@ from pathlib import Path
 from typing import Any
 
 PAPER_RMSE_M = {
-    "centralized": {"network_n1.csv": 0.67, "network_n2.csv": 0.64, "network_n3.csv": 0.64},
-    "optimized": {"network_n1.csv": 0.76, "network_n2.csv": 0.72, "network_n3.csv": 1.04},
-    "random": {"network_n1.csv": 0.72, "network_n2.csv": 1.60, "network_n3.csv": 4.30},
+    "centralized": {"n1": 0.67, "n2": 0.64, "n3": 0.64},
+    "optimized": {"n1": 0.76, "n2": 0.72, "n3": 1.04},
+    "random": {"n1": 0.72, "n2": 1.60, "n3": 4.30},
 }
-PAPER_VEHICLES = {"network_n1.csv": 50, "network_n2.csv": 38, "network_n3.csv": 24}
+"""RMSE in metres by mechanism and network: Table II of Shen, Sun and Zhao, "Semi-Interpenetrating Cooperative
+Localization in Connected Vehicle Networks"."""
+PAPER_VEHICLES = {"n1": 50, "n2": 38, "n3": 24}
+"""Number of vehicles of each network."""
 PAPER_RANGE_M = 3000.0
+"""Radio range in metres."""
+
+
+def network_file(network: str) -> str:
+    """Return the name of the file with the positions of a network."""
+    return f"network_{network}.csv"
 
 
 def paper_rmse(scene: Mapping[str, Any]) -> tuple[str, float] | None:
-    """What the paper found for the network and mechanism of this run: a label and metres; None for any other run.
+    """Return the paper's result for the network and mechanism of this run: a label and metres; None for other runs.
 
     The network is known by its file's name and its number of vehicles, the mechanism by program and `fusion`.
     """
     scenario = tomllib.loads(scene["scenario"])
     name = Path(scenario["network"].get("path", "")).name
-    if PAPER_VEHICLES.get(name) != len(scene["node_ids"]) or scene["range_m"] != PAPER_RANGE_M:
+    network = next((each for each in PAPER_VEHICLES if network_file(each) == name), None)
+    if network is None or PAPER_VEHICLES[network] != len(scene["node_ids"]) or scene["range_m"] != PAPER_RANGE_M:
         return None
     program = scenario["program"]
     mechanism = {
@@ -32,5 +42,4 @@ def paper_rmse(scene: Mapping[str, Any]) -> tuple[str, float] | None:
     }.get(program["entry"])
     if mechanism not in PAPER_RMSE_M:
         return None
-    network = name.removeprefix("network_").removesuffix(".csv").upper()
-    return f"the paper's RMSE: {mechanism}, {network}", PAPER_RMSE_M[mechanism][name]
+    return f"the paper's RMSE: {mechanism}, {network.upper()}", PAPER_RMSE_M[mechanism][network]

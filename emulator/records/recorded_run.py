@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.faults.plan import FOLLOWING, FaultPlan, PlannedFault, swizzle_times_ns
+from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
@@ -24,7 +24,8 @@ from emulator.records.busy import busy_windows
 from emulator.records.positions import Places
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import MOST_ROWS
-from emulator.scenario.faults import Range, SenderFault, Swizzle
+from emulator.scenario.fault_families import ProcessFault, SenderFault
+from emulator.scenario.faults import Range, Swizzle
 from emulator.scenario.scenario import Scenario
 from emulator.world.links import load_links
 from vnet.errors import VnetError
@@ -305,7 +306,8 @@ class RecordedRun:
         """When nodes were down: taken by a fault until it ended, not in the network, or for good."""
         spans = []
         for planned in self.plan:
-            if planned.fault.kind in ("kill", "restart") and planned.start_ns < min(self.closed_ns, planned.end_ns):
+            ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
+            if ends and planned.start_ns < min(self.closed_ns, planned.end_ns):
                 for node in np.flatnonzero(planned.nodes).tolist():
                     if self.deaths_ns.get(node, NEVER_NS) > planned.start_ns:
                         spans.append(Span(node, planned.start_ns, self._back_ns(node, planned.end_ns), True))
@@ -388,7 +390,7 @@ class RecordedRun:
 
     def connectivity(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
         """The links (N, N), rows are senders, whose rows may name a fault, and from when until when."""
-        if not self.moves or not isinstance(planned.fault, FOLLOWING):
+        if not self.moves or not planned.fault.follows_vehicles:
             yield from self._connectivity(planned)
             return
         period_ns = self.scenario.period_ns

@@ -15,10 +15,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from emulator.records.atomic import disk_errors, whole
 from emulator.scenario.scenario import Scenario, dump_scenario
 from vnet.errors import VnetError
 
 RUNS = Path("runs")
+REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
+"""Names of a run's report and recording, and of the list of the runs in a folder."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class RunFolder:
         Never touches another run's files: a `path` that is not empty is refused.
         """
         default = RUNS / f"{scenario.run.name}-{scenario.run.seed}"
-        with _disk(path or default):
+        with disk_errors(path or default):
             if path is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
                 raise VnetError(f"--out {path}: exists and is not an empty folder")
             folder = cls(path or _claim(default))
@@ -62,19 +65,13 @@ class RunFolder:
         event = Event(time_ns, kind, node, details)
         self.events.append(event)
         line = json.dumps({"time_ns": time_ns, "kind": kind, "node": node, **details})
-        with _disk(self.path), (self.path / "events.jsonl").open("a") as file:
+        with disk_errors(self.path), (self.path / "events.jsonl").open("a") as file:
             file.write(line + "\n")
 
     def put(self, name: str, write: Callable[[Path], None]) -> None:
         """Have `write` make a file beside its place, then move it there in one step."""
-        part = self.path / f".{name}.part"
-        with _disk(self.path):
-            try:
-                write(part)
-                part.replace(self.path / name)
-            except BaseException:
-                part.unlink(missing_ok=True)
-                raise
+        with whole(self.path / name) as part:
+            write(part)
 
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
@@ -101,14 +98,6 @@ def read_events(folder: Path) -> list[Event]:
         except (ValueError, KeyError, AttributeError):
             continue  # the last line of a run that was killed
     return events
-
-
-@contextlib.contextmanager
-def _disk(path: Path) -> Any:
-    try:
-        yield
-    except OSError as error:
-        raise VnetError(f"{path}: cannot write: {error.strerror or error}") from None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -63,6 +63,14 @@ class Judgement:
         return Verdict.VALID
 
     @property
+    def not_applicable(self) -> dict[str, list[str]]:
+        """Names of the checks that the run could not exercise, by reason."""
+        names: dict[str, list[str]] = {}
+        for left in self.not_exercised:
+            names.setdefault(left.reason, []).append(left.name)
+        return names
+
+    @property
     def exit_status(self) -> int:
         """The exit status of a command that ends with this judgement."""
         return self.verdict.exit_status

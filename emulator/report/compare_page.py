@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend, styled, to_svg
-from emulator.pages.page import SIGNS, badge, escape, page, put_page, table
+from emulator.pages.canvas import BLUE, RED, Canvas, Span, canvas, legend
+from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
-from emulator.report.figures import DASHES, Chart, Drawing, Line, decided, latencies_ms, time_figure
+from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
+from emulator.report.radio_figures import bin_width_s, decided, latencies_ms
 from emulator.report.source import Source
-from emulator.report.write import STYLE, figures_section
 from vnet.errors import VnetError
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
@@ -25,7 +25,6 @@ METRICS = {
     "position": ("Position", "position_rmse_m", "RMSE of position (m)"),
     "consensus": ("Consensus error", "consensus_error_m", "consensus error (m)"),
 }
-BINS = 60
 
 
 def write_comparison(comparison: Comparison, path: Path) -> Path:
@@ -34,64 +33,49 @@ def write_comparison(comparison: Comparison, path: Path) -> Path:
 
 
 def comparison_page(comparison: Comparison) -> str:
-    """The whole page."""
+    """Return the whole page."""
     charts, missing = _draw(comparison)
-    names = [source.folder.resolve().name for source in (comparison.first, comparison.second)]
-    body = [*_header(comparison), *_difference(comparison), *_tables(comparison), *figures_section(charts, missing)]
-    return page(f"vnet: {names[0]} and {names[1]}", body, STYLE)
-
-
-def _header(comparison: Comparison) -> Iterator[str]:
-    yield "<header><h1>Two runs side by side</h1>"
-    rows = zip((A, B), (comparison.first, comparison.second), comparison.records, strict=True)
-    for name, source, record in rows:
-        yield f"<p><b>{name}</b> {badge(record.verdict)} {escape(source.folder)}</p>"
-    yield "</header>"
-
-
-def _difference(comparison: Comparison) -> Iterator[str]:
     finding = comparison.finding
-    yield '<section id="difference"><h2>First difference</h2>'
-    sign = "" if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} "
-    yield f"<p>{sign}{escape(finding.text)}.</p>"
-    if rows := finding.figures.get("rows"):
-        yield table(turned(rows))
-    yield "</section>"
+    rows = finding.figures.get("rows")
+    outcomes = "outcomes, as shares of the attempted receptions; B − A in percentage points"
+    return render(
+        "comparison.html.j2",
+        runs=list(_runs(comparison)),
+        difference=finding.text if finding.verdict is Verdict.VALID else f"{SIGNS[Verdict.INVALID]} {finding.text}",
+        difference_rows=table(turned(rows)) if rows else None,
+        scenario=table(comparison.scenario, "keys that differ") if comparison.scenario else None,
+        key_figures=table(comparison.figures, "errors are means after the first fifth of the run"),
+        outcomes=table(comparison.outcomes, outcomes) if comparison.outcomes else None,
+        checks=table(comparison.checks),
+        charts=charts,
+        missing=missing,
+    )
 
 
-def _tables(comparison: Comparison) -> Iterator[str]:
-    yield '<section id="scenario"><h2>Scenario</h2>'
-    yield table(comparison.scenario, "keys that differ") if comparison.scenario else "<p>The same.</p>"
-    yield '</section><section id="key"><h2>Key figures</h2>'
-    yield table(comparison.figures, "errors are means after the first fifth of the run")
-    if comparison.outcomes:
-        yield f"<br>{table(comparison.outcomes, 'shares of the pairs in range; B − A in percentage points')}"
-    yield f'</section><section id="checks"><h2>Checks</h2>{table(comparison.checks)}</section>'
+def _runs(comparison: Comparison) -> Iterator[dict[str, Any]]:
+    sources = comparison.first, comparison.second
+    for letter, source, record in zip((A, B), sources, comparison.records, strict=True):
+        name = source.folder.resolve().name
+        yield {"letter": letter, "name": name, "folder": source.folder, "verdict": record.verdict}
 
 
 # Curves.
 
 
-@styled
-def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, str]]:
-    charts, missing = [], {}
+def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, list[str]]]:
     drawers: dict[str, tuple[str, Callable[[], Drawing]]] = {
         key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
     }
-    drawers["delivered"] = ("Delivered", partial(_delivered, comparison))
+    drawers["delivered"] = ("Packet delivery ratio", partial(_delivered, comparison))
     drawers["latency"] = ("Latency", partial(_latency, comparison))
-    for key, (title, draw) in drawers.items():
-        try:
-            drawing = draw()
-        except VnetError as error:
-            missing[title] = str(error)
-            continue
-        charts.append(Chart(key, title, to_svg(drawing.canvas.figure, key, title), drawing.caption))
-    return charts, missing
+    return draw_charts(drawers)
 
 
 def _of_both(comparison: Comparison, read: Callable[[Source], Any]) -> tuple[list[tuple[Any, Any]], str]:
-    """(look, what was read) of the runs that have it, and a note on one that does not; VnetError if neither has."""
+    """Return (look, value) for each run that has one, and a note on one that has not.
+
+    Raises VnetError if neither has.
+    """
     found, note = [], ""
     for look, source in zip(LOOKS, (comparison.first, comparison.second), strict=True):
         try:
@@ -104,7 +88,7 @@ def _of_both(comparison: Comparison, read: Callable[[Source], Any]) -> tuple[lis
 
 
 def _over_time(comparison: Comparison, read: Callable[[Source], Any], y_label: str, caption: str) -> Drawing:
-    """`read` gives times (n,) in seconds and values (n,) of a run."""
+    """Draw values of both runs; `read` returns times (n,) in seconds and values (n,) of a run."""
     found, note = _of_both(comparison, read)
     spans, said = _spans(comparison)
     lines = [Line(name, times, values, colour, dash) for (name, colour, dash), (times, values) in found]
@@ -113,10 +97,10 @@ def _over_time(comparison: Comparison, read: Callable[[Source], Any], y_label: s
 
 
 def _spans(comparison: Comparison) -> tuple[list[Span], str]:
-    """The faults that both runs had alike, and what is to be said of them."""
+    """The spans of faults if both runs had the same, and the caption's sentence on them."""
     if comparison.first.spans == comparison.second.spans:
-        return comparison.first.spans, " Shaded: while a fault acted." if comparison.first.spans else ""
-    return [], " Faults are not shaded, as they differ."
+        return comparison.first.spans, " Shaded: active faults." if comparison.first.spans else ""
+    return [], " Faults differ, and are not shaded."
 
 
 def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:
@@ -124,18 +108,18 @@ def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:
 
 
 def _delivered(comparison: Comparison) -> Drawing:
-    width_s = max(comparison.first.end_s, comparison.second.end_s) / BINS
+    width_s = max(bin_width_s(comparison.first), bin_width_s(comparison.second))
 
-    def share(source: Source) -> Any:
+    def ratio(source: Source) -> Any:
         names, code, time_s = decided(source)
-        place = (time_s / width_s).astype(np.intp)
-        total = np.bincount(place)
-        good = np.bincount(place, weights=np.array([name == "delivered" for name in names])[code])
+        index = (time_s / width_s).astype(np.intp)
+        total = np.bincount(index)
+        good = np.bincount(index, weights=np.array([name == "delivered" for name in names])[code])
         with np.errstate(invalid="ignore"):
             return (np.arange(len(total)) + 0.5) * width_s, 100 * good / total
 
-    caption = f"The share of the pairs in range that was delivered, in stretches of {width_s:.3g} s."
-    drawing = _over_time(comparison, share, "delivered (%)", caption)
+    caption = f"Share of the attempted receptions that was delivered, in bins of {width_s:.3g} s."
+    drawing = _over_time(comparison, ratio, "packet delivery ratio (%)", caption)
     drawing.canvas.axes.set_yscale("linear")
     drawing.canvas.axes.set_ylim(0, 100)
     return drawing
@@ -153,4 +137,4 @@ def _latency(comparison: Comparison) -> Drawing:
         )
     made.axes.set_xlim(0, max(end_ms, 1e-3))
     legend(made)
-    return Drawing(made, f"From handing a frame over to its arrival; a few later ones are cut off.{note}")
+    return Drawing(made, f"Time from a frame's enqueueing to its arrival; the latest 0.5 % may be cut off.{note}")

@@ -1,4 +1,4 @@
-"""Two runs side by side: where their scenarios differ, what each came to, and the first row in which they part."""
+"""Two runs side by side: the keys of their scenarios that differ, their figures, and the first row that differs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.replay import compare_folders
+from emulator.pages.text import cell
+from emulator.records.key_figures import KEY_FIGURES
 from emulator.records.run_folder import check_is_run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Finding, Verdict
 from emulator.report.source import Source
 from emulator.scenario.toml import parse_toml
-from emulator.terminal.summary import FIGURES, cell
 
 A, B = "A", "B"
+NOT_APPLICABLE = "not applicable"
 LONGEST_VALUE = 200
 Row = dict[str, Any]
 
@@ -45,12 +47,12 @@ class Comparison:
 
     @property
     def records(self) -> tuple[Record, Record]:
-        """What each run says of itself."""
+        """The verdict files of the two runs."""
         return self.first.record, self.second.record
 
     @property
     def same_trace(self) -> bool:
-        """Whether the traces are the same; states and metrics may still differ."""
+        """True if the traces are the same; states and metrics may still differ."""
         return self.finding.figures.get("table") != "trace"
 
     @cached_property
@@ -62,16 +64,16 @@ class Comparison:
 
     @cached_property
     def checks(self) -> list[Row]:
-        """The verdict, and that of each check; "left out" where a run could not exercise it."""
+        """The verdicts of the runs, and of each check that at least one of them exercised."""
         judged = [
             {check.name: check.verdict.value for check in record.checks}
-            | {left.name: "left out" for left in record.not_exercised}
+            | {left.name: NOT_APPLICABLE for left in record.not_exercised}
             for record in self.records
         ]
         rows = [{"check": "the run", A: self.records[0].verdict.value, B: self.records[1].verdict.value}]
         for name in judged[0] | judged[1]:
-            verdicts = [each.get(name, "left out") for each in judged]
-            if verdicts != ["left out"] * 2:
+            verdicts = [each.get(name, NOT_APPLICABLE) for each in judged]
+            if verdicts != [NOT_APPLICABLE] * 2:
                 rows.append({"check": name, A: verdicts[0], B: verdicts[1]})
         return rows
 
@@ -81,7 +83,7 @@ class Comparison:
         ours, theirs = (record.figures for record in self.records)
         rows = [
             _difference(f"{title} (m)", ours.get(name), theirs.get(name), ".3f")
-            for name, title in FIGURES.items()
+            for name, title in KEY_FIGURES.items()
             if ours.get(name) is not None or theirs.get(name) is not None
         ]
         times = [(record.emulated_s, record.wall_s) for record in self.records]
@@ -90,7 +92,7 @@ class Comparison:
 
     @cached_property
     def outcomes(self) -> list[Row]:
-        """Shares of the pairs in range by outcome, in percent, with B − A in percentage points."""
+        """Shares of the attempted receptions by outcome, in percent, with B − A in percentage points."""
         ours, theirs = self.records
         rows = []
         for name in ours.frames_by_outcome | theirs.frames_by_outcome:
@@ -145,7 +147,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     console.print(_table("verdicts", comparison.checks, _verdict_style))
     console.print(_table("figures (errors: means after the first fifth)", comparison.figures))
     if comparison.outcomes:
-        console.print(_table("shares of the pairs in range", comparison.outcomes))
+        console.print(_table("outcomes, as shares of the attempted receptions", comparison.outcomes))
     finding = comparison.finding
     console.print(Text(finding.text, style="green" if finding.verdict is Verdict.VALID else "bold red"))
     if rows := finding.figures.get("rows"):

@@ -1,79 +1,43 @@
-"""`runs/index.html`: all runs of a folder, the newest first, those that broke off or that are broken included."""
+"""`runs/index.html`: all runs of a folder, the newest first, unfinished and broken ones included."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
-from emulator.pages.page import badge, escape, page, put_page
-from emulator.records.page_names import INDEX, REPORT
+from emulator.pages.page import put_page, render
+from emulator.records.run_folder import INDEX, RECORDING, REPORT
 from emulator.records.verdict_file import Record, read_record
 from emulator.report.source import when
-from emulator.viewer.sinks import RECORDING
 from vnet.errors import VnetError
 
 MARKS = ("scenario.toml", "verdict.json", "events.jsonl")
 """A folder with any of these is a run's."""
-COLUMNS = {
-    "run": "",
-    "verdict": "",
-    "when": "less",
+NUMBERS = {
     "vehicles": "number less",
     "emulated (s)": "number less",
     "RMSE (m)": "number",
     "deviation (m)": "number less",
-    "delivered (%)": "number",
-    "files": "less",
+    "PDR (%)": "number",
 }
-"""Columns and their classes; those that are `less` are left out on narrow screens."""
-STYLE = """
-.tools { display: flex; flex-wrap: wrap; gap: .5rem .75rem; align-items: baseline; margin: 1rem 0 .75rem; }
-.tools[hidden] { display: none; }
-input, select { font: inherit; color: inherit; background: var(--panel); border: 1px solid var(--line);
-  border-radius: .3rem; padding: .2rem .5rem; max-width: 100%; }
-th button { font: inherit; color: inherit; background: none; border: 0; padding: 0; cursor: pointer; }
-th[aria-sort=ascending] button::after { content: " ↑"; } th[aria-sort=descending] button::after { content: " ↓"; }
-table { width: 100%; } td:first-child { overflow-wrap: anywhere; min-width: 7rem; }
-td small { display: block; }
-@media (max-width: 44rem) { .less { display: none; } th, td { padding-right: .5rem; }
-  thead th.number { white-space: normal; } }
-"""
-SCRIPT = """
-const body = document.querySelector("tbody"), rows = [...body.rows];
-const text = document.querySelector("#text"), verdict = document.querySelector("#verdict");
-document.querySelector(".tools").hidden = false;
-const fits = row => row.textContent.toLowerCase().includes(text.value.toLowerCase())
-  && (!verdict.value || row.dataset.verdict === verdict.value);
-const show = () => rows.forEach(row => row.hidden = !fits(row));
-text.oninput = verdict.onchange = show;
-document.querySelectorAll("thead th").forEach((head, place) => {
-  const button = document.createElement("button");
-  button.append(...head.childNodes); head.append(button);
-  button.onclick = () => {
-    const sign = head.ariaSort === "ascending" ? -1 : 1;
-    document.querySelectorAll("thead th").forEach(other => other.removeAttribute("aria-sort"));
-    head.ariaSort = sign > 0 ? "ascending" : "descending";
-    const key = row => row.cells[place].dataset.sort ?? "", isNumber = head.className.includes("number");
-    const order = (a, b) => isNumber ? a - b : a.localeCompare(b, "en", {numeric: true});
-    rows.sort((a, b) => (key(a) === "") - (key(b) === "") || sign * order(key(a), key(b)));
-    body.append(...rows);
-  };
-});
-"""
+COLUMNS = {"run": "", "verdict": "", "when": "less"} | NUMBERS | {"files": "less"}
+"""Columns and their classes; those that are `less` are hidden on narrow screens."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A run's folder, and its record, or why there is none."""
+    """A run's folder, and its record, or the reason for which there is none."""
 
     folder: Path
     when: datetime
     record: Record | None
     without: str
-    """What it has instead of a verdict, in two words."""
+    """The badge of a run without a record, in two words."""
     problem: str
 
 
@@ -83,10 +47,15 @@ def write_index(folder: Path) -> Path:
 
 
 def index_page(folder: Path) -> str:
-    """The whole page."""
+    """Return the whole page."""
     entries = sorted(_entries(folder), key=lambda entry: (entry.when, entry.folder.name), reverse=True)
-    title = f"vnet: runs in {folder.resolve().name}"
-    return page(title, _body(folder, entries), STYLE, SCRIPT if entries else "")
+    latest = (folder / "latest").resolve()
+    return render(
+        "index.html.j2",
+        name=folder.resolve().name,
+        columns=COLUMNS,
+        entries=[_row(entry, entry.folder.resolve() == latest) for entry in entries],
+    )
 
 
 def _entries(folder: Path) -> Iterator[Entry]:
@@ -107,56 +76,34 @@ def _entries(folder: Path) -> Iterator[Entry]:
         try:
             yield Entry(path, when(path), record, without, problem)
         except VnetError:
-            continue  # somebody has just removed it
+            continue  # it has just been removed
 
 
-def _body(folder: Path, entries: list[Entry]) -> Iterator[str]:
-    count = f"{len(entries)} run{'s' if len(entries) != 1 else ''}"
-    yield f'<header><h1>Runs in {escape(folder.resolve().name)}</h1><p class="quiet">{count}, the newest first. '
-    yield "Errors are means after the first fifth of a run; delivered: of the pairs in range.</p></header>"
-    if not entries:
-        yield "<p>There are none yet.</p>"
-        return
-    yield '<div class="tools" hidden>'
-    yield '<input id="text" type="search" placeholder="name, hash, …" aria-label="filter">'
-    words = ("valid", "invalid", "unknown", "none")
-    options = "".join(
-        f'<option value="{word}">{"no verdict" if word == "none" else word}</option>' for word in words
-    )
-    yield '<select id="verdict" aria-label="verdict"><option value="">all verdicts</option>'
-    yield f"{options}</select></div>"
-    head = "".join(f'<th scope="col" class="{kind}">{escape(name)}</th>' for name, kind in COLUMNS.items())
-    yield f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>'
-    latest = (folder / "latest").resolve()
-    for entry in entries:
-        yield _row(entry, entry.folder.resolve() == latest)
-    yield "</tbody></table></div>"
+def _row(entry: Entry, is_latest: bool) -> dict[str, Any]:
+    folder, record = entry.folder, entry.record
+    files = [name for name in ("scenario.toml", "verdict.json", RECORDING) if (folder / name).is_file()]
+    return {
+        "name": folder.name,
+        "link": _link(folder, REPORT if (folder / REPORT).is_file() else ""),
+        "is_latest": is_latest,
+        "note": f"trace {record.trace_sha256[:12]}" if record else entry.problem,
+        "verdict": record.verdict if record else None,
+        "without": entry.without,
+        "when": entry.when,
+        "numbers": [(kind, *texts) for kind, texts in zip(NUMBERS.values(), _numbers(record), strict=True)],
+        "files": {name: _link(folder, name) for name in files},
+    }
 
 
-def _row(entry: Entry, is_latest: bool) -> str:
-    record = entry.record
-    verdict = record.verdict.value if record else "none"
-    cells = [_named(entry, is_latest), (verdict, badge(record.verdict if record else None, entry.without))]
-    cells.append((entry.when.isoformat(), f"{entry.when:%Y-%m-%d %H:%M}".replace(" ", "\u00a0")))
-    cells += _numbers(record) if record else [("", "")] * 5
-    cells.append(("", _files(entry.folder)))
-    shown = (
-        f'<td class="{kind}" data-sort="{escape(key)}">{text}</td>'
-        for (key, text), kind in zip(cells, COLUMNS.values(), strict=True)
-    )
-    return f'<tr data-verdict="{verdict}">{"".join(shown)}</tr>'
+def _link(folder: Path, name: str) -> str:
+    """The address of a run's file beside the index; a folder's name need not be text."""
+    return quote(os.fsencode(f"{folder.name}/{name}"))
 
 
-def _named(entry: Entry, is_latest: bool) -> tuple[str, str]:
-    name = entry.folder.name
-    target = f"{name}/{REPORT}" if (entry.folder / REPORT).is_file() else f"{name}/"
-    shown = f'<a href="./{quote(target)}">{escape(name)}</a>{" · latest" if is_latest else ""}'
-    note = f"trace {entry.record.trace_sha256[:12]}" if entry.record else entry.problem
-    return name, f"{shown}<small>{escape(note, 300)}</small>"
-
-
-def _numbers(record: Record) -> list[tuple[str, str]]:
-    """Of each column of numbers what it is sorted by, and its text."""
+def _numbers(record: Record | None) -> list[tuple[str, str]]:
+    """The key by which each column of numbers is sorted, and its text."""
+    if record is None:
+        return [("", "")] * len(NUMBERS)
     share = record.share_of("delivered")
     figures = [record.figures.get(name) for name in ("common_error_rmse_m", "deviation_m")]
     values: Iterable[tuple[float | None, str]] = [
@@ -166,8 +113,3 @@ def _numbers(record: Record) -> list[tuple[str, str]]:
         (None if share is None else 100 * share, ".2f"),
     ]
     return [("", "–") if value is None else (f"{value:g}", format(value, form)) for value, form in values]
-
-
-def _files(folder: Path) -> str:
-    names = [name for name in ("scenario.toml", "verdict.json", RECORDING) if (folder / name).is_file()]
-    return ", ".join(f'<a href="./{quote(f"{folder.name}/{name}")}">{escape(name)}</a>' for name in names)

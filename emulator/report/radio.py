@@ -1,82 +1,89 @@
-"""The radio's part of a report: what it comes to in all, by vehicle, and on the worst links."""
+"""The radio's part of a report: figures over all links, by vehicle, and of the worst links."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import pyarrow as pa
 
-from emulator.pages.page import escape, table
+from emulator.pages.page import Table, table
 from emulator.report.source import Source
 from vnet.errors import VnetError
 
 MOST_ROWS = 50
 TOTALS = {
-    "delivered": ("delivery_ratio", "%"),
+    "packet delivery ratio": ("delivery_ratio", "%"),
     "latency": ("latency_mean_ms", "ms"),
-    "between two receptions": ("inter_reception_mean_ms", "ms"),
+    "inter-packet gap": ("inter_reception_mean_ms", "ms"),
     "age of information": ("age_mean_ms", "ms"),
-    "busy ratio": ("busy_ratio_mean", "%"),
+    "channel busy ratio": ("busy_ratio_mean", "%"),
 }
 VEHICLES = {
     "vehicle": "node",
     "frames": "frames",
-    "sent: delivered (%)": "sent_delivery_ratio",
-    "heard: delivered (%)": "heard_delivery_ratio",
+    "sent: PDR (%)": "sent_delivery_ratio",
+    "received: PDR (%)": "heard_delivery_ratio",
     "hears (vehicles)": "heard_vehicles",
     "latency (ms)": "latency_mean_ms",
-    "between receptions (ms)": "inter_reception_mean_ms",
+    "IPG (ms)": "inter_reception_mean_ms",
     "age (ms)": "age_mean_ms",
-    "busy ratio (%)": "busy_ratio_mean",
+    "CBR (%)": "busy_ratio_mean",
 }
 LINKS = {
     "sender": "sender",
     "receiver": "receiver",
-    "pairs": "pairs",
-    "delivered (%)": "delivery_ratio",
-    "apart (m)": "distance_mean_m",
+    "attempted": "pairs",
+    "PDR (%)": "delivery_ratio",
+    "distance (m)": "distance_mean_m",
     "latency (ms)": "latency_mean_ms",
-    "between receptions (ms)": "inter_reception_mean_ms",
-    "95 % (ms)": "inter_reception_p95_ms",
+    "IPG (ms)": "inter_reception_mean_ms",
+    "IPG 95 % (ms)": "inter_reception_p95_ms",
     "age (ms)": "age_mean_ms",
-    "oldest (ms)": "age_peak_ms",
+    "peak age (ms)": "age_peak_ms",
 }
 
 
-def radio_section(source: Source) -> Iterator[str]:
-    """The section; where there is nothing to show, why."""
-    yield '<section id="radio"><h2>Radio</h2>'
+@dataclass(frozen=True)
+class RadioSection:
+    """The section's key figures, and its tables by title."""
+
+    totals: dict[str, str]
+    tables: dict[str, Table]
+
+
+def radio_section(source: Source) -> RadioSection | str:
+    """Return the section, or the reason for which there is nothing to show."""
     try:
         metrics = source.radio
-        if not metrics.totals["pairs"]:
-            raise VnetError("nobody sent anything to anybody in range")
     except VnetError as error:
-        yield f"<p>{escape(error)}</p></section>"
-        return
-    yield '<dl class="tiles">'
-    for title, (name, unit) in TOTALS.items():
-        if (value := metrics.totals[name]) is not None:
-            yield f"<div><dt>{title}</dt><dd>{100 * value if unit == '%' else value:.1f} {unit}</dd></div>"
-    yield '</dl><p class="quiet">Means over all links; delivered and latency over all frames.</p>'
+        return str(error)
+    if not metrics.totals["pairs"]:
+        return "No frame was sent to anybody in range."
+    totals = {
+        title: f"{100 * value if unit == '%' else value:.1f} {unit}"
+        for title, (name, unit) in TOTALS.items()
+        if (value := metrics.totals[name]) is not None
+    }
     vehicles = metrics.vehicles.sort_by([("heard_delivery_ratio", "ascending"), ("node", "ascending")])
-    yield from _listed("By vehicle, from the one that hears least", vehicles, VEHICLES)
-    yield from _listed("The worst links", metrics.worst_links(MOST_ROWS), LINKS)
-    yield "</section>"
+    tables = _listed("By vehicle, the lowest packet delivery ratio (PDR) first", vehicles, VEHICLES)
+    return RadioSection(totals, tables | _listed("The worst links", metrics.worst_links(MOST_ROWS), LINKS))
 
 
-def _listed(title: str, rows: pa.Table, columns: Mapping[str, str]) -> Iterator[str]:
+def _listed(title: str, rows: pa.Table, columns: Mapping[str, str]) -> dict[str, Table]:
+    """The first rows as a table by its title; nothing without rows."""
     shown = rows.slice(0, MOST_ROWS)
     if not len(shown):
-        return
+        return {}
     more = f": {len(shown)} of {len(rows):,}" if len(shown) < len(rows) else ""
     listed = [
-        {head: _cell(name, row[name]) for head, name in columns.items()}
+        {head: _percent(name, row[name]) for head, name in columns.items()}
         for row in shown.select(list(columns.values())).to_pylist()
     ]
-    yield f"<details><summary>{title}{more}</summary>{table(listed, decimals=1)}</details>"
+    return {f"{title}{more}": table(listed, decimals=1)}
 
 
-def _cell(name: str, value: Any) -> Any:
+def _percent(name: str, value: Any) -> Any:
     """Ratios in percent, and all else as it is."""
     return 100 * value if "ratio" in name and value is not None else value

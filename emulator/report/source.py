@@ -107,7 +107,7 @@ class Source:
     def busy_ratio(self) -> Array:
         """(windows, N), how busy each vehicle found the medium. Raises VnetError if senders share none."""
         if self.scenario.radio.mac is None:
-            raise VnetError("senders share no medium ([radio.mac])")
+            raise VnetError("no MAC configured ([radio.mac])")
         windows = busy_windows(read_busy(self.folder), self.recorded.node_ids)
         if not len(windows):
             raise VnetError("the run was over within the first window")

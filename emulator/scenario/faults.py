@@ -1,105 +1,71 @@
-"""Faults as data: what is broken, where, from when and for how long.
+"""The kinds of faults: parameters, documentation, law, and how a campaign draws each of them.
 
-The same type stands in a scenario (`[[fault]]`) and in the live command (`vnet fault inject`). Every fault ends by
-itself. What a kind does is in `emulator.faults`; here is what may be written down.
+The same tables stand in a scenario (`[[fault]]`) and behind the live command (`vnet fault inject`). Every fault
+ends by itself. A kind is added by one class here; `emulator.scenario.fault_families` says what it inherits, and
+CONTRIBUTING.md shows an example.
 """
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections import Counter
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, cast
 
-from pydantic import Field, TypeAdapter, ValidationError, field_validator, model_validator
+import numpy as np
+from pydantic import Field, PlainValidator, SerializeAsAny, TypeAdapter, ValidationError, field_validator
 
-from emulator.scenario.sections import Section, first_problem
+from emulator.scenario.fault_draws import Chooser, Drawn
+from emulator.scenario.fault_families import (
+    LONGEST_S,
+    ClockFault,
+    DelayFault,
+    Fault,
+    GnssFault,
+    Infrastructure,
+    LinkFault,
+    LossFault,
+    NodeFault,
+    Point,
+    Probability,
+    ProcessFault,
+    SenderFault,
+    half,
+)
+from emulator.scenario.sections import first_problem
 from vnet.errors import ScenarioError, shown
-
-Probability = Annotated[float, Field(ge=0, le=1)]
-Point = tuple[float, float]
-LONGEST_S = 86_400.0
-
-
-class Selector(Section):
-    """Which nodes: all, unless one of these says otherwise.
-
-    Where vehicles stand their first position counts; where they move, docs/motion.md says which.
-    """
-
-    ids: tuple[str, ...] | None = None
-    """Those with these names."""
-    fraction: Annotated[float, Field(gt=0, le=1)] | None = None
-    """This share of all, drawn from the run's seed."""
-    random: Annotated[int, Field(ge=1)] | None = None
-    """So many of all, drawn from the run's seed."""
-    disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
-    """Those whose position is in a disc: x, y and radius in m."""
-    polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
-    """Those whose position is in a polygon: its corners, [x, y] in m."""
-    degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
-    """Those with so many others in range: least and most."""
-
-    @property
-    def by_place(self) -> bool:
-        """Whether it depends on where vehicles are."""
-        return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
-
-    @model_validator(mode="after")
-    def _at_most_one(self) -> Selector:
-        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} exclude each other")
-        if self.degree is not None and self.degree[0] > self.degree[1]:
-            raise ValueError("degree = [least, most] is upside down")
-        return self
-
-
-class _Fault(Section):
-    """Any fault."""
-
-    at_s: float = Field(0.0, ge=0, le=LONGEST_S)
-    """When it starts, in emulated time."""
-    duration_s: float = Field(gt=0, le=LONGEST_S)
-    """It ends so much later, in emulated time."""
-
-
-class _NodeFault(_Fault):
-    """A fault of nodes."""
-
-    nodes: Selector = Selector()
-    """Whom it strikes."""
-
-
-class _LinkFault(_Fault):
-    """A fault of links: those with an end among `nodes`, from one of `senders`, to one of `receivers`."""
-
-    nodes: Selector = Selector()
-    """One end of the link is among these."""
-    senders: Selector = Selector()
-    """The sender is among these."""
-    receivers: Selector = Selector()
-    """The receiver is among these."""
-
+from vnet.types import Array, Mask
+from vnet.units import NS_PER_S
 
 # Processes.
 
 
-class Kill(_NodeFault):
-    """The processes are killed (SIGKILL); when the fault ends the programs start anew.
+class Kill(ProcessFault):
+    """The processes are killed (SIGKILL); when the fault ends the programs start again.
 
     `node.incarnation` is then one higher, and `node.rng` another stream.
     """
 
+    campaign_weight: ClassVar[int] = 3
+    ends: ClassVar[bool] = True
+    forced: ClassVar[bool] = True
+
     kind: Literal["kill"]
 
 
-class Restart(_NodeFault):
+class Restart(ProcessFault):
     """As `kill`, but the programs are ended in order: their `finally` blocks run."""
+
+    ends: ClassVar[bool] = True
 
     kind: Literal["restart"]
 
 
-class Pause(_NodeFault):
-    """The processes stand still (SIGSTOP in real time) and find afterwards what came meanwhile."""
+class Pause(ProcessFault):
+    """The processes are paused (SIGSTOP in real time) and find afterwards what arrived meanwhile."""
+
+    campaign_weight: ClassVar[int] = 3
 
     kind: Literal["pause"]
 
@@ -107,8 +73,11 @@ class Pause(_NodeFault):
 # The network.
 
 
-class Partition(_Fault):
+class Partition(Fault):
     """Nothing passes between groups. Nodes that no group names are a group of their own."""
+
+    campaign_weight: ClassVar[int] = 4
+    cuts: ClassVar[bool] = True
 
     kind: Literal["partition"]
     groups: Literal["halves", "one", "ring"] | tuple[tuple[str, ...], ...] = "halves"
@@ -128,256 +97,336 @@ class Partition(_Fault):
             raise ValueError(f"{shown(twice[0])} is in two groups")
         return groups
 
+    @classmethod
+    def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+        """Draw a shape, or one group of up to half of the vehicles."""
+        shape = choose.choice(("named", "halves", "one", "ring"))
+        ids = [node for process in processes for node in process]
+        return {"groups": [choose.subset(ids, half(len(ids)))] if shape == "named" else shape}
 
-class Block(_LinkFault):
+
+class Block(LinkFault):
     """The links carry nothing; with `senders` or `receivers` in one direction only."""
+
+    campaign_weight: ClassVar[int] = 2
+    cuts: ClassVar[bool] = True
 
     kind: Literal["block"]
 
 
-class Loss(_LinkFault):
-    """Frames are lost, beside the radio's own loss."""
+class Loss(LossFault):
+    """Frames are lost, in addition to the radio's own loss."""
 
     kind: Literal["loss"]
-    probability: Probability
-    """Of losing a frame, at each receiver by itself."""
+    probability: Annotated[Probability, Drawn(1, 10, per=10)]
+    """Probability of losing a frame, at each receiver independently."""
+
+    @property
+    def mean_loss(self) -> float:
+        """The probability of losing a frame."""
+        return self.probability
+
+    def lost(self, draws: Array, bad: Mask) -> Mask:
+        """Return which receivers (N,) lose a frame, without memory."""
+        return np.asarray(draws[0] < self.probability)
 
 
-class BurstLoss(_LinkFault):
+class BurstLoss(LossFault):
     """Loss in bursts (Gilbert 1960, Elliott 1963): each link is good or bad, frame by frame.
 
-    The mean loss is `loss_good` and `loss_bad`, weighed by `leave` and `enter`.
+    The mean loss is `loss_good` and `loss_bad`, weighted by `leave` and `enter`.
     """
 
+    campaign_weight: ClassVar[int] = 2
+
     kind: Literal["burst_loss"]
-    enter: Probability = 0.05
+    enter: Annotated[Probability, Drawn(1, 30, per=100)] = 0.05
     """Probability that a good link turns bad, at each frame."""
-    leave: Annotated[float, Field(gt=0, le=1)] = 0.3
+    leave: Annotated[float, Field(gt=0, le=1), Drawn(1, 10, per=10)] = 0.3
     """Probability that a bad link turns good again, at each frame."""
     loss_bad: Probability = 1.0
     """Probability that a bad link loses a frame."""
     loss_good: Probability = 0.0
     """Probability that a good link loses a frame."""
 
+    @property
+    def mean_loss(self) -> float:
+        """The loss of a link in its stationary state."""
+        return (self.enter * self.loss_bad + self.leave * self.loss_good) / (self.enter + self.leave)
 
-class Delay(_LinkFault):
-    """Frames arrive later."""
+    def lost(self, draws: Array, bad: Mask) -> Mask:
+        """Return which receivers (N,) lose a frame; `bad` (N,) is the state of the links, changed in place."""
+        bad[:] = np.where(bad, draws[0] >= self.leave, draws[0] < self.enter)
+        return np.asarray(draws[1] < np.where(bad, self.loss_bad, self.loss_good))
+
+
+class Delay(DelayFault):
+    """Frames arrive later, by the same time at every receiver."""
 
     kind: Literal["delay"]
-    delay_ms: float = Field(gt=0, le=60_000)
-    """How much later."""
+    delay_ms: Annotated[float, Drawn(1, 500)] = Field(gt=0, le=60_000)
+    """Added latency."""
+
+    @property
+    def bounds_ms(self) -> tuple[float, float]:
+        """The delay, twice."""
+        return self.delay_ms, self.delay_ms
+
+    def added_ms(self, draws: Array) -> Array:
+        """Return the delay, at every receiver (N,)."""
+        return np.full(len(draws), self.delay_ms)
 
 
-class Jitter(_LinkFault):
-    """Frames arrive later, each by a time of its own."""
+class Jitter(DelayFault):
+    """Frames arrive later, by a random time at each receiver."""
 
     kind: Literal["jitter"]
-    jitter_ms: float = Field(gt=0, le=60_000)
-    """How much later at most; uniform from 0."""
+    jitter_ms: Annotated[float, Drawn(1, 300)] = Field(gt=0, le=60_000)
+    """Greatest added latency; uniform from 0."""
+
+    @property
+    def bounds_ms(self) -> tuple[float, float]:
+        """Zero and the greatest added latency."""
+        return 0.0, self.jitter_ms
+
+    def added_ms(self, draws: Array) -> Array:
+        """Return a uniform latency at each receiver (N,)."""
+        return self.jitter_ms * draws
 
 
-class Reorder(_LinkFault):
+class Reorder(DelayFault):
     """Some frames are held back, so that later ones overtake them."""
 
     kind: Literal["reorder"]
-    probability: Probability = 0.2
-    """Of holding a frame back, at each receiver by itself."""
-    delay_ms: float = Field(150.0, gt=0, le=60_000)
-    """How long it is held back."""
+    probability: Annotated[Probability, Drawn(1, 5, per=10)] = 0.2
+    """Probability of holding a frame back, at each receiver independently."""
+    delay_ms: Annotated[float, Drawn(1, 400)] = Field(150.0, gt=0, le=60_000)
+    """Time for which a frame is held back."""
+
+    @property
+    def bounds_ms(self) -> tuple[float, float]:
+        """Zero and the time for which a frame is held back."""
+        return 0.0, self.delay_ms
+
+    def added_ms(self, draws: Array) -> Array:
+        """Return the delay at the receivers (N,) at which a frame is held back, else zero."""
+        return np.where(draws < self.probability, self.delay_ms, 0.0)
 
 
-class Duplicate(_LinkFault):
-    """Some frames arrive again."""
+class Duplicate(LinkFault):
+    """Some frames arrive more than once."""
 
     kind: Literal["duplicate"]
-    probability: Probability = 0.2
-    """Of repeating a frame, at each receiver by itself."""
-    copies: int = Field(1, ge=1, le=20)
-    """How many more times it arrives."""
-    delay_ms: float = Field(10.0, gt=0, le=60_000)
+    probability: Annotated[Probability, Drawn(1, 5, per=10)] = 0.2
+    """Probability of repeating a frame, at each receiver independently."""
+    copies: Annotated[int, Drawn(1, 3)] = Field(1, ge=1, le=20)
+    """Number of further arrivals."""
+    delay_ms: Annotated[float, Drawn(1, 100)] = Field(10.0, gt=0, le=60_000)
     """Time from one of these arrivals to the next."""
 
 
-class Corrupt(_LinkFault):
+class Corrupt(LinkFault):
     """Some frames arrive with bytes changed."""
 
+    campaign_weight: ClassVar[int] = 2
+
     kind: Literal["corrupt"]
-    probability: Probability = 0.2
-    """Of changing a frame, at each receiver by itself."""
-    flips: int = Field(1, ge=1, le=65_000)
-    """How many bytes; all of a shorter frame."""
+    probability: Annotated[Probability, Drawn(1, 5, per=10)] = 0.2
+    """Probability of changing a frame, at each receiver independently."""
+    flips: Annotated[int, Drawn(1, 8)] = Field(1, ge=1, le=65_000)
+    """Number of changed bytes; all bytes of a shorter frame."""
 
 
-class Throttle(_NodeFault):
+class Throttle(NodeFault):
     """The nodes send slowly; their queues fill."""
 
     kind: Literal["throttle"]
-    bitrate_mbps: float = Field(ge=1e-4, le=1e6)
-    """Their bitrate; the radio's own, if that is less."""
+    bitrate_mbps: Annotated[float, Drawn(1, 40, per=20)] = Field(ge=1e-4, le=1e6)
+    """Bitrate of the nodes; the radio's own, if that is less."""
 
 
-class Range(_NodeFault):
-    """The nodes hear and are heard less far."""
+class Range(NodeFault):
+    """The radio range of the nodes shrinks, for sending and receiving."""
+
+    cuts: ClassVar[bool] = True
+    follows_vehicles: ClassVar[bool] = True
 
     kind: Literal["range"]
-    range_m: float = Field(gt=0, le=1e9)
-    """Their range."""
+    range_m: Annotated[float, Drawn(1, 20, times=100)] = Field(gt=0, le=1e9)
+    """Range of the nodes."""
 
 
-class Swizzle(_NodeFault):
+class Swizzle(NodeFault):
     """The nodes are cut off one by one, and then come back in another order, each for half of `over_s`."""
+
+    cuts: ClassVar[bool] = True
 
     kind: Literal["swizzle"]
     over_s: Annotated[float, Field(gt=0, le=LONGEST_S)] | None = None
-    """How long all of this takes; the duration, unless it is given."""
+    """Time from the first cut to the last return; the duration, unless it is given."""
 
 
 # Sensors and clocks.
 
 
-class GnssOutage(_NodeFault):
+class GnssOutage(GnssFault):
     """No fixes."""
 
     kind: Literal["gnss_outage"]
 
 
-class GnssJump(_NodeFault):
+class GnssJump(GnssFault):
     """Fixes are off by a constant."""
 
     kind: Literal["gnss_jump"]
-    offset_m: Point
-    """East and north."""
+    offset_m: Annotated[Point, Drawn(-50, 50)]
+    """Offset of the fixes, east and north."""
+
+    def displacement_m(self, since_ns: int) -> Array | None:
+        """Return the offset (2,)."""
+        return np.array(self.offset_m)
 
 
-class GnssRamp(_NodeFault):
-    """Fixes stray, from 0 at the start."""
+class GnssRamp(GnssFault):
+    """Fixes drift away, from 0 at the start."""
 
     kind: Literal["gnss_ramp"]
-    rate_m_s: Point
-    """East and north."""
+    rate_m_s: Annotated[Point, Drawn(-3, 3)]
+    """Speed of the drift, east and north."""
+
+    def displacement_m(self, since_ns: int) -> Array | None:
+        """Return the offset (2,) that has accumulated since the start."""
+        return np.asarray(np.array(self.rate_m_s) * since_ns / NS_PER_S)
 
 
-class GnssFreeze(_NodeFault):
+class GnssFreeze(GnssFault):
     """Fixes repeat the last position, with new times."""
+
+    follows_vehicles: ClassVar[bool] = False
 
     kind: Literal["gnss_freeze"]
 
 
-class Skew(_NodeFault):
+class Skew(ClockFault):
     """The nodes' clocks are off by a constant.
 
-    `node.now_ns`, the times at which packets are received, and all timers of a program go by them.
+    `node.now_ns`, the times at which packets are received, and all timers of a program follow them.
     """
 
     kind: Literal["skew"]
-    offset_ms: float = Field(ge=-3.6e6, le=3.6e6)
-    """Positive: the clock is ahead."""
+    offset_ms: Annotated[float, Drawn(-1000, 1000)] = Field(ge=-3.6e6, le=3.6e6)
+    """Offset of the clock; positive: the clock is ahead."""
 
 
-class Drift(_NodeFault):
-    """The nodes' clocks run too fast or too slow. As `skew`, they are what a program goes by."""
+class Drift(ClockFault):
+    """The nodes' clocks run too fast or too slow. As with `skew`, programs follow them."""
 
     kind: Literal["drift"]
-    rate_ppm: float = Field(ge=-500_000, le=500_000)
-    """Positive: too fast."""
+    rate_ppm: Annotated[float, Drawn(-500, 500, times=100)] = Field(ge=-500_000, le=500_000)
+    """Error of the clock's rate; positive: too fast."""
 
 
 # Misbehaviour, as VeReMi names it (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020).
 
 
-class ConstPosOffset(_NodeFault):
+class ConstPosOffset(GnssFault):
     """The nodes' own fixes are off by a constant, and so is what they say."""
 
+    chapter: ClassVar[str] = "Misbehaviour"
+
     kind: Literal["ConstPosOffset"]
-    offset_m: Point = (50.0, 0.0)
-    """East and north."""
+    offset_m: Annotated[Point, Drawn(-50, 50)] = (50.0, 0.0)
+    """Offset of the fixes, east and north."""
+
+    def displacement_m(self, since_ns: int) -> Array | None:
+        """Return the offset (2,)."""
+        return np.array(self.offset_m)
 
 
-class RandomPos(_NodeFault):
-    """The nodes' own fixes are anywhere in a disc around where they would be, a new place each time."""
+class RandomPos(GnssFault):
+    """The nodes' own fixes are anywhere in a disc around their true fixes, drawn again each time."""
+
+    chapter: ClassVar[str] = "Misbehaviour"
 
     kind: Literal["RandomPos"]
-    radius_m: float = Field(300.0, gt=0)
+    radius_m: Annotated[float, Drawn(1, 300)] = Field(300.0, gt=0)
     """Radius of the disc."""
 
 
-class DataReplay(_NodeFault):
-    """With each frame the nodes send an old one of their own again, of those since the fault began."""
+class DataReplay(SenderFault):
+    """With each frame the nodes send an old one of their own again, one of those since the fault began."""
 
     kind: Literal["DataReplay"]
-    age_s: float = Field(1.0, gt=0, le=60)
-    """How old: the newest that is at least so old."""
+    age_s: Annotated[float, Drawn(1, 30, per=10)] = Field(1.0, gt=0, le=60)
+    """Age of the old frame: the newest one that is at least this old."""
 
 
-class StaleMessages(_NodeFault):
+class StaleMessages(SenderFault):
     """In place of each frame the nodes send an old one of their own, once there is one since the fault began."""
 
     kind: Literal["StaleMessages"]
-    age_s: float = Field(1.0, gt=0, le=60)
-    """How old: the newest that is at least so old."""
+    age_s: Annotated[float, Drawn(1, 30, per=10)] = Field(1.0, gt=0, le=60)
+    """Age of the old frame: the newest one that is at least this old."""
 
 
-class DoS(_NodeFault):
-    """Each frame goes out many times."""
+class DoS(SenderFault):
+    """Each frame is sent many times."""
 
     kind: Literal["DoS"]
-    factor: int = Field(10, ge=2, le=200)
-    """How many times in all."""
+    factor: Annotated[int, Drawn(2, 10)] = Field(10, ge=2, le=200)
+    """Number of transmissions of each frame."""
 
 
-class Sybil(_NodeFault):
-    """Each frame goes out again under other names: ID~1, ID~2, …"""
+class Sybil(SenderFault):
+    """Each frame is sent again under other names: ID~1, ID~2, …"""
 
     kind: Literal["Sybil"]
-    ghosts: int = Field(3, ge=1, le=100)
-    """How many other names."""
+    ghosts: Annotated[int, Drawn(1, 3)] = Field(3, ge=1, le=100)
+    """Number of other names."""
 
 
 # Infrastructure.
 
 
-class EmulatorRestart(_Fault):
+class EmulatorRestart(Infrastructure):
     """The emulator's router and sessions close and come back; agents are told first.
 
     In lockstep no emulated time passes meanwhile.
     """
 
     kind: Literal["emulator_restart"]
-    down_s: float = Field(1.0, gt=0, le=60)
-    """How long they are away (wall clock)."""
-    duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
-    """Means nothing here."""
 
 
-class RouterRestart(_Fault):
+class RouterRestart(Infrastructure):
     """The separate router is ended and started again; agents are told first."""
 
     kind: Literal["router_restart"]
-    down_s: float = Field(1.0, gt=0, le=60)
-    """How long it is away (wall clock)."""
-    duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
-    """Means nothing here."""
 
 
-ProcessFault = Kill | Restart | Pause
-LinkFault = Block | Loss | BurstLoss | Delay | Jitter | Reorder | Duplicate | Corrupt
-GnssFault = GnssOutage | GnssJump | GnssRamp | GnssFreeze | ConstPosOffset | RandomPos
-ClockFault = Skew | Drift
-SenderFault = DataReplay | StaleMessages | DoS | Sybil
-NodeFault = ProcessFault | Throttle | Range | Swizzle | GnssFault | ClockFault | SenderFault
-Infrastructure = EmulatorRestart | RouterRestart
+KINDS = cast(Mapping[str, type[Fault]], Fault.kinds)
+"""All kinds by their names; a class that is added later is there as well."""
 
-Fault = Annotated[NodeFault | LinkFault | Partition | Infrastructure, Field(discriminator="kind")]
 
-_adapter: TypeAdapter[Any] = TypeAdapter(Fault)
-KINDS: tuple[str, ...] = tuple(_adapter.json_schema()["discriminator"]["mapping"])
-"""The names of all kinds."""
+@functools.lru_cache
+def _adapter(kinds: tuple[type[Fault], ...]) -> TypeAdapter[Any]:
+    """Return the validator of a fault that is one of these kinds."""
+    fault: Any = Annotated[functools.reduce(operator.or_, kinds), Field(discriminator="kind")]
+    return TypeAdapter(fault)
+
+
+def _validate(data: object) -> Fault:
+    """Return the fault that plain data describe. Raises ValidationError."""
+    fault: Fault = _adapter(tuple(KINDS.values())).validate_python(data)
+    return fault
+
+
+AnyFault = Annotated[SerializeAsAny[Fault], PlainValidator(_validate)]
+"""A fault of any kind, as the type of a scenario's key."""
 
 
 def parse_fault(data: object) -> Fault:
-    """A fault from plain data, as of JSON or TOML. Raises ScenarioError in one line."""
+    """Return the fault that plain data, as of JSON or TOML, describe. Raises ScenarioError in one line."""
     try:
-        fault: Fault = _adapter.validate_python(data)
+        return _validate(data)
     except ValidationError as error:
-        raise ScenarioError(f"fault: {first_problem(error, _adapter)}") from None
-    return fault
+        raise ScenarioError(f"fault: {first_problem(error, Fault)}") from None

@@ -17,12 +17,12 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from emulator.scenario.faults import Fault
+from emulator.scenario.faults import AnyFault
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.sumo import input_files
 from emulator.scenario.toml import DEEPEST, check_plain, parse_toml, read_toml
-from vnet.errors import ScenarioError, did_you_mean, printable, shown
+from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
 DAY_S = 86_400
@@ -37,8 +37,6 @@ FAR_S = 1e11
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
-MOST_NAMED = 8
-"""Files that a message names."""
 
 
 class Run(Section):
@@ -304,8 +302,8 @@ class Scenario(Section):
     world: WorldSection = WorldSection()
     radio: Radio = Radio()
     program: Program = Program()
-    fault: tuple[Fault, ...] = ()
-    """What breaks, and when."""
+    fault: tuple[AnyFault, ...] = ()
+    """The faults, and when they act."""
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:
@@ -375,7 +373,7 @@ def _instead(path: Path) -> str:
     try:
         inside = sorted(each.name for each in path.glob("*.toml"))
         if inside:
-            return f"; in it there are {', '.join(inside[:MOST_NAMED])}{', …' if len(inside) > MOST_NAMED else ''}"
+            return f"; in it there are {first_names(inside)}"
         return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
     except (OSError, ValueError):
         return ""

@@ -20,6 +20,7 @@ from emulator.records.run_folder import Event
 from emulator.terminal.console import LogFormat
 from emulator.terminal.dashboard import Dashboard, describe, is_bad
 from emulator.terminal.painter import EVERY_S, Painter
+from vnet.errors import first_names
 
 PLAIN_LINE_EVERY_S = 5.0
 JSON_LINE_EVERY_S = 1.0
@@ -184,8 +185,7 @@ class PlainLines(_Lines):
         self._course.awaits(nodes)
         if nodes and self._is_time():
             total = len(self._emulation.world.node_ids)
-            named = ", ".join(nodes[:8]) + (", …" if len(nodes) > 8 else "")
-            self._write(f"{total - len(nodes)} of {total} vehicles have joined; missing: {named}")
+            self._write(f"{total - len(nodes)} of {total} vehicles have joined; missing: {first_names(nodes)}")
         if not nodes:
             self._last_s = 0.0
 

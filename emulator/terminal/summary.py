@@ -13,17 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.judge import Judgement, Verdict
-from emulator.records.page_names import REPORT
-from emulator.viewer.sinks import RECORDING, is_closed, repair_command
+from emulator.pages.text import cell
+from emulator.records.key_figures import KEY_FIGURES
+from emulator.records.run_folder import RECORDING, REPORT
+from emulator.viewer.sinks import is_closed, repair_command
 
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
-FIGURES = {
-    "common_error_rmse_m": "common error, RMSE",
-    "deviation_m": "deviation between vehicles",
-    "position_rmse_m": "position, RMSE of the estimates",
-    "fix_rmse_m": "position, RMSE of the raw fixes",
-    "consensus_error_m": "consensus error",
-}
 
 
 def print_summary(
@@ -64,8 +59,8 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
     for check in judgement.checks:
         table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
     console.print(table)
-    for reason, names in left_out(judgement).items():
-        console.print(Text(f"left out: {', '.join(names)}: {reason}", style="dim"))
+    for reason, names in judgement.not_applicable.items():
+        console.print(Text(f"not applicable: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
@@ -74,14 +69,6 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
             console.print(offending(rows))
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
-
-
-def left_out(judgement: Judgement) -> dict[str, list[str]]:
-    """What could not be exercised, by reason."""
-    names: dict[str, list[str]] = {}
-    for left in judgement.not_exercised:
-        names.setdefault(left.reason, []).append(left.name)
-    return names
 
 
 def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -93,13 +80,6 @@ def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     for row in rows:
         table.add_row(*(Text(cell(row.get(column))) for column in columns))
     return table
-
-
-def cell(value: Any) -> str:
-    """A value as a table shows it."""
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return "" if value is None else str(value)
 
 
 def _print_details(figures: dict[str, Any], console: Console) -> None:
@@ -120,7 +100,7 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
     table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
-    for name, title in FIGURES.items():
+    for name, title in KEY_FIGURES.items():
         if (value := verdict["figures"].get(name)) is not None:
             table.add_row(title, f"{value:.3f} m")
     return table

@@ -26,11 +26,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from emulator.records.atomic import write_atomically
 from emulator.records.run_folder import RUNS
+from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.schedules import WEIGHTS, ScheduleConstraints, draw_fault, known_kinds
+from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
 from vnet.errors import ScenarioError, VnetError
@@ -77,9 +79,9 @@ class Plan:
         if self.scenario.network.kind == "generated":
             changes["network.seed"] = seed
         scenario = make_scenario(self.scenario, changes)
-        choose, ground = _Random(seed), ScheduleConstraints.of(scenario)
-        weighted = [kind for kind in self.kinds for _ in range(WEIGHTS.get(kind, 1))]
-        faults = [draw_fault(choose, ground, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
+        choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
+        weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
+        faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
         return make_scenario(scenario, {"faults": faults})
 
 
@@ -249,8 +251,8 @@ class Campaign:
         """campaign.json and campaign.html, of what is there."""
         rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.seed)]
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
-        _replace(self._folder / "campaign.json", json.dumps(head | {"results": rows}, indent=1) + "\n")
-        _replace(self._folder / "campaign.html", self._page())
+        write_atomically(self._folder / "campaign.json", json.dumps(head | {"results": rows}, indent=1) + "\n")
+        write_atomically(self._folder / "campaign.html", self._page())
 
     def _page(self) -> str:
         run = self._plan.scenario.run
@@ -282,12 +284,6 @@ class Campaign:
             texts = "\n".join(f"{name}: {text}" for name, text in told["checks"].items())
             table.add_row(told["number"], str(outcome.seed), Text(texts), Text(told["schedule"] or "none"))
         return table
-
-
-def _replace(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    part.replace(path)
 
 
 def _folders(name: str) -> Iterator[Path]:

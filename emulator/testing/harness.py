@@ -27,7 +27,8 @@ from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
 from emulator.records.metrics import PeriodFigures
 from emulator.records.run_folder import Event, RunFolder
-from emulator.scenario.faults import LONGEST_S, Selector, parse_fault
+from emulator.scenario.fault_families import LONGEST_S, Selector
+from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
 from emulator.world.world import build_world

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from emulator.scenario.faults import Fault, Selector
+from emulator.scenario.fault_families import Fault, Selector
+from emulator.scenario.faults import Partition
 
 Schedule = tuple[Fault, ...]
 SHORTEST_S = 0.1
@@ -56,7 +57,7 @@ def _fewer(fault: Fault) -> Iterator[Fault]:
         if isinstance(value, Selector):
             for ids in _halves(value.ids or ()):
                 yield fault.model_copy(update={name: Selector(ids=ids)})
-    if fault.kind == "partition" and isinstance(fault.groups, tuple) and len(fault.groups) == 1:
+    if isinstance(fault, Partition) and isinstance(fault.groups, tuple) and len(fault.groups) == 1:
         for ids in _halves(fault.groups[0]):
             yield fault.model_copy(update={"groups": (ids,)})
 

@@ -36,6 +36,7 @@ from emulator.viewer.drawing import (
     outcome_colours,
 )
 from emulator.viewer.radio_scene import next_charts_s
+from vnet.errors import first_names
 
 LANE_HALF_LENGTH_M = 250.0
 ELLIPSES_EVERY_S = 1.0
@@ -186,7 +187,7 @@ class OverviewScene:
         if down != self._down:
             colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
             self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
-            shown = ", ".join(down[:NAMED_DOWN]) + (" …" if len(down) > NAMED_DOWN else "")
+            shown = first_names(down, NAMED_DOWN)
             self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else NOBODY))
             self._down = down
 

@@ -21,11 +21,10 @@ from emulator.viewer.overview_scene import OverviewScene
 from emulator.viewer.radio_scene import RadioScene
 from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.viewer.vehicle_scene import VehicleScene
-from vnet.errors import VnetError
+from vnet.errors import VnetError, first_names
 
 DRAWN_TOGETHER_S = 1.0
 """Periods are drawn some at a time: ten take hardly longer than three that come apart."""
-NAMED = 8
 
 
 class Recorder:
@@ -75,8 +74,7 @@ class Recorder:
         self._node_ids = scene["node_ids"]
         vehicle = self._vehicle or self._node_ids[0]
         if vehicle not in self._node_ids:
-            known = ", ".join(self._node_ids[:NAMED]) + (", …" if len(self._node_ids) > NAMED else "")
-            raise VnetError(f"no vehicle is called {vehicle}; there are {known}")
+            raise VnetError(f"no such vehicle: {vehicle}; there are {first_names(self._node_ids)}")
         self._overview = OverviewScene(self._canvas, scene)
         self._parts = [
             self._overview,

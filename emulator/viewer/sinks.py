@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from emulator.records.run_folder import RECORDING
 from vnet.errors import VnetError
 
 if TYPE_CHECKING:  # Rerun is slow to import, and only those who open a recording need it
     import rerun
 
 CHOICES = ("spawn", "serve", "save", "off")
-RECORDING = "recording.rrd"
 LOOPBACK = "127.0.0.1"
 DEFAULT_PORT = 9876
 PORTS_TRIED = 50

@@ -9,22 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from emulator.faults.plan import PlannedFault, stream
-from emulator.scenario.faults import (
-    ConstPosOffset,
-    Drift,
-    GnssFault,
-    GnssFreeze,
-    GnssJump,
-    GnssOutage,
-    GnssRamp,
-    RandomPos,
-    Skew,
-)
+from emulator.scenario.fault_families import GnssFault
+from emulator.scenario.faults import Drift, GnssFreeze, GnssOutage, RandomPos, Skew
 from emulator.world.world import Instant, World
 from vnet.node import Fix
 from vnet.transport.wire import ClockError
 from vnet.types import Array
-from vnet.units import NS_PER_S
 
 
 class FaultyGnss:
@@ -79,18 +69,15 @@ class FaultyGnss:
         return self._world.fix(last, number).position_m
 
     def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:
-        match planned.fault:
-            case GnssJump(offset_m=offset_m) | ConstPosOffset(offset_m=offset_m):
-                return np.asarray(position_m + np.array(offset_m))
-            case GnssRamp(rate_m_s=rate_m_s):
-                return np.asarray(position_m + np.array(rate_m_s) * (time_ns - planned.start_ns) / NS_PER_S)
-            case RandomPos(radius_m=radius_m):
-                # Drawn for each vehicle and period, independent of other draws.
-                draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
-                angle, away_m = 2 * math.pi * draws[0], radius_m * math.sqrt(draws[1])
-                return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
-            case _:
-                return position_m
+        fault = planned.fault
+        assert isinstance(fault, GnssFault)
+        if isinstance(fault, RandomPos):
+            # Drawn for each vehicle and period, independent of other draws.
+            draws = stream(self._seed, planned.number, f"position {number} {period}").random(2)
+            angle, away_m = 2 * math.pi * draws[0], fault.radius_m * math.sqrt(draws[1])
+            return np.asarray(position_m + away_m * np.array([math.cos(angle), math.sin(angle)]))
+        displacement_m = fault.displacement_m(time_ns - planned.start_ns)
+        return position_m if displacement_m is None else np.asarray(position_m + displacement_m)
 
 
 def clock_of(faults: Sequence[PlannedFault], node: str, number: int, time_ns: int) -> ClockError:

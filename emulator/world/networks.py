@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.random_streams import NETWORK_KEY, philox
 from emulator.world.csv_file import check_row_count, open_csv
 from vnet.errors import ScenarioError, shown
 from vnet.transport.keys import is_segment
@@ -111,7 +112,7 @@ def generate_network(layout: str, vehicles: int, seed: int) -> Network:
     the scaled degrees of the nearest of them. `dense` is a city centre in which most vehicles are in range of each
     other.
     """
-    rng = np.random.Generator(np.random.Philox(key=np.array([seed, 0x6E6574], dtype=np.uint64)))
+    rng = np.random.Generator(philox(seed, NETWORK_KEY))
     width = max(2, len(str(vehicles)))
     node_ids = tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
     heading_rad = _draw_headings(rng, vehicles)

@@ -8,7 +8,6 @@ all receivers, and the noise of each.
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Gnss, Scenario
 from emulator.world.lateral import lateral_offsets_m
 from emulator.world.links import load_links
@@ -23,7 +23,7 @@ from emulator.world.maps.around import read_lanes
 from emulator.world.networks import Network, generate_network, load_network
 from emulator.world.trips.drive import drive, drive_through_city
 from emulator.world.trips.motion import Motion
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, first_names
 from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
@@ -105,7 +105,7 @@ class World:
     def _draw_common(self, scenario: Scenario) -> Array:
         """Draw the common error (K, 2) in metres: a Gauss-Markov process that starts in its stationary state."""
         common = scenario.world.common_error
-        normal = _stream(scenario.run.seed, "common error", 0).standard_normal((self.periods, 2))
+        normal = stream(scenario.run.seed, "common error").standard_normal((self.periods, 2))
         keep = math.exp(-self.period_ns / NS_PER_S / common.tau_s)
         error = np.empty_like(normal)
         error[0] = common.sigma_m * normal[0]
@@ -115,8 +115,8 @@ class World:
 
     def _draw_noise(self, gnss: Gnss, seed: int, count: int) -> tuple[Array, Array]:
         """Draw the position noise (K, N, 2) in metres and the heading noise (K, N) in radians."""
-        position = [_stream(seed, "gnss", i).standard_normal((self.periods, 2)) for i in range(count)]
-        heading = [_stream(seed, "heading", i).standard_normal(self.periods) for i in range(count)]
+        position = [stream(seed, "gnss", i).standard_normal((self.periods, 2)) for i in range(count)]
+        heading = [stream(seed, "heading", i).standard_normal(self.periods) for i in range(count)]
         return gnss.sigma_m * np.stack(position, axis=1), gnss.heading_sigma_rad * np.stack(heading, axis=1)
 
     def at(self, period: int) -> Instant:
@@ -157,7 +157,7 @@ def _draw_lateral(scenario: Scenario, count: int) -> Array:
     """Draw lateral offsets (K, N) in metres: Ornstein-Uhlenbeck processes reflected at the half-width."""
     lateral, periods = scenario.world.lateral, periods_of(scenario)
     normal = np.column_stack(
-        [_stream(scenario.run.seed, "lateral", i).standard_normal(periods) for i in range(count)]
+        [stream(scenario.run.seed, "lateral", i).standard_normal(periods) for i in range(count)]
     )
     keep = math.exp(-scenario.period_ns / NS_PER_S / lateral.tau_s)
     return lateral_offsets_m(normal, lateral.sigma_m, keep, lateral.half_width_m)
@@ -166,7 +166,7 @@ def _draw_lateral(scenario: Scenario, count: int) -> Array:
 def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
     """Return a world in which each vehicle stands on a straight lane of its own, with a varying lateral offset."""
     count = len(network.node_ids)
-    order = _stream(scenario.run.seed, "map order", 0).permutation(count)
+    order = stream(scenario.run.seed, "map order").permutation(count)
     half_width_m = scenario.world.lateral.half_width_m
     lane_map = LaneMap(network.position_m[order], network.heading_rad[order], half_width_m)
     normal = np.column_stack([np.sin(network.heading_rad), -np.cos(network.heading_rad)])
@@ -193,7 +193,7 @@ def _check_exceptions(scenario: Scenario, node_ids: tuple[str, ...]) -> None:
     for exception in scenario.program.exceptions:
         for node in exception.nodes:
             if node not in node_ids:
-                some = ", ".join(node_ids[:8]) + (", …" if len(node_ids) > 8 else "")
+                some = first_names(node_ids)
                 raise ScenarioError(f"program.exceptions: {node!r}: no such vehicle; the network has {some}")
 
 
@@ -231,13 +231,3 @@ def components(position_m: Array, range_m: float, links: NDArray[np.bool_] | Non
     label = np.full(len(present), -1, dtype=np.intp)
     label[present] = connected_components(linked, directed=False)[1]
     return label
-
-
-def _stream(seed: int, process: str, vehicle: int) -> np.random.Generator:
-    """Return the random stream of a process (the string is part of its key) of a vehicle."""
-    key = int.from_bytes(hashlib.blake2b(process.encode(), digest_size=8).digest(), "little")
-    return np.random.Generator(
-        np.random.Philox(
-            key=np.array([seed, key], dtype=np.uint64), counter=np.array([0, 0, vehicle, 0], dtype=np.uint64)
-        )
-    )

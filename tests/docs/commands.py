@@ -128,8 +128,8 @@ def parse(words: Sequence[str]) -> None:
 def _look_at(program: str, arguments: list[str]) -> None:
     """What can be said of a command that is not vnet's."""
     if program == "make":
-        targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-        if wrong := set(arguments) - set(targets):
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        if wrong := {word for word in arguments if "=" not in word} - set(targets):
             raise DocsError(f"make: no such target: {', '.join(sorted(wrong))}")
     if program == "ip" and "exec" in arguments:
         parse(arguments[arguments.index("exec") + 2 :])

@@ -10,7 +10,7 @@ from markdown_it.token import Token
 
 from tests.support.paths import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _parser = MarkdownIt("commonmark").enable("table")
 
 

@@ -14,7 +14,8 @@ from emulator.drivers.live.inbox import Inbox
 from emulator.drivers.live.supervisor import ProcessState, Supervisor
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.router import ROUTER
-from emulator.scenario.faults import EmulatorRestart, Infrastructure
+from emulator.scenario.fault_families import Infrastructure
+from emulator.scenario.faults import EmulatorRestart
 from vnet.transport import wire
 
 AWAIT_WARNING_S = 0.2

@@ -5,6 +5,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -275,14 +276,14 @@ def cooperate(options: Options, seconds: float = 15.0, loss: float = 0.2, seed: 
 
 
 @pytest.mark.parametrize("consensus", ["ratio", "metropolis", "max-degree"])
-def test_together_they_find_the_common_error_whatever_the_consensus(consensus: str) -> None:
+def test_together_they_find_the_common_error_whatever_the_consensus(consensus: Any) -> None:
     errors = cooperate(Options(particles=100, consensus=consensus))
     assert errors.max() < 1.0, "the prior's deviation is 3 m an axis"
 
 
 @pytest.mark.parametrize("fusion", ["random", "metropolis", "max-degree", "constant"])
 @pytest.mark.parametrize("exchange", ["estimates", "particles"])
-def test_every_rule_of_fusion_works_in_both_ways_of_exchange(fusion: str, exchange: str) -> None:
+def test_every_rule_of_fusion_works_in_both_ways_of_exchange(fusion: Any, exchange: Any) -> None:
     options = Options(particles=50, fusion=fusion, exchange=exchange, relay=exchange == "estimates")
     assert cooperate(options, seconds=6.0).max() < 2.0
 

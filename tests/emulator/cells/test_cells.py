@@ -10,6 +10,7 @@ from emulator.cells import cells as cells_module
 from emulator.cells.cells import Cell, read_series, run_cell, run_cells
 from emulator.cli.commands import app
 from emulator.experiments import paper, reports
+from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError
@@ -72,7 +73,7 @@ def test_the_paper_profile_starts_at_the_truth_and_hears_whom_it_should() -> Non
     assert np.allclose(world.at(0).common_error_m, world.at(99).common_error_m, atol=0.01), "constant over the run"
     position = {node: world.at(0).position_m[i] for i, node in enumerate(world.node_ids)}
     for node, heard in options["hears"].items():
-        near = {o for o in position if o != node and np.hypot(*(position[o] - position[node])) <= paper.RANGE_M}
+        near = {o for o in position if o != node and np.hypot(*(position[o] - position[node])) <= PAPER_RANGE_M}
         assert abs(len(near) - len(heard)) <= 1 and len(near ^ set(heard)) <= 1  # offsets of centimetres
 
 

@@ -115,19 +115,19 @@ def some(recorded: RecordedRun, *outcomes: str, cause: str = "", copies: bool = 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_with_a_fault_of_any_kind_is_valid_and_the_fault_bit(kind: str) -> None:
+def test_a_run_with_a_fault_of_any_kind_is_valid_and_the_fault_took_effect(kind: str) -> None:
     recorded = with_fault(kind)
     assert not_valid(recorded) == {}
-    bit = result(recorded, f"bit:{kind}-0")
-    left_out = kind in ("skew", "drift", *RESTARTS)  # this program sends at each fix, whatever its clock says
-    assert isinstance(bit, NotExercised if left_out else CheckResult)
+    effect = result(recorded, f"effect:{kind}-0")
+    cannot_show = kind in ("skew", "drift", *RESTARTS)  # this program sends at each fix, whatever its clock says
+    assert isinstance(effect, NotExercised if cannot_show else CheckResult)
 
 
 @pytest.mark.parametrize("kind", ["skew", "drift"])
 def test_a_bent_clock_shows_where_a_program_sends_by_its_clock(kind: str) -> None:
     recorded = simulated(fault(kind), program=f"{__name__}:sends_by_the_clock")
     assert not_valid(recorded) == {}
-    assert verdict(recorded, f"bit:{kind}-0") is Verdict.VALID
+    assert verdict(recorded, f"effect:{kind}-0") is Verdict.VALID
 
 
 async def sends_by_the_clock(node: Node) -> None:
@@ -175,7 +175,7 @@ def test_stale_frames_that_were_cut_tell_nothing_of_what_was_said() -> None:
 def test_a_fault_that_was_healed_before_it_began_leaves_nothing_to_see() -> None:
     recorded = simulated(fault("kill", duration_s=1e-10))
     assert not_valid(recorded) == {}
-    assert result(recorded, "bit:kill-0") == NotExercised("bit:kill-0", "it was healed before it began")
+    assert result(recorded, "effect:kill-0") == NotExercised("effect:kill-0", "it was healed before it began")
 
 
 @pytest.mark.parametrize("kind", ["DoS", "Sybil", "DataReplay", "StaleMessages"])
@@ -184,9 +184,9 @@ def test_a_vehicle_that_other_faults_keep_down_need_not_be_seen_to_misbehave(kin
     whom = {"nodes": {"ids": ["v01"]}}
     held = simulated(fault(kind, **whom), fault(holding, at_s=1.5, duration_s=1.0, **whom), fault(holding, **whom))
     assert not_valid(held) == {}
-    assert isinstance(result(held, f"bit:{kind}-0"), NotExercised)
+    assert isinstance(result(held, f"effect:{kind}-0"), NotExercised)
     freed = simulated(fault(kind, **whom), fault(holding, at_s=1.5, duration_s=2.4, **whom))
-    assert not isinstance(result(freed, f"bit:{kind}-0"), NotExercised)
+    assert not isinstance(result(freed, f"effect:{kind}-0"), NotExercised)
 
 
 @pytest.mark.parametrize("kind", ["partition", "block", "range", "swizzle"])
@@ -379,7 +379,7 @@ def test_bytes_that_a_corruption_left_alone_show_none() -> None:
         digests[row] = said.get(int(recorded.frame[row]), digests[row])
     index = recorded.trace.column_names.index("payload_digest")
     spared = recorded.trace.set_column(index, "payload_digest", pa.array(digests, pa.uint64()))
-    assert not_valid(replace(recorded, trace=spared)) == {"bit:corrupt-0": Verdict.UNKNOWN}
+    assert not_valid(replace(recorded, trace=spared)) == {"effect:corrupt-0": Verdict.UNKNOWN}
 
 
 def test_a_copy_of_nothing_breaks_conservation() -> None:
@@ -403,22 +403,22 @@ def test_a_fault_that_acts_on_nobody_is_unknown(kind: str) -> None:
     nowhere = {"disc": [1e7, 1e7, 1.0]}
     key = "receivers" if kind in OF_LINKS else "nodes"
     found = not_valid(simulated(fault(kind, **{key: nowhere}), run={"duration_s": 3.0, "settle_s": 0.5}))
-    assert found[f"bit:{kind}-0"] is Verdict.UNKNOWN
+    assert found[f"effect:{kind}-0"] is Verdict.UNKNOWN
     assert Verdict.INVALID not in found.values()
 
 
 def test_a_fault_that_the_run_did_not_come_to_is_unknown() -> None:
     recorded = with_fault("loss")
     cut = replace(recorded, events=[*recorded.events, Event(1_500_000_000, "interrupted", None, {})])
-    assert verdict(cut, "bit:loss-0") is Verdict.UNKNOWN
+    assert verdict(cut, "effect:loss-0") is Verdict.UNKNOWN
 
 
 def test_restarts_of_the_router_need_an_event_where_there_is_a_router() -> None:
     recorded = with_fault("router_restart")
     live = [Event(0, "started", None, {"start_up_s": 2.0}), *recorded.events[1:]]
-    assert verdict(replace(recorded, events=live), "bit:router_restart-0") is Verdict.UNKNOWN
+    assert verdict(replace(recorded, events=live), "effect:router_restart-0") is Verdict.UNKNOWN
     told = [*live, Event(2_000_000_000, "router_restarted", None, {"fault": "router_restart-0"})]
-    assert verdict(replace(recorded, events=told), "bit:router_restart-0") is Verdict.VALID
+    assert verdict(replace(recorded, events=told), "effect:router_restart-0") is Verdict.VALID
 
 
 @pytest.mark.parametrize("kind", ["kill", "loss"])

@@ -92,8 +92,8 @@ def test_on_a_disc_neither_is_exercised(tmp_path: Path) -> None:
     simulate(emulation)
     judgement, _ = conclude(emulation, 1.0, "simulate")
     left = {check.name: check.reason for check in judgement.not_exercised}
-    assert "no power" in left["fading"]
-    assert "no medium" in left["medium"]
+    assert left["fading"] == "unit-disc radio: no fading"
+    assert left["medium"] == "no MAC configured ([radio.mac])"
     assert not (tmp_path / "run" / "busy.parquet").exists()
 
 
@@ -327,8 +327,8 @@ def test_a_fault_acts_on_a_shared_medium_as_it_says(tmp_path: Path, fault: dict[
     )
     judgement = judge(recorded)
     assert judgement.verdict is Verdict.VALID, [c for c in judgement.checks if c.verdict is not Verdict.VALID]
-    bit = next(check for check in judgement.checks if check.name == f"bit:{fault['kind']}-0")
-    assert bit.figures["count"] > 0
+    effect = next(check for check in judgement.checks if check.name == f"effect:{fault['kind']}-0")
+    assert effect.figures["count"] > 0
 
 
 def test_a_throttle_that_does_nothing_did_not_bite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,7 +336,7 @@ def test_a_throttle_that_does_nothing_did_not_bite(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(Csma, "throttle", lambda *_: None)
     throttle = {"kind": "throttle", "at_s": 0.9, "duration_s": 1.2, "nodes": {"ids": ["v01", "v02"]}}
     recorded = run(tmp_path / "run", [{**throttle, "bitrate_mbps": 3.0}], fading={}, mac={}, access_jitter_ms=60.0)
-    assert verdict(recorded, "bit:throttle-0") is Verdict.UNKNOWN
+    assert verdict(recorded, "effect:throttle-0") is Verdict.UNKNOWN
 
 
 def test_what_a_fault_keeps_from_a_receiver_is_still_on_air(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_what_was_there_stays_until_the_new_one_is_whole(watched: Watched, tmp_p
         (["play", "RUN", "--from", "1", "--to", "1"], "--to 1: must come after --from 1"),
         (["play", "NOWHERE"], "not a run's folder"),
         (["render", "NOWHERE"], "not a run's folder"),
-        (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no vehicle is called v77"),
+        (["render", "RUN", "--out", "NOWHERE.rrd", "--rerun-vehicle", "v77"], "no such vehicle: v77"),
         (["render", "RUN", "--out", "NOWHERE/x.rrd"], "there is no folder"),
     ],
 )
@@ -135,6 +135,7 @@ def until(process: subprocess.Popen[str], beginning: str) -> None:
     assert any(line.startswith(beginning) for line in process.stdout), "it ended before"
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
     with playing(watched.folder, "--speed", "inf") as process:
         until(process, "played")
@@ -142,6 +143,7 @@ def test_a_played_run_stays_until_it_is_ended(watched: Watched) -> None:
         assert process.wait(30) == 0
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals) -> None:
     with playing(watched.folder, "--speed", "0.001", "--from", "0.5") as process:

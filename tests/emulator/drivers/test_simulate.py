@@ -13,6 +13,8 @@ from tests.emulator.drivers.test_status import emulate
 from vnet.errors import ProgramError
 from vnet.node import Node
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 AT_NS = 500_000_000
 
 

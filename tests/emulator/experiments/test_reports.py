@@ -7,8 +7,9 @@ import pyarrow as pa
 import pytest
 
 from emulator.experiments import network_figures, reports, result_figures
-from emulator.experiments.paper import ALPHAS, NETWORKS, load_positions
+from emulator.experiments.paper import ALPHAS, load_positions
 from emulator.experiments.tables import with_error
+from emulator.records.paper_values import PAPER_VEHICLES
 
 NETWORK = {"N3": load_positions({"kind": "generated", "vehicles": 24})}
 LONELY = {"one": (np.zeros((1, 2)), np.zeros(1)), "apart": (np.array([[0.0, 0.0], [9e4, 0.0]]), np.zeros(2))}
@@ -78,7 +79,7 @@ def test_one_seed_has_no_standard_error(tmp_path: Path) -> None:
 def test_table_two_puts_the_papers_figures_beside() -> None:
     rows = [
         {"network": n, "sides": sides, "mechanism": m, "seed": 1, "stacked_rmse_m": value, "rmse_m": value}
-        for n in NETWORKS
+        for n in PAPER_VEHICLES
         for sides in (1, 2)
         for m, value in {"centralized": 0.1, "optimized": 0.2, "random": 0.6, "none": 0.9}.items()
     ]
@@ -89,7 +90,7 @@ def test_table_two_puts_the_papers_figures_beside() -> None:
 def test_ratios_to_the_limit_are_drawn(tmp_path: Path) -> None:
     rows = [
         {"network": n, "mechanism": m, "seed": s, "rmse_m": value * s}
-        for n in NETWORKS
+        for n in PAPER_VEHICLES
         for m, value in {"limit": 0.2, "optimized": 0.21, "none": 0.5}.items()
         for s in (1, 2)
     ]

@@ -13,6 +13,7 @@ from emulator.cells import cells as cells_module
 from emulator.cli.commands import app
 from emulator.experiments import divergence, paper, tempering
 from emulator.records.metrics import anees_band
+from emulator.records.paper_values import PAPER_VEHICLES
 
 TINY: dict[str, Any] = {"n3": {"kind": "generated", "vehicles": 4}}
 
@@ -68,7 +69,7 @@ def test_divergence_is_counted_over_the_seeds_and_goes_on(tmp_path: Path, monkey
 
 
 def test_all_networks_run_equally_long() -> None:
-    networks = dict.fromkeys(paper.NETWORKS, TINY["n3"])
+    networks = dict.fromkeys(PAPER_VEHICLES, TINY["n3"])
     cells = divergence.divergence_cells(networks, [1, 2], 30.0)
     assert len({cell.digest for cell in cells}) == 2, "all three networks are the same here"
     found = {cell.labels["network"]: (cell.scenario.run.duration_s, cell.from_s) for cell in cells}
@@ -76,7 +77,7 @@ def test_all_networks_run_equally_long() -> None:
 
 
 def test_cooperation_is_swept_on_one_network_and_the_limit_on_all() -> None:
-    networks = dict.fromkeys(paper.NETWORKS, TINY["n3"])
+    networks = dict.fromkeys(PAPER_VEHICLES, TINY["n3"])
     cells = tempering.tempering_cells(networks, [1])
     filters = {(cell.labels["network"], cell.labels["mechanism"]) for cell in cells}
     assert filters == {("n1", "limit"), ("n2", "limit"), ("n3", "limit"), ("n3", "optimized")}

@@ -108,25 +108,25 @@ def test_a_report_needs_nothing_from_elsewhere(cooperative: Path) -> None:
 def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path) -> None:
     page = page_of(beacon)
     assert "common-error" not in page.ids and "latency" in page.ids
-    assert re.search(r"Not shown, and why .*Common error.*: no program reported what it needs", page.text)
+    assert re.search(r"Not shown .*Common error.*: no program reported what it needs", page.text)
 
 
 def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
     run = simulate(tmp_path / "run", "--duration", "1.5", "--no-report", scenario="80211p.toml")
     page = page_of(run)
-    assert "busy ratio (%)" in page.text and "expected: " not in page.text
+    assert "channel busy ratio (%)" in page.text and "expected: " not in page.text
     figures = radio_metrics(read_recorded_run(run))
     delivered, busy = figures.totals["delivery_ratio"], figures.totals["busy_ratio_mean"]
     assert delivered is not None and busy is not None
-    assert f"delivered {100 * delivered:.1f} %" in page.text
-    assert f"busy ratio {100 * busy:.1f} %" in page.text
+    assert f"packet delivery ratio {100 * delivered:.1f} %" in page.text
+    assert f"channel busy ratio {100 * busy:.1f} %" in page.text
     assert f"age of information {figures.totals['age_mean_ms']:.1f} ms" in page.text
     worst = figures.worst_links(1).to_pylist()[0]
     assert f"{worst['sender']} {worst['receiver']} {worst['pairs']}" in page.text
     assert "time (ms)" in page.text and "all frames, by 200 m" in page.text
     (run / "busy.parquet").unlink()
     assert "busy" not in page_of(run).ids
-    reason = r"Not shown, and why .*Busy ratio of the medium.*: .*no busy\.parquet in it"
+    reason = r"Not shown .*Channel busy ratio.*: .*no busy\.parquet in it"
     assert re.search(reason, page_of(run).text)
     assert "age of information" in page_of(run).text, "the rest of the radio's figures stay"
 
@@ -157,7 +157,7 @@ def test_a_run_that_lost_a_file_has_a_report_that_says_so(beacon: Path, lost: st
     page = page_of(beacon)
     assert lost.removesuffix(".parquet") in page.text
     if lost == "verdict.json":
-        assert "no verdict" in page.text and "Nothing was judged" in page.text
+        assert "no verdict" in page.text and "No check was judged" in page.text
 
 
 def test_figures_that_need_no_metrics_are_drawn_without_them(beacon: Path) -> None:

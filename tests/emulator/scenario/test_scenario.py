@@ -49,7 +49,7 @@ def write(folder: Path, text: str) -> Path:
         ("[network]\nlayout = 'rural'", ["network.layout = 'rural'", "'urban' or 'dense'"]),
         ("[network]\npath = 'n.csv'\nkind = 'generated'", ["network", "path is required"]),
         ("[network]\nkind = 'file'\npath = '.'", ["network.path = '.'", "no such file"]),
-        ("[program]\noptions = 3", ["program.options = 3", "dictionary"]),
+        ("[program]\noptions = 3", ["program.options = 3", "a table is needed"]),
         ("[program]\nentry = 'a.b:c; import d'", ["program.entry = 'a.b:c; import d'", "package.module:function"]),
         ("[radio]\nlinks = 'no.csv'", ["radio.links = 'no.csv'", "no such file"]),
         ("[radio]\nlinks = '.'", ["radio.links = '.'", "no such file"]),

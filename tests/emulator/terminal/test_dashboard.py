@@ -11,7 +11,7 @@ from rich.console import Console
 from emulator.drivers.status import BINS, FIGURES, FaultState, Snapshot
 from emulator.radio.outcomes import Outcome
 from emulator.records.run_folder import Event
-from emulator.report import figures as report_figures
+from emulator.report import radio_figures as report_figures
 from emulator.terminal.dashboard import BAD_EVENTS, OUTCOMES, Dashboard, describe, is_bad, sparkline
 from emulator.viewer import drawing
 

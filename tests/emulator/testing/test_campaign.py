@@ -172,15 +172,15 @@ class Reader(HTMLParser):
 def test_the_matrix_counts_by_kind_and_check() -> None:
     valid, invalid, unknown = Verdict.VALID, Verdict.INVALID, Verdict.UNKNOWN
     runs = [
-        (["kill", "loss"], {"range": valid, "bit:kill-0": valid, "bit:loss-1": unknown}),
-        (["kill", "kill"], {"range": invalid, "bit:kill-0": valid, "bit:kill-1": invalid}),
+        (["kill", "loss"], {"range": valid, "effect:kill-0": valid, "effect:loss-1": unknown}),
+        (["kill", "kill"], {"range": invalid, "effect:kill-0": valid, "effect:kill-1": invalid}),
     ]
-    assert column_of("bit:kill-0") == ("bit (its own)", "kill")
+    assert column_of("effect:kill-0") == ("effect (its own)", "kill")
     assert column_of("loss_rate") == ("loss_rate", None)
     matrix = count_verdicts(runs)
     assert matrix == {
-        "kill": {"range": Counter({valid: 1, invalid: 1}), "bit (its own)": Counter({valid: 2, invalid: 1})},
-        "loss": {"range": Counter({valid: 1}), "bit (its own)": Counter({unknown: 1})},
+        "kill": {"range": Counter({valid: 1, invalid: 1}), "effect (its own)": Counter({valid: 2, invalid: 1})},
+        "loss": {"range": Counter({valid: 1}), "effect (its own)": Counter({unknown: 1})},
     }
 
 

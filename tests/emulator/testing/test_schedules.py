@@ -9,10 +9,11 @@ from hypothesis.errors import NoSuchExample
 
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
-from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause, Selector
+from emulator.scenario.fault_families import Selector
+from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import Plan, schedule_toml
-from emulator.testing.schedules import SIMULATED_KINDS, known_kinds
+from emulator.testing.schedules import known_kinds, simulated_kinds
 from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.strategies import faults
 from emulator.world.world import build_world
@@ -56,7 +57,7 @@ def test_the_vehicles_of_a_process_are_hit_together(schedule: Schedule) -> None:
 def test_a_pause_in_a_crowd_shrinks_to_the_shortest_of_one_vehicle() -> None:
     def falls(schedule: Schedule) -> bool:
         return any(
-            f.kind == "pause" and f.duration_s >= 0.7 and f.at_s >= 1 and "v03" in (f.nodes.ids or ())
+            isinstance(f, Pause) and f.duration_s >= 0.7 and f.at_s >= 1 and "v03" in (f.nodes.ids or ())
             for f in schedule
         )
 
@@ -82,8 +83,8 @@ def test_only_the_kinds_that_were_asked_for_are_drawn() -> None:
         find(faults(SMALL, kinds=["kill"]), lambda s: any(fault.kind != "kill" for fault in s), settings=QUIET)
     with pytest.raises(ScenarioError, match="fault 'rain': must be one of block, "):
         faults(SMALL, kinds=["rain"])
-    assert set(KINDS) - set(SIMULATED_KINDS) == {"emulator_restart", "router_restart"}
-    assert known_kinds(None) == SIMULATED_KINDS
+    assert set(KINDS) - set(simulated_kinds()) == {"emulator_restart", "router_restart"}
+    assert known_kinds(None) == simulated_kinds()
 
 
 def test_no_time_for_faults_is_said() -> None:
@@ -97,7 +98,7 @@ def test_a_campaign_draws_the_same_for_a_seed_and_every_kind_at_last() -> None:
     drawn = [plan.draw(number) for number in range(120)]
     assert [plan.draw(number).fault for number in range(5)] == [run.fault for run in drawn[:5]]
     assert Plan.of(scenario, "random", 1, 9).draw(0) == drawn[4], "a failure is had again by its seed alone"
-    assert {fault.kind for run in drawn for fault in run.fault} == set(SIMULATED_KINDS)
+    assert {fault.kind for run in drawn for fault in run.fault} == set(simulated_kinds())
     assert {len(run.fault) for run in drawn} == {1, 2, 3, 4}
 
 
@@ -111,7 +112,7 @@ CROWD: Schedule = (
 
 def test_shrinking_drops_halves_and_shortens() -> None:
     def falls(schedule: Schedule) -> bool:
-        return any(f.kind == "loss" and f.duration_s >= 0.5 and "v03" in (f.senders.ids or ()) for f in schedule)
+        return any(isinstance(f, Loss) and f.duration_s >= 0.5 and "v03" in (f.senders.ids or ()) for f in schedule)
 
     smallest, steps = shrink(CROWD, falls)
     assert smallest == (CROWD[1].model_copy(update={"senders": Selector(ids=("v03",)), "duration_s": 0.8}),)

@@ -368,7 +368,7 @@ def test_what_comes_before_the_scene_and_what_is_unknown_is_left_out(told: Told,
 
 
 def test_a_vehicle_that_is_not_there_is_refused(told: Told, tmp_path: Path) -> None:
-    with pytest.raises(VnetError, match="no vehicle is called v99; there are v01, v02"):
+    with pytest.raises(VnetError, match="no such vehicle: v99; there are v01, v02"):
         write(told, tmp_path / "x.rrd", "v99")
 
 

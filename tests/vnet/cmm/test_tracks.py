@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from vnet.cmm.tracks import Tracks, predicted_covariance, transition, white_acceleration
+from vnet.types import Array
 
 K = 3
 FORGET_S = 1.0
@@ -20,7 +21,7 @@ class Vehicle:
     def __init__(self, mark: float, lanes: list[int], particles: int) -> None:
         self.mark = mark
         self.lanes = lanes
-        self.mean = np.full((4, particles), mark) + np.arange(particles)
+        self.mean: Array = np.full((4, particles), float(mark)) + np.arange(particles, dtype=float)
         self.map_log_likelihood = np.zeros(particles)
         self.age_s = self.unseen_s = mark / 1000
         self.anchor_rad = np.nan

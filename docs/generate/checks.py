@@ -1,0 +1,49 @@
+"""docs/reference/checks.md: every check, what it claims, and when a run gets which verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from docs.generate.markdown import page as whole_page
+from docs.generate.markdown import table
+from emulator.checks.registry import CHECKS, Check
+
+INTRODUCTION = """
+Every check of a run, from the table by which `vnet check` judges it. [checks.md](../checks.md) says how the
+verdicts add up. LABEL is the name of a fault, such as `kill-0`.
+"""
+FROM_THE_FOLDER = (
+    [
+        "`replay`",
+        "The same scenario gives the same trace, states and metrics. Judged with `--check-determinism`.",
+        "a row differs; the first is shown, from both runs",
+        "the second run failed",
+        "the run ran once",
+    ],
+    [
+        "`trace_sha256`",
+        "The trace is the one that `verdict.json` names. Judged by `vnet check`.",
+        "it is not",
+        "",
+        "",
+    ],
+)
+"""Rows of the checks that compare files instead of judging a run."""
+
+
+def page() -> str:
+    """Return the whole page: a chapter for each `chapter` of the table, in its order."""
+    parts = [INTRODUCTION]
+    for title in dict.fromkeys(check.chapter for check in CHECKS):
+        rows = [_row(check) for check in CHECKS if check.chapter == title]
+        parts += [f"## {title}", _table(rows)]
+    parts += ["## Files", _table(FROM_THE_FOLDER)]
+    return whole_page("Checks", *parts)
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    return table(["check", "claims", "invalid", "unknown", "not applicable"], rows)
+
+
+def _row(check: Check) -> list[str]:
+    return [f"`{check.name}`", check.claims, check.invalid, check.unknown, check.not_applicable]

@@ -1,0 +1,70 @@
+"""Figures of the estimates: their errors against time, their consensus and their consistency."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from emulator.pages.canvas import BLUE, GREEN, GREY, QUIET, RED
+from emulator.records.metrics import anees_band
+from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
+from emulator.report.source import Source
+from vnet.errors import VnetError
+
+
+def _lines(source: Source, names: dict[str, str]) -> list[Line]:
+    """Return columns of the metrics by label; those that no program reported are dropped.
+
+    Raises VnetError if none is left.
+    """
+    found: list[Line] = []
+    problem = VnetError("")
+    for (label, name), colour, dash in zip(names.items(), (BLUE, RED, GREEN), DASHES, strict=False):
+        try:
+            found.append(Line(label, source.time_s, source.metric(name), colour, dash))
+        except VnetError as error:
+            problem = error
+    if not found:
+        raise problem
+    return found
+
+
+def common_error(source: Source) -> Drawing:
+    """Draw the errors of the estimates of the common error."""
+    lines = _lines(source, {"RMSE": "common_error_rmse_m", "deviation": "deviation_m"})
+    made = time_figure(lines, "common error (m)", source.end_s, source.spans)
+    text = "Distance of the vehicles' estimates from the true common error (RMSE) and from their mean (deviation)."
+    return Drawing(made, text + faults_note(made, source))
+
+
+def position(source: Source) -> Drawing:
+    """Draw the errors of the estimated positions and of the raw fixes."""
+    lines = _lines(source, {"estimates": "position_rmse_m", "raw fixes": "fix_rmse_m"})
+    made = time_figure(lines, "RMSE of position (m)", source.end_s, source.spans)
+    text = "Distance of the vehicles' estimates, and of their receivers' raw fixes, from the true positions."
+    return Drawing(made, text + faults_note(made, source))
+
+
+def consensus(source: Source) -> Drawing:
+    """Draw the consensus error."""
+    lines = _lines(source, {"consensus error": "consensus_error_m"})
+    made = time_figure(lines, "consensus error (m)", source.end_s, source.spans)
+    text = "Distance of the means that vehicles hold from the mean of all estimates of their component."
+    return Drawing(made, text + faults_note(made, source))
+
+
+def consistency(source: Source) -> Drawing:
+    """Draw the normalized squared errors of the filters."""
+    lines = _lines(source, {"common error": "common_error_anees", "position": "position_anees"})
+    made = time_figure(lines, "ANEES (1 = consistent)", source.end_s, source.spans)
+    count = int(np.median(source.metrics["reporting"].to_numpy())) or 1
+    low, high = anees_band(count)
+    made.axes.axhspan(low, high, color=GREY, alpha=0.25, linewidth=0, zorder=0.6)
+    made.axes.axhline(1, color=QUIET, linewidth=1, zorder=0.7)
+    bottom, top = made.axes.get_ylim()
+    made.axes.set_ylim(min(bottom, low / 1.1), max(top, high * 1.1))
+    text = (
+        f"Normalized estimation error squared, averaged. Above 1 a filter is overconfident. Grey: 95 % band of "
+        f"{count} independent estimates, {low:.2f} to {high:.2f}; those of the common error are dependent and "
+        "spread further."
+    )
+    return Drawing(made, text + faults_note(made, source))

@@ -1,0 +1,205 @@
+"""Figures of the network: delivery against distance, node degrees and fusion weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path as Outline
+from matplotlib.ticker import MaxNLocator
+from scipy.stats import binom
+
+from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
+from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.records.radio_metrics import BIN_M
+from emulator.report.drawing import DASHES, Drawing
+from emulator.report.source import Source
+from emulator.world.world import components
+from vnet.errors import VnetError, printable
+from vnet.types import Array
+
+MOST_LINKS = 800
+"""Links up to which each has a point; more are shown in bins."""
+MOST_IN_MATRIX = 150
+"""Vehicles of which the matrix of fusion weights is readable."""
+DISTANCE_BINS = 25
+LINK_BAND = 0.99
+"""Share of the links that lie in the drawn band by chance alone."""
+OPACITY = {0.05: 0.16, 0.1: 0.32, 0.2: 0.52, 0.4: 0.76, 1.0: 1.0}
+"""Opacity of a fusion weight, by the largest weight that has it."""
+_NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))])
+_WEIGHT = "weight."
+
+
+def links(source: Source) -> Drawing:
+    """Draw the packet delivery ratio of the links against their length."""
+    recorded = source.recorded
+    count = len(recorded.node_ids)
+    if not len(recorded.trace):
+        raise VnetError("no frame was sent to anybody in range")
+    link = recorded.sender * count + recorded.receiver
+    rows = np.bincount(link, minlength=count * count)
+    used = np.flatnonzero(rows)
+    delivered = np.bincount(link, weights=recorded.outcome_is("delivered"), minlength=count * count)
+    share = 100 * delivered[used] / rows[used]
+    apart_m = recorded.places.pair_distances_m(recorded.sender, recorded.receiver, recorded.sent_ns)
+    known = np.isfinite(apart_m)
+    total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
+    distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
+    physical, binned = source.scenario.radio.is_physical, recorded.moves or source.scenario.radio.is_physical
+    labels = 1 + (len(used) > MOST_LINKS) + (not physical) + binned
+    made = canvas("distance (km)", "delivery ratio (%)", legend_rows=int(np.ceil(labels / 3)))
+    if len(used) <= MOST_LINKS:
+        dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4, "markeredgewidth": 0}
+        made.axes.plot(distance_km, share, color=BLUE, alpha=0.55, label="a link", **dots)
+    else:
+        _draw_bins(made, distance_km, share)
+    text = f"Packet delivery ratio of each of {len(used):,} links, from one vehicle to another."
+    lowest = float(share.min())
+    if not physical:
+        low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
+        lowest, text = min(lowest, low), text + band + _why_less(source)
+    if binned:
+        lowest = min(lowest, _draw_frames(made, source.radio.distances))
+    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
+    made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
+    legend(made)
+    return Drawing(made, text)
+
+
+def _draw_expected(made: Canvas, loss: float, frames: int) -> tuple[float, str]:
+    """Draw the expected ratio of links that all lose alike; returns its lower bound in percent, and a caption."""
+    low, high = (100 * edge / frames for edge in binom.interval(LINK_BAND, frames, 1 - loss))
+    label = f"expected: {100 * (1 - loss):g} %"
+    made.axes.axhline(100 * (1 - loss), color=RED, linestyle=DASHES[1], label=label, zorder=2.5)
+    if low == high:
+        return low, ""
+    made.axes.axhspan(low, high, color=RED, alpha=0.12, linewidth=0, zorder=0.6)
+    return low, f" Band: {LINK_BAND:.0%} of links with {frames:,} frames lie in it by chance alone."
+
+
+def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
+    """Draw the median by distance, and the range of nine of ten links."""
+    edges = np.linspace(0, distance_km.max(), 25)
+    index = np.clip(np.digitize(distance_km, edges) - 1, 0, len(edges) - 2)
+    filled = np.unique(index)
+    middle = ((edges[:-1] + edges[1:]) / 2)[filled]
+    low, median, high = np.array([np.percentile(share[index == i], [5, 50, 95]) for i in filled]).T
+    made.axes.fill_between(middle, low, high, color=BLUE, alpha=0.25, linewidth=0, label="9 of 10 links")
+    made.axes.plot(middle, median, color=BLUE, label="median")
+
+
+def _draw_frames(made: Canvas, bins: pa.Table) -> float:
+    """Draw the ratio of all frames by distance, in at most `DISTANCE_BINS` bins; returns the least in percent."""
+    from_m, pairs, delivered = (bins[name].to_numpy() for name in ("from_m", "pairs", "delivered"))
+    width_m = BIN_M * int(np.ceil((from_m.max(initial=0) + BIN_M) / BIN_M / DISTANCE_BINS))
+    index = (from_m // width_m).astype(np.intp)
+    filled = np.unique(index)
+    share = 100 * np.bincount(index, delivered)[filled] / np.bincount(index, pairs)[filled]
+    made.axes.plot((filled + 0.5) * width_m / 1000, share, color=INK, label=f"all frames, by {width_m:g} m")
+    return float(share.min(initial=100))
+
+
+def _why_less(source: Source) -> str:
+    """The outcomes besides `lost` that lower a link's delivery ratio."""
+    others = (outcome.name for outcome in DRAWN if outcome not in (Outcome.delivered, Outcome.lost))
+    names = [name for name in others if source.recorded.outcome_is(name).any()]
+    return f" Links below it had outcomes {', '.join(names)} as well." if names else ""
+
+
+def degrees(source: Source) -> Drawing:
+    """Draw the distribution of the vehicles' degrees: how many others each has in range."""
+    recorded = source.recorded
+    if not recorded.node_ids:
+        raise VnetError("no period was completed, and no position is known")
+    degree = recorded.places.mean_senders_in_range()
+    step = int(np.ceil((degree.max() + 1) / 40))
+    edges = np.arange(0, degree.max() + step + 1, step) - 0.5
+    counts, _ = np.histogram(degree, edges)
+    made = canvas("degree (vehicles in range)", "vehicles", legend_rows=1)
+    made.axes.bar(edges[:-1] + step / 2, counts, width=0.85 * step, color=BLUE)
+    made.axes.axvline(degree.mean(), color=RED, linestyle=DASHES[1], label=f"mean {degree.mean():.1f}")
+    if degree.max() > source.scenario.radio.max_peers:
+        cap = source.scenario.radio.max_peers
+        made.axes.axvline(cap + 0.5, color=INK, linestyle=DASHES[2], label=f"peer cap {cap}")
+    made.axes.set_xlim(edges[0] - 0.3, max(edges[-1], 4) + 0.3)
+    made.axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    whole_numbers(made.axes)
+    legend(made)
+    radio = source.scenario.radio
+    how = f"within {radio.range_m / 1000:g} km" if radio.links is None else "by the scenario's links"
+    if radio.path_loss is not None:
+        how = f"with {radio.path_loss.floor_dbm:g} dBm or more on average"
+    if recorded.moves:
+        return Drawing(
+            made,
+            f"Number of vehicles that each can hear, {how}; mean over its time in the network.",
+        )
+    parts = int(components(recorded.places.position_m(0), radio.range_m, recorded.places.in_range(0)).max()) + 1
+    network = "one component" if parts == 1 else f"{parts} components out of range of each other"
+    return Drawing(made, f"Number of vehicles that each can hear, {how}: {network}.")
+
+
+def weights(source: Source) -> Drawing:
+    """Draw the matrix of the mean fusion weights."""
+    ids = source.recorded.node_ids
+    matrix = mean_weights(source)
+    if len(ids) > MOST_IN_MATRIX:
+        raise VnetError(f"a matrix of {len(ids)} vehicles would not be readable")
+    made = canvas("weighed vehicle", "fusing vehicle", legend_rows=2, plot_px=270)
+    level = np.searchsorted(list(OPACITY), matrix)
+    handles = []
+    least = 0.0
+    for number, (largest, opacity) in enumerate(OPACITY.items()):
+        corners = np.argwhere((level == number) & (matrix > 0))[:, ::-1]
+        square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        if len(corners):
+            outline = Outline.make_compound_path_from_polys(corners[:, None] + square)
+            made.axes.add_patch(PathPatch(outline, facecolor=BLUE, alpha=opacity, linewidth=0))
+        handles.append(Patch(facecolor=BLUE, alpha=opacity, linewidth=0, label=f"{least:g}–{largest:g}"))
+        least = largest
+    _dress_matrix(made, [printable(node, 7) for node in ids])
+    legend(made, handles)
+    return Drawing(
+        made, "Row by row the mean weight that a vehicle gave each estimate in fusion, its own included."
+    )
+
+
+def _dress_matrix(made: Canvas, ids: Sequence[str]) -> None:
+    axes = made.axes
+    axes.set(xlim=(0, len(ids)), ylim=(len(ids), 0))
+    every = int(np.ceil(len(ids) / 12))
+    ticks = range(0, len(ids), every)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_ticks([tick + 0.5 for tick in ticks], [ids[tick] for tick in ticks])
+        axis.set_tick_params(labelsize=9, length=0)
+    axes.grid(visible=False)
+
+
+def mean_weights(source: Source) -> Array:
+    """Return the mean weights (N, N) that vehicles (rows) gave others (columns), over their reports with any.
+
+    Raises VnetError if nobody reported any.
+    """
+    recorded = source.recorded
+    count = len(recorded.node_ids)
+    lists = recorded.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
+    row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
+    key, value = pair.field("key"), pair.field("value")
+    single = pc.and_(pc.starts_with(key, _WEIGHT), pc.equal(pc.list_value_length(value), 1))
+    chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
+    names = key.take(pa.array(chosen)).dictionary_encode()
+    numbers = [recorded.number.get(name.removeprefix(_WEIGHT), -1) for name in names.dictionary.to_pylist()]
+    of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
+    weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
+    node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
+    at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
+    if not fits.any():
+        raise VnetError("no program reported any (as values named weight.ID)")
+    total = np.bincount((at * count + of)[fits], weights=weight[fits], minlength=count * count)
+    reports = np.bincount(node[np.unique(row[chosen])], minlength=count)
+    return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])

@@ -1,0 +1,187 @@
+"""Figures of the radio: outcomes, latency, age of information and the channel busy ratio."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from emulator.pages.canvas import (
+    BLUE,
+    GREEN,
+    GREY,
+    QUIET,
+    RED,
+    SKY,
+    canvas,
+    from_zero,
+    legend,
+    logarithmic,
+    whole_numbers,
+)
+from emulator.pages.palette import PALETTE
+from emulator.radio.medium import WINDOW_NS
+from emulator.radio.outcomes import DRAWN
+from emulator.report.drawing import DASHES, TIME, WIDE_RANGE, Drawing, Line, faults_note, time_figure
+from emulator.report.source import Source
+from vnet.errors import VnetError, printable
+from vnet.types import Array
+
+OUTCOME_COLOURS = {outcome.name: PALETTE[outcome.facts.colour].light for outcome in DRAWN}
+MOST_BINS = 80
+MOST_BARS = 10
+
+
+def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
+    """Return the names of outcomes, and each row's index among them and time of its decision in seconds.
+
+    Raises VnetError without rows.
+    """
+    trace = source.recorded.trace
+    if not len(trace):
+        raise VnetError("no frame was sent to anybody in range")
+    column = trace["outcome"].combine_chunks()
+    code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
+    left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
+    decided_ns = pc.coalesce(trace["arrival_ns"], trace[left]).to_numpy()
+    return column.dictionary.to_pylist(), code, decided_ns / 1e9
+
+
+def bin_width_s(source: Source) -> float:
+    """Return the width of the bins of figures against time: whole periods, so that each bin has frames."""
+    period_s = source.scenario.period_ns / 1e9
+    periods = max(1, int(np.ceil(source.end_s / period_s - 1e-9)))
+    return int(np.ceil(periods / MOST_BINS)) * period_s
+
+
+def outcomes(source: Source) -> Drawing:
+    """Draw the shares of the outcomes against time, stacked."""
+    names, code, decided_s = decided(source)
+    width_s = bin_width_s(source)
+    bins = max(1, int(np.ceil(source.end_s / width_s - 1e-9)))
+    index = np.minimum((decided_s / width_s).astype(np.intp), bins - 1)
+    counts = np.bincount(index * len(names) + code, minlength=bins * len(names)).reshape(bins, len(names))
+    share = 100 * counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
+    shown = [number for number, name in enumerate(names) if counts[:, number].any() and name in OUTCOME_COLOURS]
+    made = canvas(TIME, "share of receptions (%)", int(np.ceil(len(shown) / 3)), source.spans, source.end_s)
+    edges = np.minimum(np.arange(bins + 1) * width_s, source.end_s)
+    below = np.zeros(bins)
+    for number in shown:
+        above = below + share[:, number]
+        low, high = (np.append(some, some[-1]) for some in (below, above))
+        drawn: dict[str, Any] = {"color": OUTCOME_COLOURS[names[number]], "linewidth": 0, "label": names[number]}
+        made.axes.fill_between(edges, low, high, step="post", zorder=0.6, **drawn)
+        below = above
+    made.axes.set_ylim(0, 100)
+    legend(made)
+    text = f"Outcomes of the attempted receptions (a frame at a receiver in range), in bins of {width_s:g} s."
+    return Drawing(made, text + faults_note(made, source))
+
+
+def busy(source: Source) -> Drawing:
+    """Draw the channel busy ratio of the vehicles."""
+    percent = 100 * source.busy_ratio
+    end_s = np.arange(1, len(percent) + 1) * WINDOW_NS / 1e9
+    lines = [
+        Line("mean", end_s, percent.mean(axis=1), BLUE),
+        Line("busiest", end_s, percent.max(axis=1), RED, DASHES[1]),
+    ]
+    made = time_figure(lines, "channel busy ratio (%)", source.end_s, source.spans, linear=True)
+    text = "Share of the time in which vehicles sensed the medium busy, in windows of 100 ms."
+    return Drawing(made, text + faults_note(made, source))
+
+
+def totals(source: Source) -> Drawing:
+    """Draw the numbers and shares of the outcomes of the whole run."""
+    trace = source.recorded.trace
+    if not len(trace):
+        raise VnetError("no frame was sent to anybody in range")
+    bars = _bars(trace)
+    made = canvas("share of receptions (%)", "outcome", plot_px=31 * len(bars) + 6)
+    axes = made.axes
+    for row, (label, outcome, count) in enumerate(bars):
+        share = 100 * count / len(trace)
+        axes.barh(row + 0.7, 100, height=0.26, color=GREY, alpha=0.18)
+        axes.barh(row + 0.7, share, height=0.26, color=OUTCOME_COLOURS.get(outcome, GREY))
+        axes.text(0, row + 0.45, printable(label, 32))
+        axes.text(100, row + 0.45, f"{count:,}  ·  {share:.2f} %", ha="right", color=QUIET)
+    axes.set(xlim=(0, 100), ylim=(len(bars) + 0.1, 0))
+    axes.yaxis.set_ticks([])
+    text = f"Outcomes of all {len(trace):,} attempted receptions (a frame at a receiver in range)."
+    return Drawing(made, text + (" Faults stand by their names." if any(o == "fault" for _, o, _ in bars) else ""))
+
+
+def _bars(trace: pa.Table) -> list[tuple[str, str, int]]:
+    """Label, outcome and count of each bar; receptions lost by faults under the fault's name."""
+    counts = trace.select(["outcome", "cause"]).group_by(["outcome", "cause"]).aggregate([([], "count_all")])
+    found: dict[tuple[str, str], int] = {}
+    for row in counts.to_pylist():
+        label = row["cause"] if row["outcome"] == "fault" else row["outcome"]
+        key = (str(label), str(row["outcome"]))
+        found[key] = found.get(key, 0) + row["count_all"]
+    order = {outcome.name: number for number, outcome in enumerate(DRAWN)}
+    bars = [(label, outcome, count) for (label, outcome), count in found.items()]
+    bars.sort(key=lambda bar: (order.get(bar[1], len(order)), -bar[2]))
+    shown, others = bars[:MOST_BARS], bars[MOST_BARS:]
+    return shown + ([("others", "", sum(count for _, _, count in others))] if others else [])
+
+
+def latencies_ms(source: Source) -> Array:
+    """Return the latency (k,) of each delivery in ms. Raises VnetError if there is none."""
+    recorded = source.recorded
+    delivered = recorded.outcome_is("delivered")
+    if not delivered.any():
+        raise VnetError("nothing was delivered")
+    return np.asarray((recorded.arrival_ns[delivered] - recorded.sent_ns[delivered]) / 1e6)
+
+
+def latency(source: Source) -> Drawing:
+    """Draw the distribution of the latency."""
+    latency_ms = latencies_ms(source)
+    median, late, latest = np.percentile(latency_ms, [50, 99, 100])
+    shown_ms = min(latest, 2.5 * np.percentile(latency_ms, 99.5))
+    counts, edges = np.histogram(latency_ms, bins=50, range=(0, max(shown_ms * 1.02, 1e-3)))
+    made = canvas("latency (ms)", "deliveries", legend_rows=1)
+    made.axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.8)
+    made.axes.axvline(median, color=RED, linestyle=DASHES[1], label=f"median {median:.2f} ms")
+    made.axes.axvline(late, color=GREEN, linestyle=DASHES[2], label=f"99 % within {late:.2f} ms")
+    made.axes.set_xlim(0, edges[-1])
+    whole_numbers(made.axes)
+    legend(made)
+    beyond = int((latency_ms > edges[-1]).sum())
+    further = f" {beyond:,} more took longer, up to {latest:,.1f} ms." if beyond else ""
+    return Drawing(made, f"Time from a frame's enqueueing to its arrival, {len(latency_ms):,} deliveries.{further}")
+
+
+def ages(source: Source) -> Drawing:
+    """Draw the inter-packet gap and the age of information of the links, sorted."""
+    links, share = source.radio.links, np.linspace(0, 1, 101)
+    lines = {
+        "IPG: mean": ("inter_reception_mean_ms", BLUE),
+        "IPG: 95 %": ("inter_reception_p95_ms", SKY),
+        "age: mean": ("age_mean_ms", RED),
+    }
+    made = canvas("links, sorted (%)", "time (ms)", legend_rows=1)
+    drawn = []
+    for (label, (name, colour)), dash in zip(lines.items(), (DASHES[0], DASHES[2], DASHES[1]), strict=True):
+        values_ms = links[name].drop_null().to_numpy()
+        if len(values_ms):
+            drawn.append(np.quantile(values_ms, share, method="inverted_cdf"))
+            made.axes.plot(100 * share, drawn[-1], color=colour, linestyle=dash, label=label)
+    if not drawn:
+        raise VnetError("no link received two frames")
+    made.axes.set_xlim(0, 100)
+    least, most = np.min(drawn), np.max(drawn)
+    if 0 < WIDE_RANGE * least < most:
+        logarithmic(made.axes)
+    else:
+        from_zero(made.axes)
+    legend(made)
+    return Drawing(
+        made,
+        "IPG: inter-packet gap, from one reception on a link to the next. Age: time since the newest received "
+        f"frame was sent. Each line sorts the {len(links):,} links by its own figure.",
+    )

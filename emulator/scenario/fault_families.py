@@ -1,0 +1,247 @@
+"""The families of faults: what all faults have in common, and what the kinds of one family do alike.
+
+A kind of fault is one class in `emulator.scenario.faults` that derives from a family. The class is the only place
+that says how the kind is called, which parameters it has, what the reference page says about it, how a campaign
+draws it, and which law it follows. The layers above act on families:
+
+| family | carried out by | judged by |
+|---|---|---|
+| `ProcessFault` | `drivers/emulation.py` | `checks/faults.py` |
+| `cuts = True` | `radio/link_faults.py` | `checks/faults.py` |
+| `LossFault`, `DelayFault` | `radio/link_faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
+| `SenderFault` | `radio/sender_faults.py` | `checks/senders.py` |
+| `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
+| `Infrastructure` | `drivers/live.py` | `checks/fault_effects.py` |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, ClassVar, get_args
+
+from pydantic import Field, model_validator
+
+from emulator.scenario.fault_draws import Chooser, Drawn
+from emulator.scenario.sections import Section
+from vnet.types import Array, Mask
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+Point = tuple[float, float]
+LONGEST_S = 86_400.0
+"""No fault starts later or lasts longer: a day."""
+
+
+class Selector(Section):
+    """A choice of nodes: all, unless one of these keys says otherwise.
+
+    Positions are those at the start of the run where vehicles stand; docs/motion.md says which where they move.
+    """
+
+    ids: tuple[str, ...] | None = None
+    """The nodes with these names."""
+    fraction: Annotated[float, Field(gt=0, le=1)] | None = None
+    """This share of all nodes, drawn from the run's seed."""
+    random: Annotated[int, Field(ge=1)] | None = None
+    """This many nodes, drawn from the run's seed."""
+    disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
+    """The nodes in a disc: x, y and radius in m."""
+    polygon: Annotated[tuple[Point, ...], Field(min_length=3)] | None = None
+    """The nodes in a polygon: its corners, [x, y] in m."""
+    degree: tuple[Annotated[int, Field(ge=0)], int] | None = None
+    """The nodes with this many others in range: least and most."""
+
+    @property
+    def by_place(self) -> bool:
+        """Whether the choice depends on the positions of vehicles."""
+        return any(choice is not None for choice in (self.disc, self.polygon, self.degree))
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_a_table(cls, given: Any) -> Any:
+        if not isinstance(given, (dict, Selector)):
+            raise ValueError('a selector is a table, such as { ids = ["v01", "v02"] } or { random = 3 }')
+        return given
+
+    @model_validator(mode="after")
+    def _at_most_one(self) -> Selector:
+        given = [name for name in type(self).model_fields if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other")
+        if self.degree is not None and self.degree[0] > self.degree[1]:
+            raise ValueError("degree = [least, most] is upside down")
+        return self
+
+
+class Fault(Section):
+    """A fault of any kind. Deriving a class that narrows `kind` to one literal registers that kind."""
+
+    kinds: ClassVar[dict[str, type[Section]]] = {}
+    """The classes of all kinds by their names."""
+    chapter: ClassVar[str] = "The network"
+    """The heading of the kind's family in docs/reference/faults.md."""
+    acts_on: ClassVar[str] = "the whole"
+    """What the reference page says that the kind acts on."""
+    campaign_weight: ClassVar[int] = 1
+    """How often campaigns draw the kind, relative to others."""
+    live_only: ClassVar[bool] = False
+    """Whether a simulation has nothing that the kind could act on; campaigns then never draw it."""
+    cuts: ClassVar[bool] = False
+    """Whether no frame passes a link on which the fault acts."""
+    follows_vehicles: ClassVar[bool] = False
+    """Whether a selector by position is evaluated again each period; if not, once, at the fault's start."""
+
+    kind: str
+    """Name of the kind."""
+    at_s: float = Field(0.0, ge=0, le=LONGEST_S)
+    """Start of the fault, in emulated time."""
+    duration_s: float = Field(gt=0, le=LONGEST_S)
+    """Length of the fault, in emulated time."""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        for name in get_args(cls.model_fields["kind"].annotation):
+            if name in Fault.kinds:
+                raise TypeError(f"fault kind {name!r} is both {Fault.kinds[name].__name__} and {cls.__name__}")
+            Fault.kinds[name] = cls
+
+    @classmethod
+    def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+        """Draw what the fault acts on; `processes` are the ids of the vehicles, process by process."""
+        return {}
+
+    @classmethod
+    def draw_parameters(cls, choose: Chooser) -> dict[str, Any]:
+        """Draw every parameter with a `Drawn`, in the order of the fields."""
+        drawn: dict[str, Any] = {}
+        for name, field in cls.model_fields.items():
+            for law in (each for each in field.metadata if isinstance(each, Drawn)):
+                pair = get_args(field.annotation) == get_args(Point)
+                drawn[name] = (law.draw(choose), law.draw(choose)) if pair else law.draw(choose)
+        return drawn
+
+
+def half(count: int) -> int:
+    """Return the most vehicles, of `count`, on which a drawn fault acts: a plausible fault spares half of them."""
+    return max(1, count // 2)
+
+
+class NodeFault(Fault):
+    """A fault of nodes."""
+
+    acts_on: ClassVar[str] = "vehicles"
+
+    nodes: Selector = Selector()
+    """The nodes on which the fault acts."""
+
+    @classmethod
+    def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+        """Draw up to half of the vehicles."""
+        return _draw_selector(choose, processes, ("nodes",))
+
+
+class LinkFault(Fault):
+    """A fault of links: those with an end among `nodes`, from one of `senders`, to one of `receivers`."""
+
+    acts_on: ClassVar[str] = "links"
+    follows_vehicles: ClassVar[bool] = True
+
+    nodes: Selector = Selector()
+    """One end of the link is among these."""
+    senders: Selector = Selector()
+    """The sender is among these."""
+    receivers: Selector = Selector()
+    """The receiver is among these."""
+
+    @classmethod
+    def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+        """Draw up to half of the vehicles as one end of the links, as their senders, or as their receivers."""
+        return _draw_selector(choose, processes, ("nodes", "senders", "receivers"))
+
+
+def _draw_selector(
+    choose: Chooser, processes: Sequence[tuple[str, ...]], selectors: Sequence[str]
+) -> dict[str, Any]:
+    ids = [node for process in processes for node in process]
+    chosen = choose.subset(ids, half(len(ids)))
+    return {choose.choice(selectors): {"ids": chosen}}
+
+
+class ProcessFault(NodeFault):
+    """A fault of processes: their programs are ended, or paused, until the fault ends."""
+
+    chapter: ClassVar[str] = "Processes"
+    ends: ClassVar[bool] = False
+    """Whether the programs are ended and start again after the fault; if not, they are paused."""
+    forced: ClassVar[bool] = False
+    """Whether the programs are ended without notice."""
+
+    @classmethod
+    def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
+        """Draw up to half of the processes: the nodes of one process share its fate."""
+        chosen = choose.subset(processes, half(len(processes)))
+        return {"nodes": {"ids": [node for process in chosen for node in process]}}
+
+
+class LossFault(LinkFault):
+    """A fault that loses frames by chance, at each receiver independently."""
+
+    @property
+    def mean_loss(self) -> float:
+        """The expected share of lost receptions, in the long run."""
+        raise NotImplementedError
+
+    def lost(self, draws: Array, bad: Mask) -> Mask:
+        """Return which receivers (N,) lose a frame, from uniform draws (2, N) in [0, 1).
+
+        `bad` (N,) is the memory of the links from the frame's sender, all False at first; a law that has a memory
+        changes it in place.
+        """
+        raise NotImplementedError
+
+
+class DelayFault(LinkFault):
+    """A fault that adds to the latency of receptions."""
+
+    @property
+    def bounds_ms(self) -> tuple[float, float]:
+        """The least and the greatest added latency in ms."""
+        raise NotImplementedError
+
+    def added_ms(self, draws: Array) -> Array:
+        """Return the added latency (N,) in ms at each receiver, from uniform draws (N,) in [0, 1)."""
+        raise NotImplementedError
+
+
+class SenderFault(NodeFault):
+    """A fault of senders: frames of their own are sent again, or in place of others."""
+
+    chapter: ClassVar[str] = "Misbehaviour"
+
+
+class GnssFault(NodeFault):
+    """A fault of GNSS receivers."""
+
+    chapter: ClassVar[str] = "GNSS receivers"
+    follows_vehicles: ClassVar[bool] = True
+
+    def displacement_m(self, since_ns: int) -> Array | None:
+        """Return what the fault adds to a fix (2,) `since_ns` after its start; None if time does not tell."""
+        return None
+
+
+class ClockFault(NodeFault):
+    """A fault of the nodes' clocks."""
+
+    chapter: ClassVar[str] = "Clocks"
+
+
+class Infrastructure(Fault):
+    """A fault of the emulator's own processes; live runs only."""
+
+    chapter: ClassVar[str] = "Infrastructure"
+    live_only: ClassVar[bool] = True
+
+    duration_s: float = Field(0.001, gt=0, le=LONGEST_S)
+    """Ignored."""
+    down_s: float = Field(1.0, gt=0, le=60)
+    """Time from the end to the new start (wall clock)."""

@@ -1,0 +1,153 @@
+"""What surrounds the parts of a live run, without processes and without Zenoh: it notes what it is told to do."""
+
+import signal
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.join import Membership
+from emulator.drivers.launch import Exit
+from emulator.drivers.live.supervisor import Supervisor
+from emulator.drivers.live.waiting import ChangeSignal
+from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.transport import wire
+from vnet.transport.access import Access
+
+IDS = ["v01", "v02", "v03", "v04"]
+ALONE = [[node] for node in IDS]
+
+
+class FakeLauncher:
+    """A launcher whose processes have only a name and a number."""
+
+    def __init__(self) -> None:
+        self.pids: dict[str, int] = {}
+        self.done: list[tuple[str, ...]] = []
+        self._next_pid = 100
+
+    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
+        self._next_pid += 1
+        self.pids[nodes[0]] = self._next_pid
+        self.done.append(("start", *nodes))
+
+    def start(self, name: str, *_: Any, **__: Any) -> None:
+        self.done.append(("start", name))
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        self.done.append((number.name, name))
+
+    def kill(self, name: str) -> None:
+        self.pids.pop(name, None)
+        self.done.append(("kill", name))
+
+    def detach(self, name: str) -> Callable[[float], None]:
+        self.pids.pop(name, None)
+        return lambda patience_s: self.done.append(("wait for", name))
+
+    def request_stack(self, name: str) -> None:
+        self.done.append(("stack", name))
+
+    def log_tail(self, name: str) -> str:
+        return f"the log of {name}"
+
+    def dies(self, supervisor: Supervisor, name: str, status: int = -11) -> None:
+        """A process ends by itself, and the news of it comes."""
+        self.pids.pop(name, None)
+        supervisor.child_ended(name, Exit(status, "its last line"))
+
+
+class FakeAttachment:
+    """An attachment that keeps what is sent."""
+
+    endpoint = "tcp/here:1"
+
+    def __init__(self, node_ids: Iterable[str] = IDS) -> None:
+        self.node_ids = list(node_ids)
+        self.sent: list[tuple[str, wire.EmulatorMessage]] = []
+        self.done: list[str] = []
+        self.on_send: Callable[[str, wire.EmulatorMessage], None] = lambda node, message: None
+
+    def knows(self, node: str) -> bool:
+        return node in self.node_ids
+
+    def send(self, node: str, message: wire.EmulatorMessage) -> None:
+        self.sent.append((node, message))
+        self.on_send(node, message)
+
+    def take_sent(self) -> list[tuple[str, wire.EmulatorMessage]]:
+        sent, self.sent = self.sent, []
+        return sent
+
+    def is_watched(self, stream: str) -> bool:
+        return False
+
+    def open(self) -> None:
+        self.done.append("open")
+
+    def close(self) -> None:
+        self.done.append("close")
+
+
+def hello(node: str, process_id: str | None = None, nonce: bytes = b"1", **more: Any) -> wire.Hello:
+    """A hello, ready unless it says otherwise."""
+    return wire.Hello(node, process_id or node, nonce, 7, "host", **{"ready": True, **more})
+
+
+class Stage:
+    """The parts that the others need, around an emulation of four vehicles. Make it on a running loop."""
+
+    def __init__(
+        self,
+        processes: Sequence[Sequence[str]] = ALONE,
+        faults: Sequence[dict[str, Any]] = (),
+        launch: bool = True,
+        later: Sequence[str] = (),
+        pacing: str = "lockstep",
+        **sections: Any,
+    ) -> None:
+        run = {"pacing": pacing, **sections.pop("run", {})}
+        scenario = scenario_of(list(faults), "agents.beacon:main", run=run, **sections)
+        self.emulation: Emulation = emulation_of(scenario)
+        self.processes = [list(nodes) for nodes in processes]
+        self.launcher = FakeLauncher()
+        self.attachment = FakeAttachment()
+        self.changes = ChangeSignal()
+        self.members = Membership(IDS, later)
+        self.options = LiveOptions(Access.create("fake", self.processes), launch=launch)
+        self.supervisor = Supervisor(
+            launcher=self.launcher,  # type: ignore[arg-type]
+            members=self.members,
+            attachment=self.attachment,  # type: ignore[arg-type]
+            options=self.options,
+            folder=self.emulation.folder,
+            time_ns=lambda: 0,
+            changes=self.changes,
+            realtime=pacing == "realtime",
+        )
+
+    @property
+    def folder(self) -> Path:
+        return self.emulation.folder.path
+
+    def join(self, nonce: bytes = b"1", begin: bool = True) -> None:
+        """Every process starts and joins, but for those that come later."""
+        for nodes in self.processes:
+            if nodes[0] not in self.members.later:
+                if self.options.launch:
+                    self.supervisor.launch(nodes)
+                self.hello(nodes[0], nonce)
+        self.launcher.done.clear()
+        self.members.closed = True
+        if begin:
+            self.supervisor.begin(self.members.processes())
+
+    def hello(self, process_id: str, nonce: bytes) -> None:
+        """The nodes of a process say that they are ready."""
+        for node in next(nodes for nodes in self.processes if nodes[0] == process_id):
+            assert self.members.hello(node, hello(node, process_id, nonce)) is None
+
+    def events(self, *kinds: str) -> list[tuple[str, str | None]]:
+        """The events of these kinds, and of which node."""
+        return [(event.kind, event.node) for event in self.emulation.folder.events if event.kind in kinds]

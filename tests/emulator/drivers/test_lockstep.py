@@ -1,0 +1,347 @@
+"""The barrier, with processes that are nothing but what they yield."""
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.protocol import ProtocolError
+from tests.support.multi_loop_driver import emulation_of, scenario_of
+from vnet.transport import wire
+
+IDS = ["v01", "v02", "v03", "v04"]
+ALONE = [[node] for node in IDS]
+MS = 1_000_000
+PERIOD_NS = 200 * MS
+
+
+def barrier(
+    faults: Sequence[dict[str, Any]] = (), processes: Sequence[Sequence[str]] = ALONE, **sections: Any
+) -> tuple[Lockstep, Emulation]:
+    sections = {"radio": {"loss": 0.0}, **sections}
+    emulation = emulation_of(scenario_of(list(faults), "agents.beacon:main", **sections))
+    return Lockstep(emulation, processes), emulation
+
+
+def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
+    who = {"nodes": {"ids": list(nodes)}} if nodes else {}
+    return {"kind": kind, "at_s": at_s, "duration_s": duration_s, **who, **more}
+
+
+def yielded(
+    grant: wire.Grant,
+    timer_ns: int | None = None,
+    radio: Sequence[str] = (),
+    gnss: Sequence[str] = (),
+    frames: Sequence[wire.Frame] = (),
+) -> wire.Yield:
+    return wire.Yield(b"n", grant.seq, timer_ns, radio, gnss, wire.Traffic(frames))
+
+
+def yield_all(lockstep: Lockstep, grants: dict[str, wire.Grant], **timers_ns: int) -> None:
+    for process_id, grant in grants.items():
+        lockstep.receive(process_id, yielded(grant, timers_ns.get(process_id)))
+
+
+def times(grants: dict[str, wire.Grant]) -> dict[str, int]:
+    return {process_id: grant.time_ns for process_id, grant in grants.items()}
+
+
+# One rule at a time.
+
+
+def test_at_time_0_every_process_is_granted_its_first_instant() -> None:
+    lockstep, _ = barrier()
+    grants = lockstep.start()
+    assert times(grants) == dict.fromkeys(IDS, 0)
+    assert [grant.seq for grant in grants.values()] == [0] * 4
+    assert lockstep.owed == dict.fromkeys(IDS, 0)
+
+
+def test_nothing_is_granted_before_all_owed_yields_are_there() -> None:
+    lockstep, _ = barrier()
+    grants = lockstep.start()
+    for process_id in IDS[:3]:
+        lockstep.receive(process_id, yielded(grants[process_id], 10 * MS))
+        with pytest.raises(AssertionError):
+            lockstep.step()
+    lockstep.receive("v04", yielded(grants["v04"], 20 * MS))
+    assert times(lockstep.step()) == dict.fromkeys(IDS[:3], 10 * MS)
+
+
+def test_only_those_are_granted_an_instant_who_have_something_to_do_at_it() -> None:
+    lockstep, _ = barrier()
+    yield_all(lockstep, lockstep.start(), v01=30 * MS, v02=10 * MS, v03=10 * MS)
+    grants = lockstep.step()
+    assert times(grants) == {"v02": 10 * MS, "v03": 10 * MS}
+    assert lockstep.owed == {"v02": 1, "v03": 1}
+    yield_all(lockstep, grants, v03=20 * MS)
+    grants = lockstep.step()
+    assert times(grants) == {"v03": 20 * MS}
+    yield_all(lockstep, grants)
+    assert times(lockstep.step()) == {"v01": 30 * MS}
+
+
+def test_a_timer_that_is_overdue_is_granted_now_and_time_never_goes_back() -> None:
+    lockstep, _ = barrier()
+    yield_all(lockstep, lockstep.start(), v01=30 * MS)
+    yield_all(lockstep, lockstep.step(), v01=10 * MS)
+    assert times(lockstep.step()) == {"v01": 30 * MS}
+
+
+def test_a_task_that_waits_for_fixes_is_woken_by_each_and_gets_what_it_has_missed() -> None:
+    lockstep, _ = barrier()
+    for process_id, grant in lockstep.start().items():
+        gnss = [process_id] if process_id == "v01" else []
+        lockstep.receive(process_id, yielded(grant, 500 * MS if process_id == "v02" else None, gnss=gnss))
+    grants = lockstep.step()
+    assert times(grants) == {"v01": PERIOD_NS}
+    assert [fix.time_ns for fix in grants["v01"].fixes] == [PERIOD_NS]
+    yield_all(lockstep, grants)
+    grants = lockstep.step()
+    assert times(grants) == {"v02": 500 * MS}
+    assert [fix.time_ns for fix in grants["v02"].fixes] == [200 * MS, 400 * MS]
+
+
+def test_a_frame_wakes_whoever_waits_for_it_when_it_arrives_and_waits_for_the_others() -> None:
+    lockstep, _ = barrier()
+    for process_id, grant in lockstep.start().items():
+        frames = [wire.Frame("v01", b"hello")] if process_id == "v01" else []
+        radio = [process_id] if process_id in ("v01", "v02") else []
+        timer_ns = 900 * MS if process_id == "v03" else None
+        lockstep.receive(process_id, yielded(grant, timer_ns, radio, frames=frames))
+    grants = lockstep.step()
+    assert list(grants) == ["v02"], "the sender does not hear itself"
+    (packet,) = grants["v02"].packets
+    assert (packet.sender, packet.payload, packet.sent_ns) == ("v01", b"hello", 0)
+    assert 0 < packet.received_ns == grants["v02"].time_ns < 900 * MS
+    yield_all(lockstep, grants)
+    grants = lockstep.step()
+    assert times(grants) == {"v03": 900 * MS}
+    assert [packet.payload for packet in grants["v03"].packets] == [b"hello"]
+
+
+@pytest.mark.parametrize(
+    ("seq", "traffic", "radio", "gnss"),
+    [
+        (1, wire.Traffic(), [], []),
+        (0, wire.Traffic([wire.Frame("v02", b"x")]), [], []),
+        (0, wire.Traffic((), (), [wire.Ending("v02", "finished")]), [], []),
+        (0, wire.Traffic(), ["v02"], []),
+        (0, wire.Traffic(), [], ["v02"]),
+    ],
+    ids=["seq", "frame", "ending", "radio", "gnss"],
+)
+def test_a_yield_that_does_not_fit_its_grant_is_refused_and_still_owed(
+    seq: int, traffic: wire.Traffic, radio: list[str], gnss: list[str]
+) -> None:
+    lockstep, _ = barrier()
+    grants = lockstep.start()
+    with pytest.raises(ProtocolError):
+        lockstep.receive("v01", wire.Yield(b"n", seq, None, radio, gnss, traffic))
+    assert lockstep.owed["v01"] == 0
+    lockstep.receive("v01", yielded(grants["v01"]))
+    with pytest.raises(ProtocolError):
+        lockstep.receive("v01", yielded(grants["v01"]))
+
+
+def test_a_process_that_died_owes_nothing_and_its_nodes_are_down() -> None:
+    lockstep, emulation = barrier(processes=[["v01", "v02"], ["v03"], ["v04"]])
+    grants = lockstep.start()
+    lockstep.died("v01", how="SIGSEGV")
+    lockstep.died("v01", how="told again")
+    for process_id in ("v03", "v04"):
+        lockstep.receive(process_id, yielded(grants[process_id], 10 * MS))
+    assert times(lockstep.step()) == {"v03": 10 * MS, "v04": 10 * MS}
+    assert [emulation.up[node] for node in IDS] == [False, False, True, True]
+    died = [(event.node, event.details["how"]) for event in emulation.folder.events if event.kind == "died"]
+    assert died == [("v01", "SIGSEGV"), ("v02", "SIGSEGV")]
+
+
+def test_faults_act_before_anything_else_of_their_instant() -> None:
+    lockstep, emulation = barrier([fault("kill", 0.5, 0.3, "v02"), fault("pause", 0.5, 0.2, "v03")])
+    yield_all(lockstep, lockstep.start(), **dict.fromkeys(IDS, 500 * MS))
+    grants = lockstep.step()
+    assert times(grants) == {"v01": 500 * MS, "v04": 500 * MS}
+    (actions,) = lockstep.take_actions()
+    assert (actions.stop, actions.paused) == ({"v02": True}, {"v03"})
+    assert lockstep.take_actions() == [], "each is told once"
+    yield_all(lockstep, grants)
+    grants = lockstep.step()
+    assert times(grants) == {"v03": 700 * MS}, (
+        "a process that was paused is granted the instant at which it resumes"
+    )
+    assert grants["v03"].seq == 1
+    yield_all(lockstep, grants)
+    grants = lockstep.step()
+    assert times(grants) == {"v02": 800 * MS}
+    assert grants["v02"].seq == 0, "another process"
+    assert [actions.start for actions in lockstep.take_actions()] == [[], ["v02"]]
+    assert emulation.incarnation["v02"] == 1
+
+
+def test_a_run_that_is_held_does_all_before_its_horizon_and_nothing_at_it() -> None:
+    lockstep, emulation = barrier()
+    lockstep.horizon_ns = 400 * MS
+    yield_all(lockstep, lockstep.start(), v01=399 * MS, v02=400 * MS)
+    grants = lockstep.step()
+    assert times(grants) == {"v01": 399 * MS}
+    yield_all(lockstep, grants)
+    assert lockstep.step() == {} and lockstep.held
+    assert len(emulation.metrics.rows) == 2, "the periods before it are recorded"
+    assert lockstep.step() == {}, "and it stays held"
+    lockstep.horizon_ns = None
+    assert times(lockstep.step()) == {"v02": 400 * MS}
+    assert not lockstep.held
+
+
+def test_at_the_end_nobody_is_granted_anything_and_all_periods_are_recorded() -> None:
+    lockstep, emulation = barrier()
+    yield_all(lockstep, lockstep.start(), v01=emulation.duration_ns)
+    assert lockstep.step() == {} and not lockstep.held
+    assert len(emulation.metrics.rows) == emulation.duration_ns // PERIOD_NS
+
+
+# All rules at once: vehicles that do something at random.
+
+
+@dataclass
+class Vehicle:
+    """A program without a loop: what it does hangs on its own random numbers and on what it is told alone."""
+
+    node: str
+    incarnation: int
+    seed: int
+    timer_ns: int | None = None
+    packets: list[wire.WirePacket] = field(default_factory=list)
+    fixes: list[wire.WireFix] = field(default_factory=list)
+    begun: bool = False
+
+    def __post_init__(self) -> None:
+        self.draw = random.Random(f"{self.seed}/{self.node}/{self.incarnation}")
+        self.hears, self.locates = self.draw.random() < 0.7, self.draw.random() < 0.6
+
+    def wake(self, now_ns: int, diary: list[tuple[Any, ...]]) -> list[wire.Frame]:
+        """Do what is to be done at this instant, and write it down."""
+        packets, fixes = (self.packets if self.hears else []), (self.fixes if self.locates else [])
+        rings = self.timer_ns is not None and self.timer_ns <= now_ns
+        if self.begun and not (packets or fixes or rings):
+            return []
+        self.begun = True
+        told = [(p.sender, p.sent_ns, p.received_ns, p.payload) for p in packets], [f.time_ns for f in fixes]
+        diary.append((now_ns, self.incarnation, *told, rings))
+        self.packets, self.fixes = [], []
+        wait_ns = self.draw.choice([1, 10 * MS, 77_777_777, 200 * MS, None])
+        self.timer_ns = None if wait_ns is None else now_ns + wait_ns
+        if rings and wait_ns == 1:
+            self.timer_ns = now_ns + 50 * MS  # not for ever in steps of a nanosecond
+        # An answer to every packet would be answered without end.
+        sent = self.draw.choice([0, 0, 1, 2]) if fixes or rings else self.draw.choice([0] * 9 + [1])
+        return [
+            wire.Frame(self.node, f"{self.node} {self.incarnation} {len(diary)} {n}".encode()) for n in range(sent)
+        ]
+
+
+class Course:
+    """Runs vehicles in processes to the end, and checks every grant."""
+
+    def __init__(
+        self, emulation: Emulation, groups: Sequence[Sequence[str]], seed: int, order: random.Random
+    ) -> None:
+        self.emulation = emulation
+        self.hosts_all = len(groups) == 1
+        self.lockstep = Lockstep(emulation, groups, hosts_all=self.hosts_all)
+        self.groups = {nodes[0]: nodes for nodes in groups}
+        self.seed = seed
+        self.order = order
+        self.vehicles = {node: Vehicle(node, 0, seed) for node in IDS}
+        self.diary: dict[str, list[tuple[Any, ...]]] = {node: [] for node in IDS}
+        self.sent_ns: dict[bytes, int] = {}
+        self.seqs: dict[str, int] = {}
+        self.paused: set[str] = set()
+
+    def run(self) -> tuple[str, dict[str, list[tuple[Any, ...]]]]:
+        now_ns = 0
+        grants = self.lockstep.start()
+        while grants:
+            self.apply_actions()
+            assert len({grant.time_ns for grant in grants.values()}) == 1, "one instant at a time"
+            assert next(iter(grants.values())).time_ns >= now_ns, "in order"
+            now_ns = next(iter(grants.values())).time_ns
+            assert self.lockstep.owed.keys() == grants.keys()
+            answers = [(process_id, self.answer(process_id, grant)) for process_id, grant in grants.items()]
+            self.order.shuffle(answers)
+            for process_id, message in answers:
+                with pytest.raises(AssertionError):
+                    self.lockstep.step()  # while one of them is still owed
+                self.lockstep.receive(process_id, message)
+            grants = self.lockstep.step()
+        return self.emulation.engine.trace.sha256(), self.diary
+
+    def apply_actions(self) -> None:
+        for actions in self.lockstep.take_actions():
+            self.paused = actions.paused
+            for node in actions.start:
+                self.vehicles[node] = Vehicle(node, self.emulation.incarnation[node], self.seed)
+                if not self.hosts_all:
+                    self.seqs.pop(node, None)
+
+    def answer(self, process_id: str, grant: wire.Grant) -> wire.Yield:
+        """Give a process its grant, and let its vehicles yield."""
+        assert grant.seq == self.seqs.get(process_id, -1) + 1
+        self.seqs[process_id] = grant.seq
+        for packet in grant.packets:
+            assert self.sent_ns[packet.payload] == packet.sent_ns, "nothing is delivered that was not sent before"
+            assert packet.sent_ns <= packet.received_ns <= grant.time_ns
+            self.vehicles[packet.node].packets.append(packet)
+        for fix in grant.fixes:
+            assert fix.time_ns <= grant.time_ns
+            self.vehicles[fix.node].fixes.append(fix)
+        nodes = [node for node in self.groups[process_id] if self.emulation.up[node] and node not in self.paused]
+        frames = [f for node in nodes for f in self.vehicles[node].wake(grant.time_ns, self.diary[node])]
+        self.sent_ns |= {frame.payload: grant.time_ns for frame in frames}
+        living = [self.vehicles[node] for node in self.groups[process_id] if self.emulation.up[node]]
+        timers = [vehicle.timer_ns for vehicle in living if vehicle.timer_ns is not None]
+        radio = [vehicle.node for vehicle in living if vehicle.hears]
+        gnss = [vehicle.node for vehicle in living if vehicle.locates]
+        return yielded(grant, min(timers, default=None), radio, gnss, frames)
+
+
+GROUPINGS = [ALONE, [["v01", "v02"], ["v03", "v04"]], [["v01"], ["v02", "v03", "v04"]], [IDS]]
+
+
+def faults_of(kind: str, **more: Any) -> st.SearchStrategy[dict[str, Any]]:
+    starts_s, durations_s = st.sampled_from([0.0, 0.1, 0.2, 0.35, 0.5]), st.sampled_from([0.1, 0.25, 0.4])
+    return st.builds(lambda at_s, duration_s: fault(kind, at_s, duration_s, **more), starts_s, durations_s)
+
+
+# Faults that act on all processes alike, so that any grouping of the nodes allows them.
+schedules = st.lists(
+    st.one_of(
+        *map(faults_of, ["kill", "restart", "pause"]),
+        faults_of("loss", probability=0.5),
+        faults_of("delay", delay_ms=120),
+    ),
+    max_size=3,
+)
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    faults=schedules,
+    seed=st.integers(0, 1000),
+    groups=st.sampled_from(GROUPINGS[1:]),
+    order=st.randoms(use_true_random=False),
+)
+def test_neither_the_grouping_of_nodes_nor_the_order_of_yields_changes_a_run(
+    faults: list[dict[str, Any]], seed: int, groups: list[list[str]], order: random.Random
+) -> None:
+    scenario = scenario_of(faults, "agents.beacon:main", run={"duration_s": 1.6, "settle_s": 0.1, "seed": seed})
+    reference = Course(emulation_of(scenario), ALONE, seed, random.Random(0)).run()
+    assert Course(emulation_of(scenario), groups, seed, order).run() == reference

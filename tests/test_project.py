@@ -1,0 +1,90 @@
+"""The project's own files agree: supported versions of Python, the linters, and what is run where."""
+
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.docs.pages import check_workflow
+from tests.support.paths import ROOT
+
+WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "test.yml").read_text())
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+MAKEFILE = (ROOT / "Makefile").read_text()
+
+
+def recipe(target: str) -> list[str]:
+    """The commands of a target of the Makefile."""
+    found = re.search(rf"^{target}:[^=\n]*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
+    assert found, target
+    return [line.strip() for line in found.group(1).splitlines()]
+
+
+def test_the_workflow_can_be_run() -> None:
+    check_workflow(WORKFLOW)
+    (job,) = WORKFLOW["jobs"].values()
+    assert [step["run"] for step in job["steps"] if "run" in step] == ["make test PYTHON=python"]
+
+
+def test_the_supported_versions_of_python_are_the_same_everywhere() -> None:
+    (job,) = WORKFLOW["jobs"].values()
+    versions = job["strategy"]["matrix"]["python"]
+    listed = re.search(r"^PYTHONS \?= (.*)$", MAKEFILE, re.MULTILINE)
+    prefix = "Programming Language :: Python :: 3."
+    classifiers = [entry for entry in PROJECT["project"]["classifiers"] if entry.startswith(prefix)]
+    assert listed and listed.group(1).split() == versions
+    assert classifiers == [f"Programming Language :: Python :: {version}" for version in versions]
+    assert PROJECT["project"]["requires-python"] == f">={versions[0]}"
+    assert PROJECT["tool"]["mypy"]["python_version"] == versions[0]
+    assert PROJECT["tool"]["ruff"]["target-version"] == f"py{versions[0].replace('.', '')}"
+
+
+def test_the_hooks_before_a_commit_are_the_linters_of_make() -> None:
+    hooks: list[dict[str, Any]] = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0][
+        "hooks"
+    ]
+    entries = [hook["entry"].removesuffix(" --force-exclude") for hook in hooks]
+    linters = [line.replace("$(BIN)", ".venv/bin").removesuffix(" .") for line in recipe("lint")]
+    assert entries == linters
+
+
+def test_every_package_that_is_installed_has_an_exact_version() -> None:
+    """Of the packages that `pyproject.toml` names; what those need is installed by `make` and listed with it."""
+    pinned = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    wanted = [*PROJECT["project"]["dependencies"]]
+    for extra in PROJECT["project"]["optional-dependencies"].values():
+        wanted += extra
+    names = {re.split(r"[<>=]", name)[0] for name in wanted}
+    normal = {re.sub(r"[-_.]+", "-", name).lower() for name in pinned}
+    assert {name for name in names if re.sub(r"[-_.]+", "-", name).lower() not in normal} == set()
+
+
+@pytest.mark.parametrize(
+    ("installed", "said"),
+    [
+        (["3.98"], "passed with Python 3.98"),
+        (["3.97", "3.99"], "tested with Python 3.97 3.99; failed: 3.99"),
+        ([], "none of Python 3.97 3.98 3.99 is installed"),
+    ],
+)
+def test_make_test_all_tests_each_python_that_is_installed(installed: list[str], said: str, tmp_path: Path) -> None:
+    """With stand-ins for interpreters of versions that do not exist, and for make, which fails for 3.99."""
+    for version in installed:
+        stand_in(tmp_path / f"python{version}", "exit 0")
+    stand_in(tmp_path / "remake", 'case "$*" in *3.99*) exit 1;; esac')
+    command = ["make", "-C", str(ROOT), "test-all", f"MAKE={tmp_path / 'remake'}", "PYTHONS=3.97 3.98 3.99"]
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "HOME": str(tmp_path)}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (ended.returncode == 0) == said.startswith("passed"), ended.stdout + ended.stderr
+    assert said in ended.stdout.splitlines()
+    for version in {"3.97", "3.98", "3.99"} - set(installed):
+        assert f"Python {version} is not installed: not tested" in ended.stdout
+
+
+def stand_in(path: Path, does: str) -> None:
+    path.write_text(f"#!/bin/sh\n{does}\n")
+    path.chmod(0o755)
