@@ -237,7 +237,7 @@ def test_other_files_are_refused_by_their_name(tmp_path: Path) -> None:
 def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_module, "MOST_SAMPLES", 5)
     path = write(tmp_path, "t.csv", HEADER + "".join(f"a,{time},{time},0\n" for time in range(9)))
-    assert "more than 5 samples; with network.start_s" in refusal(path)
+    assert "more than 5 samples; set network.start_s" in refusal(path)
     assert world_of(path, duration_s=1.0, start_s=0.0, longest_gap_s=2.0).node_ids == ("a",)
 
 
