@@ -1,4 +1,4 @@
-"""vnet: what vehicle programs and the emulator agree on. A program needs only `from vnet import Node`.
+"""vnet: the interface between vehicle programs and the emulator. A program needs only `from vnet import Node`.
 
 These names are imported at their first use: whatever must come before numpy, which they need, can come after vnet.
 """

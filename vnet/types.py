@@ -1,4 +1,4 @@
-"""Types of arrays that the whole code shares; shapes are given where they are used, as (K, N)."""
+"""Types of arrays; docstrings give their shapes, as (K, N)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Numbers: metres, seconds, probabilities."""
+"""Real numbers, such as metres, seconds or probabilities."""
 IntArray = NDArray[np.int64]
-"""Whole numbers: times in nanoseconds, numbers of frames and faults."""
+"""Integers, such as times in nanoseconds or numbers of frames."""
 Mask = NDArray[np.bool_]
-"""A subset, by index."""
+"""A subset as a mask."""

@@ -18,7 +18,7 @@ from vnet.types import Array
 LANES_SHOWN_M = 800.0
 """Largest extent of a picture that shows lanes."""
 
-# Colour and line width in points of each class.
+# Colour and line width in points of each class. Similar classes differ only in width.
 _STYLES = {
     "motorway": (PALETTE["red"].light, 2.6),
     "trunk": (PALETTE["red"].light, 2.2),

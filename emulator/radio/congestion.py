@@ -26,7 +26,7 @@ SLICES = WINDOW_NS // SLICE_NS
 
 
 class CongestionControl(Protocol):
-    """Decides when each sender's next frame may go to the MAC; of those held back the newest `waiting` are kept."""
+    """Gate between program and MAC. Of the frames of a sender that it holds back, it keeps the newest `waiting`."""
 
     waiting: int
 

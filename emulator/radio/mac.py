@@ -16,7 +16,7 @@ from vnet.units import NS_PER_MS
 
 
 class Mac(Protocol):
-    """Decides when frames are transmitted. `sent` holds the frames decided since the engine last took them.
+    """Interface of a MAC. `sent` holds the frames that have left their senders since the engine last took them.
 
     A MAC may have events of its own, at which no program runs. `run` processes the events strictly before a time,
     so that all frames enqueued at this time are there before its events are processed.

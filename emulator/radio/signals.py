@@ -43,7 +43,7 @@ def sender_draw(frame: Frame, lowest_bit: int) -> float:
 
 
 class Signals:
-    """Computes the signals of frames at `count` receivers."""
+    """Factory of the signals of frames at `count` receivers."""
 
     def __init__(self, seed: int, fading: Fading | None, count: int) -> None:
         self._draws = Draws(seed, "radio")

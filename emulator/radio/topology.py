@@ -54,7 +54,9 @@ class Topology:
             in_range = power_mw > 0  # computing the powers twice would double the time of this method
             np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
-        self.now = TopologySnapshot(distance_m, in_range, in_range, power_mw, fading)
+        self.now = TopologySnapshot(
+            distance_m=distance_m, in_range=in_range, admitted=in_range, power_mw=power_mw, fading=fading
+        )
         self._rank()
 
     def set_up(self, node: int, up: bool) -> None:

@@ -1,1 +1,1 @@
-"""The stream to observers: the messages, the same from a finished run, and the pace in which they come."""
+"""The stream to observers: its messages, live and from a finished run, and playback in wall-clock time."""

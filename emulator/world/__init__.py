@@ -1,1 +1,1 @@
-"""The truth that the vehicles live in and never see: where they are, and how wrong their GNSS is."""
+"""The truth of a run, hidden from programs: motion of the vehicles, and errors of their GNSS receivers."""

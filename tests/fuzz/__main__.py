@@ -22,7 +22,7 @@ MEMORY_BYTES = 2**30
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one target."""
+    """The result of one target."""
 
     inputs: int
     covered: int
@@ -72,7 +72,7 @@ def _bound_memory() -> None:
 
 def fuzz_in_process(name: str, runs: int, seconds: int, kept: Path) -> Result:
     """Fuzz one target in a process of its own; inputs that do harm are moved to `kept`."""
-    from tests.fuzz.targets import temporary_folder
+    from tests.fuzz.seeds import temporary_folder
 
     with temporary_folder() as text:
         folder = Path(text)

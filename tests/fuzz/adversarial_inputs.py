@@ -2,7 +2,7 @@
 
 import struct
 
-from tests.fuzz.targets import OVERRIDE
+from tests.fuzz.seeds import OVERRIDE
 from vnet.transport import wire
 
 _TWO_GB = struct.pack(">I", 2**31)
@@ -17,17 +17,17 @@ _DEEP = 100_000
 
 
 def _msgpack() -> dict[str, bytes]:
-    """Headers that claim 2 GB, at every place of a message in which something of variable length stands."""
+    """Return inputs with headers that claim 2 GB, at every position of a value of variable length."""
     whole = {
         "yield": wire.encode(wire.Yield(b"n", 1, None, ["a"], [], wire.Traffic([wire.Frame("a", b"b")]))),
         "grant": wire.encode(wire.Grant(1, 2, [wire.WirePacket("a", "b", 1, 2, b"c")])),
         "observation": wire.encode_observation({"a": 1}),
     }
     nasty = {
-        f"{name} with {header} at {place}": message[:place] + claim + message[place + 1 :]
+        f"{name} with {header} at {index}": message[:index] + claim + message[index + 1 :]
         for header, claim in _HEADERS.items()
         for name, message in whole.items()
-        for place in range(len(message))
+        for index in range(len(message))
     }
     nasty |= {f"{header} in {header}": claim * 1000 for header, claim in _HEADERS.items()}
     nasty["arrays 10⁵ deep"] = b"\x81\xa1a" + b"\x91" * _DEEP

@@ -1,4 +1,4 @@
-"""Hostile input does no harm: no target raises what it does not document, hangs, or fills the memory."""
+"""Adversarial inputs: no target raises an undocumented error, hangs, or fills the memory."""
 
 import signal
 import tracemalloc
@@ -21,7 +21,7 @@ all_targets = pytest.mark.parametrize("target", TARGETS, ids=lambda target: targ
 
 @contextmanager
 def bounded() -> Iterator[None]:
-    """At most `LONGEST_CPU_S` of processor time (not of the clock on the wall: the machine may be busy)."""
+    """Bound the CPU time to `LONGEST_CPU_S` (not the wall-clock time: the machine may be busy)."""
 
     def too_long(*_: object) -> None:
         raise AssertionError(f"more than {LONGEST_CPU_S} s of processor time")
@@ -36,7 +36,7 @@ def bounded() -> Iterator[None]:
 
 
 def peak_bytes(target: Target, data: bytes) -> int:
-    """The most memory that reading `data` took at once, in bytes."""
+    """Return the peak memory of reading `data`, in bytes."""
     tracemalloc.start()
     try:
         target.try_out(data)

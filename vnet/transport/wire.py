@@ -26,7 +26,7 @@ HEAD_START_NS = 200_000_000
 LATENESS_LIMIT_NS = 20_000_000
 """Deliveries later than this count against a real-time run."""
 LATENESS_BINS = 80
-"""Bins of delays, four for each factor of two, from 10 µs to 10 s around the limit."""
+"""Bins of delays: four for each factor of two, from 10 µs to 10 s."""
 LARGEST_MESSAGE_BYTES = 64 * 2**20
 """Largest message of an agent: it holds a frame of the largest payload from each of a thousand nodes."""
 

@@ -1,1 +1,1 @@
-"""Maps of real and invented cities: reading, writing, drawing and generating them."""
+"""Maps of real and generated cities: reading, writing and generating them."""

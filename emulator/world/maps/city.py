@@ -63,7 +63,7 @@ def city_roads(seed: int, size_m: float = SIZE_M) -> Roads:
 
 
 class _Warp:
-    """Rotates the plan slightly, and displaces it by long waves."""
+    """Map from the plan to metres: a small rotation, and a displacement by long waves."""
 
     def __init__(self, rng: np.random.Generator, size_m: float) -> None:
         self._turn_rad = math.radians(rng.uniform(4, 14)) * rng.choice([-1, 1])
@@ -78,7 +78,7 @@ class _Warp:
 
 
 class _City:
-    """Draws the streets on the plan, a square centred at (0, 0)."""
+    """The plan of the streets, a square centred at (0, 0)."""
 
     def __init__(self, rng: np.random.Generator, size_m: float) -> None:
         self._rng = rng

@@ -158,7 +158,7 @@ def _kinds(path: Path, arrays: Arrays, count: int) -> Ints:
 
 
 class _Merger:
-    """Merges edges into roads: both directions of an edge, then chains of edges without crossings."""
+    """Merger of edges into roads: both directions of an edge, then chains of edges without crossings."""
 
     def __init__(self, path: Path, node_m: Array, edges: _Edges, frame: Frame | None) -> None:
         self._path, self._node_m, self._frame = path, node_m, frame

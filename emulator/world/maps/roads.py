@@ -136,16 +136,16 @@ class Roads:
         of_lane = lane[segment]
         of_road = road[of_lane]
         return RoadMap(
-            point_m[segment],
-            _heading_rad(step[segment]),
-            np.hypot(step[segment, 0], step[segment, 1]),
-            np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, MIN_HALF_WIDTH_M),
-            self.kind[of_road].astype(np.uint8),
-            self.one_way[of_road],
-            of_road.astype(np.int32),
-            of_lane.astype(np.int32),
-            NAMES,
-            sigma_m,
+            point_m=point_m[segment],
+            heading_rad=_heading_rad(step[segment]),
+            length_m=np.hypot(step[segment, 0], step[segment, 1]),
+            half_width_m=np.maximum((self.lane_width_m[of_road] - VEHICLE_WIDTH_M) / 2, MIN_HALF_WIDTH_M),
+            kind=self.kind[of_road].astype(np.uint8),
+            one_way=self.one_way[of_road],
+            road=of_road.astype(np.int32),
+            lane=of_lane.astype(np.int32),
+            classes=NAMES,
+            sigma_m=sigma_m,
         )
 
     def _lanes(self, side: float) -> tuple[Ints, Array, NDArray[np.bool_]]:
@@ -191,7 +191,7 @@ class _Row:
 
 
 class RoadsBuilder:
-    """Collects roads as a file is read; points with the same key, which the reader chooses, are the same point."""
+    """Builder of `Roads` from a file; points with the same key, which the reader chooses, are the same point."""
 
     def __init__(self, source: object) -> None:
         self._source = source

@@ -1,1 +1,1 @@
-"""Trips: how vehicles drive, read from what others recorded or simulated."""
+"""Trips: trajectories of vehicles, recorded, simulated by SUMO, or generated."""

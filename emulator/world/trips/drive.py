@@ -46,8 +46,15 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     trips = samples.trips(network.origin_deg)
     if start_s is None:
         start_s = min(float(trip.time_s[0]) for trip in trips)
+    selection = Selection(
+        start_s=start_s,
+        periods=periods,
+        period_ns=period_ns,
+        disc=network.disc,
+        most=network.max_vehicles,
+    )
     try:
-        motion = motion_of(trips, Selection(start_s, periods, period_ns, network.disc, network.max_vehicles), rules)
+        motion = motion_of(trips, selection, rules)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
     return replace(motion, origin_deg=samples.origin_deg)

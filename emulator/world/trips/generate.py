@@ -80,14 +80,14 @@ def generate_motion(
     for number in range(vehicles):
         rng = np.random.default_rng((seed, number))
         states[:, number] = _Trip(network, rng, float(time_s[-1]), side).at(time_s)
-    there = np.flatnonzero(np.isfinite(states[: periods - 1, :, 0]).any(axis=0))
-    if not len(there):
+    present = np.flatnonzero(np.isfinite(states[: periods - 1, :, 0]).any(axis=0))
+    if not len(present):
         raise ScenarioError(
             f"{source}: no vehicle is present within {time_s[-1]:g} s; set more vehicles or a longer duration"
         )
     width = len(str(vehicles))
-    ids = tuple(f"v{number + 1:0{max(2, width)}d}" for number in there.tolist())
-    return Motion(ids, states[:, there, :2], states[:, there, 2])
+    ids = tuple(f"v{number + 1:0{max(2, width)}d}" for number in present.tolist())
+    return Motion(ids, states[:, present, :2], states[:, present, 2])
 
 
 class _Trip:

@@ -142,7 +142,7 @@ def _resample(driven: Array, trip: Trip, rows: NDArray[np.intp], selection: Sele
 
 
 def _kept(heading_rad: Array, moving: NDArray[np.bool_]) -> Array:
-    """Headings (k,) in which those who stand keep their last, or before they ever moved have their first."""
+    """Return headings (k,) of which a standing vehicle keeps its last, or, before it first moves, has its first."""
     if not moving.any():
         return np.full(len(heading_rad), np.nan)
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moving)), -1))

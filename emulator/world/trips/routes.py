@@ -130,7 +130,15 @@ def _streets(roads: Roads) -> Streets:
     first = np.ones(len(order), dtype=np.bool_)
     first[1:] = (np.diff(start[order]) != 0) | (np.diff(end[order]) != 0)
     kept = order[first]
-    return Streets(roads, start[kept], end[kept], road_of[kept], against[kept], speed_of[kept], time_of[kept])
+    return Streets(
+        roads=roads,
+        start=start[kept],
+        end=end[kept],
+        road=road_of[kept],
+        against=against[kept],
+        speed_m_s=speed_of[kept],
+        time_s=time_of[kept],
+    )
 
 
 def _speed_m_s(name: str) -> float:

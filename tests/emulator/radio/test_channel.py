@@ -31,7 +31,7 @@ def radio(**changes: float) -> Radio:
 
 
 class Row(NamedTuple):
-    """What has become of the pairs of one frame, by receiver."""
+    """The receptions of one frame, by receiver."""
 
     outcome: NDArray[np.uint8]
     arrival_ns: NDArray[np.int64]
@@ -56,7 +56,7 @@ def sent(
 
 
 def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
-    """When a frame that is handed over has left its sender; None if there was no room."""
+    """Enqueue a frame; return the end of its transmission, or None if the queue was full."""
     frame = frame_of(sender, seq, time_ns, size)
     queue.enqueue(frame)
     assert queue.sent.pop() is frame
@@ -73,7 +73,7 @@ def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
     for other, number in before:
         used.uniform(*other, number)
     assert np.array_equal(used.uniform(*frame, count), fresh)
-    assert np.array_equal(used.uniform(*frame, count + 3)[:count], fresh), "one more receiver moves nobody's draw"
+    assert np.array_equal(used.uniform(*frame, count + 3)[:count], fresh), "another receiver changes no other draw"
     assert np.all((fresh >= 0) & (fresh < 1))
 
 
@@ -136,7 +136,7 @@ def test_a_death_lets_the_next_one_in_and_a_restart_puts_it_out_again() -> None:
     assert topology.now.admitted[:, 0].tolist() == [False, True, True, False]
     topology.set_up(1, False)
     topology.move(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
-    assert topology.now.admitted[:, 0].tolist() == [False, False, True, True], "moving raises nobody from the dead"
+    assert topology.now.admitted[:, 0].tolist() == [False, False, True, True], "moving does not set a node up"
     topology.set_up(1, True)
     assert topology.now.admitted[:, 0].tolist() == [False, True, True, False]
 
@@ -167,7 +167,7 @@ def test_a_frame_keeps_the_surroundings_of_its_handing_over_among_others() -> No
 
 
 def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]:
-    """When each frame of one sender has left it at 1 µs a byte without access jitter; None where there was no room."""  # noqa: E501
+    """Return the end of each frame of one sender at 1 µs a byte without access jitter; None if the queue was full."""  # noqa: E501
     ends: list[int | None] = []
     on_air: list[tuple[int, int]] = []
     for time_ns, size in sends:

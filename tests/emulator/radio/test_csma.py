@@ -145,7 +145,7 @@ def test_however_time_is_cut_copies_have_the_same_numbers(
 def test_who_looks_ahead_knows_the_next_arrival_and_changes_nothing(
     seed: int, sends: list[Send], radio: dict[str, Any]
 ) -> None:
-    """As lockstep does: at each instant the first arrival at some nodes is told before it happens."""
+    """Predict the first arrival at some nodes before each send, as lockstep does."""
     position_m = scattered(6, seed)
     plain, asked = (engine(position_m, seed, **PHYSICAL, **radio) for _ in range(2))
     told = []

@@ -1,4 +1,4 @@
-"""The engine and its channel: one outcome for every pair, and luck that depends only on what it decides."""
+"""The engine and its channel: one outcome for every reception, and draws that depend only on what they decide."""
 
 import tracemalloc
 from collections import Counter
@@ -89,7 +89,7 @@ def test_loss_lies_in_its_binomial_band() -> None:
     low, high = binom.interval(0.999, 20 * 19 * 50, 0.3)
     assert low <= subject.counts[Outcome.lost] <= high
     lost_of = Counter(row["receiver"] for row in rows(subject) if row["outcome"] == "lost")
-    assert len(lost_of) == 20, "nobody is spared"
+    assert len(lost_of) == 20, "every receiver loses some"
 
 
 @settings(max_examples=25, deadline=None)
@@ -139,7 +139,7 @@ def test_neither_the_order_of_calls_nor_the_size_of_steps_matters(seed: int, ord
 
 @settings(max_examples=15, deadline=None)
 @given(seeds)
-def test_one_more_vehicle_far_away_changes_nobodys_luck(seed: int) -> None:
+def test_one_more_vehicle_far_away_changes_no_draws_of_others(seed: int) -> None:
     position = place(6, seed % 100, 5000)
     far = np.vstack([position, [[1e6, 1e6]]])
     one, other = engine(position, seed, loss=0.3), engine(far, seed, loss=0.3)
@@ -201,12 +201,12 @@ def test_moving_changes_who_hears_from_then_on() -> None:
 
 
 def heard(subject: Engine) -> set[tuple[str, str]]:
-    """Which (sender, receiver) pairs came to a delivery."""
+    """Return the links (sender, receiver) with a delivery."""
     return {(row["sender"], row["receiver"]) for row in rows(subject) if row["outcome"] == "delivered"}
 
 
 def test_in_a_directed_ring_frames_go_one_way_only() -> None:
-    """Vehicle i hears only vehicle i - 1, though all stand in one place, and as little when they have moved."""
+    """Vehicle i receives only from vehicle i - 1, though all are at one position, also after they have moved."""
     links = np.roll(np.eye(4, dtype=bool), -1, axis=1)
     subject = engine(np.zeros((4, 2)), links=links)
     for time_ns in (0, PERIOD_NS):
@@ -289,7 +289,7 @@ def test_what_arrives_with_other_bytes_has_another_digest_whichever_rows_are_ask
 
 
 def test_a_row_of_a_long_trace_in_which_bytes_were_changed_costs_no_more_than_of_a_short_one() -> None:
-    """By what is allocated for it: deliveries look a few rows up at each of their instants."""
+    """Measured by allocated memory: deliveries look up a few rows at a time."""
     trace = trace_of(100_000)
     trace.alter(5, 1)
     tracemalloc.start()

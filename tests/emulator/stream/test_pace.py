@@ -76,7 +76,7 @@ def test_no_message_comes_early_or_later_than_it_must(costs_s: list[float], spee
 
 
 def test_the_clock_starts_with_the_first_period() -> None:
-    """Finding the place where to begin takes time, and so does opening a viewer: neither is made up for."""
+    """Finding the start takes time, and so does opening a viewer: playback does not catch up for either."""
     clock = Clock()
     times: list[float] = []
 

@@ -1,4 +1,4 @@
-"""A run's files tell what those who watched it were told, and say in one line why they cannot."""
+"""Playback of a run's files gives the messages of the live run, or one line about what is missing."""
 
 import shutil
 from dataclasses import dataclass, replace

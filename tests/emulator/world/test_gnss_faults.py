@@ -1,4 +1,4 @@
-"""What faults make of fixes, as functions of the plan and the time."""
+"""Effects of faults on fixes, as functions of the plan and the time."""
 
 from typing import Any
 
@@ -45,7 +45,7 @@ def strayed(gnss: FaultyGnss, world: World, number: int = 0, periods: int = 100)
 
 
 def steps(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What is inside the fault, from 2 to 5 s, and what is outside."""
+    """Split values into those during the fault, from 2 to 5 s, and the others."""
     return values[20:50], np.concatenate([values[:20], values[50:]])
 
 

@@ -24,7 +24,7 @@ PUBLISHED = {
 
 
 def links(network: Network) -> NDArray[np.bool_]:
-    """Who is in range of whom, oneself left out."""
+    """Return the mask (N, N) of vehicles in range of each other."""
     position_m = network.position_m
     distance_m = np.sqrt(((position_m[:, None] - position_m[None]) ** 2).sum(axis=2))
     return (distance_m <= RANGE_M) & ~np.eye(len(position_m), dtype=bool)

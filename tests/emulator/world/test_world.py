@@ -131,7 +131,7 @@ def test_vehicles_stay_inside_their_lanes() -> None:
 
 
 def test_vehicles_are_reflected_and_do_not_stick() -> None:
-    """With a wide process in a narrow lane, the offset is spread evenly over it, up to the very edge."""
+    """The offset is uniform over a narrow lane, up to its edge, if the process is wide."""
     narrow = {"lateral": {"half_width_m": 0.5, "sigma_m": 5.0, "tau_s": 10.0}}
     offsets_m = lateral_m(build_world(scenario(run={"duration_s": 300}, world=narrow)))
     assert np.abs(offsets_m).max() <= 0.5 + 1e-6
@@ -177,7 +177,7 @@ def from_rows(folder: Path, count: int, **sections: dict[str, Any]) -> World:
     return build_world(scenario(network={"kind": "file", "path": str(path)}, **sections))
 
 
-def test_one_more_vehicle_changes_nobodys_errors(tmp_path: Path) -> None:
+def test_one_more_vehicle_changes_no_errors_of_others(tmp_path: Path) -> None:
     few_world, many_world = from_rows(tmp_path, 5), from_rows(tmp_path, 6)
     for period in (0, 50, 200):
         few, many = few_world.at(period), many_world.at(period)
@@ -221,7 +221,7 @@ def test_the_map_holds_every_lane_and_no_label() -> None:
     assert world.lane_map.half_width_m == HALF_WIDTH_M
     assert sorted(world.lane_of.tolist()) == list(range(38)), "to each vehicle a lane"
     assert np.array_equal(world.lane_map.heading_rad[world.lane_of], world.at(0).heading_rad)
-    assert np.mean(world.lane_of == np.arange(38)) < 0.2, "the order gives nobody's lane away"
+    assert np.mean(world.lane_of == np.arange(38)) < 0.2, "the order reveals no lanes"
     names = set(vars(world.lane_map))
     assert names == {"point_m", "heading_rad", "half_width_m"}
 

@@ -83,7 +83,7 @@ def test_a_router_goes_by_where_it_listens() -> None:
 
 
 def test_what_cannot_stand_in_a_certificate_is_one_line() -> None:
-    with pytest.raises(TransportError, match="not a name or an address"):
+    with pytest.raises(TransportError, match="not a host name or an address"):
         Access.create("r", PROCESSES, certifier(TLS, ["a" * 300]))
 
 

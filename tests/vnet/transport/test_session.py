@@ -30,7 +30,7 @@ def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("wanted", [None, "off", "debug", "trace,zenoh::api::session=trace"])
 def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
-    """In a process of its own, because a log is opened once for all."""
+    """Run in a process of its own, because a log is opened only once."""
     code = (
         "from vnet.errors import TransportError\n"
         "from vnet.transport import session\n"

@@ -17,7 +17,7 @@ from vnet.errors import ScenarioError
 
 
 def refusal(path: Path, origin_deg: tuple[float, float] | None = None) -> str:
-    """What is said of a file: one line, which begins with its name; the rest is returned."""
+    """Return the error of a file without its name, with which it must begin."""
     with pytest.raises(ScenarioError) as refused:
         read_roads(path, origin_deg)
     text = str(refused.value)
@@ -58,7 +58,7 @@ def test_a_file_that_is_not_there(tmp_path: Path, ending: str) -> None:
     assert refusal(tmp_path / f"folder{ending}") == "not a file"
 
 
-def test_a_kind_that_nobody_knows(tmp_path: Path) -> None:
+def test_an_unknown_format(tmp_path: Path) -> None:
     assert "allowed are *.osm, " in refusal(write(tmp_path, "town.shp", "x"))
     with pytest.raises(ScenarioError, match=r"allowed are \*.geojson"):
         write_roads(read_roads(write(tmp_path, "t.geojson", maps.geojson())), tmp_path / "town.osm")
@@ -97,10 +97,10 @@ def test_a_map_of_more_points_than_are_taken(tmp_path: Path, monkeypatch: pytest
 # OpenStreetMap.
 
 
-def node(place: str) -> str:
-    """The town, whose first node is at `place`."""
+def node(coordinates: str) -> str:
+    """The town, whose first node has these `coordinates`."""
     first, rest = maps.osm_xml().split('<node id="1" ')
-    return f'{first}<node id="1" {place} version="1"/>{rest.partition("/>")[2]}'
+    return f'{first}<node id="1" {coordinates} version="1"/>{rest.partition("/>")[2]}'
 
 
 BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]>'
@@ -120,7 +120,7 @@ BAD_OSM = {
     "metres": (node('lat="4682000" lon="271000"'), "line 3: wrong format for coordinate: '4682000'"),
     "a node of the other side": (node('lat="-83.74" lon="42.28"'), "way 10: 9,341 km from the origin"),
     "a node at 0°, 0°": (node('lat="0" lon="0"'), "way 10: 5,146 km from the origin"),
-    "no place": (node(""), "way 10: node 1 is not in the file, or not on the earth"),
+    "no coordinates": (node(""), "way 10: node 1 is not in the file, or not on the earth"),
     "entities": (maps.osm_xml().replace("<osm ", BOMB + "<osm "), "XML entities are not"),
     "text that is not closed": (maps.osm_xml().replace("</osm>", ""), ""),
     "a network of SUMO": (maps.sumo_net(), ""),
@@ -221,7 +221,10 @@ BAD_SUMO = {
     ),
     "a shape of text": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 a,b"')), "line 21: lane e_0: shape: 'a,b'"),
     "not a number": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 nan,3"')), "line 21: lane e_0: shape: 'nan,3'"),
-    "an infinite place": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 inf,3"')), "line 21: lane e_0: shape"),
+    "an infinite x": (
+        maps.sumo_net(more=BAD_LANE.format('shape="1,2 inf,3"')),
+        "line 21: lane e_0: shape",
+    ),
     "one coordinate": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3"')), "line 21: lane e_0: shape: '3'"),
     "a width": (maps.sumo_net(more=BAD_LANE.format('shape="1,2 3,4" width="-1"')), "line 21: width = '-1'"),
     "no length": (
@@ -349,7 +352,7 @@ def test_arrays_that_are_not_what_they_say(tmp_path: Path, write_member: Callabl
     assert refusal(tmp_path / "town.npz").startswith("not an NPZ file: ")
 
 
-def test_geojson_of_a_map_that_is_nowhere(tmp_path: Path) -> None:
+def test_geojson_of_a_map_without_projection(tmp_path: Path) -> None:
     roads = read_roads(write(tmp_path, "town.net.xml", maps.sumo_net()))
     with pytest.raises(ScenarioError, match="the projection of this map is unknown"):
         write_roads(roads, tmp_path / "town.geojson")

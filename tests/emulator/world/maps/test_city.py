@@ -90,7 +90,7 @@ def test_vehicles_keep_to_their_lanes(city: Roads) -> None:
     place, heading = motion.position_m[there], motion.heading_rad[there]
     row, segment, distance = lanes.near(place, heading, np.full(len(place), 20.0))
     first = np.flatnonzero(np.diff(row, prepend=-1))
-    assert len(first) > 0.9 * len(place), "the others turn, or stand on parking lots"
+    assert len(first) > 0.9 * len(place), "the others turn, or are on parking lots"
     assert np.mean(distance[first] <= lanes.half_width_m[segment[first]] + 0.1) > 0.9
 
 
@@ -125,7 +125,7 @@ def test_people_drive_on_their_side_of_the_road_and_park_there(tmp_path: Path, s
     assert (np.abs(beside[parked]) > 6).all()
 
 
-def test_where_nobody_drives_it_is_said(city: Roads) -> None:
+def test_no_vehicle_is_present(city: Roads) -> None:
     with pytest.raises(ScenarioError, match="the city: no vehicle is present within 0 s"):
         drives(city, vehicles=3, periods=1)
 
@@ -137,15 +137,15 @@ def write_graph(path: Path, node_m: Sequence[tuple[float, float]], edges: list[t
 
 
 def test_one_road_is_driven_once(tmp_path: Path) -> None:
-    """At its end there is nowhere to go without turning round."""
+    """A street whose end can be left only by a U-turn."""
     roads = write_graph(tmp_path / "r.npz", [(0, 0), (800, 0)], [(0, 1), (1, 0)])
     motion = drives(roads, vehicles=5)
     assert (np.abs(motion.position_m[..., 1]) < 25)[np.isfinite(motion.position_m[..., 1])].all()
 
 
-def test_nobody_drives_where_there_is_no_way_back(tmp_path: Path) -> None:
+def test_roads_without_a_way_back_are_refused(tmp_path: Path) -> None:
     roads = write_graph(tmp_path / "r.npz", [(0, 0), (500, 0), (900, 50)], [(0, 1), (1, 2)])
-    with pytest.raises(ScenarioError, match="the city: no two places on its roads between which one can drive"):
+    with pytest.raises(ScenarioError, match="the city: no two points of its roads can be reached from each other"):
         drives(roads)
 
 

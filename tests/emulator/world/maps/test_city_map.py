@@ -97,7 +97,7 @@ def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Pat
 
 
 def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> None:
-    """The next one has been filtering beside it, and goes on; who comes later does not take over."""
+    """The next process has run a filter too, and continues; one that starts later does not take over."""
     courses: dict[str, list[Stay]] = {
         "a": [(3.0, 12.0, along(-150, 12, -RIGHT_M))],
         "b": [(0, 8.0, along(150, -11, RIGHT_M))],
@@ -115,7 +115,7 @@ def test_the_filter_of_all_outlives_the_vehicle_that_runs_it(tmp_path: Path) -> 
     before = error[left - 3]
     assert before is not None and before < 1.5
     after = [value for value in error[left : left + 10] if value is not None]
-    assert len(after) == 10 and max(after) < 1.5, "it does not begin anew from three metres"
+    assert len(after) == 10 and max(after) < 1.5, "it does not start again at three metres"
 
 
 def test_a_map_of_somewhere_else_is_refused(tmp_path: Path) -> None:

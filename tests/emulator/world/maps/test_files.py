@@ -39,7 +39,7 @@ def write_town(folder: Path, kind: str) -> Path:
 
 
 def directed(roads: Roads) -> dict[tuple[tuple[int, ...], tuple[int, ...]], int]:
-    """How many lanes lead straight from one place to another, places by the whole decimetre."""
+    """Return the number of lanes between points, which are rounded to decimetres."""
     found = {}
     for road in range(len(roads)):
         places = roads.node_m[roads.node[roads.first[road] : roads.first[road + 1]]]
@@ -88,7 +88,7 @@ def test_metres_start_in_the_middle_unless_an_origin_is_given(tmp_path: Path, ki
 
 
 def one_way_road(folder: Path, **tags: str) -> Roads:
-    """What is made of a way from west to east with these tags."""
+    """Return the road of a way from west to east with these tags."""
     return read_roads(write(folder, "one.osm", maps.osm_xml({10: ((1, 2), tags)})), ORIGIN)
 
 
@@ -270,7 +270,7 @@ def test_a_map_comes_back_from_a_file_as_it_went(tmp_path: Path, kind: str) -> N
 
 
 def described(roads: Roads) -> list[tuple[Any, ...]]:
-    """Where the lanes of a map begin, and what they are."""
+    """Return the first points and the attributes of a map's lanes."""
     lanes = roads.lane_map()
     place = lanes.point_m.round(2).tolist()
     width, kind = lanes.half_width_m.round(6).tolist(), lanes.kind.tolist()

@@ -1,4 +1,4 @@
-"""From roads to lanes: sides, widths, bends, and which parts of a lane are left out."""
+"""Conversion of roads to lanes: sides, widths, curves, and parts of a lane that are dropped."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def roads(*lines: Any) -> Roads:
 
 
 def ends(found: Any, lane: int) -> list[tuple[float, ...]]:
-    """Where a lane's segments begin, and where its last one ends."""
+    """Return the first points of a lane's segments, and the end of the last."""
     of_lane = np.flatnonzero(found.lane == lane)
     end = found.point_m[of_lane[-1:]] + found.length_m[of_lane[-1:], None] * found.direction[of_lane[-1:]]
     return [tuple(point) for point in np.vstack([found.point_m[of_lane], end]).round(6).tolist()]
@@ -65,7 +65,7 @@ def test_a_hairpin_leaves_no_segment_that_runs_backwards() -> None:
     assert (found.heading_rad < 2 * np.pi).all()
 
 
-def test_points_at_one_place_make_no_segment() -> None:
+def test_equal_points_make_no_segment() -> None:
     builder = RoadsBuilder("town")
     points = [(1, (0.0, 0.0)), (2, (50.0, 0.0)), (3, (50.0, 0.0)), (4, (100.0, 0.0))]
     builder.add("road", points, 0, (1, 0), 3.0)

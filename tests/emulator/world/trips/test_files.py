@@ -1,4 +1,4 @@
-"""Files of trips: what each reader reads, and that a wrong file is refused in one line that names its place."""
+"""Files of trips: the readers, and refusals in one line that names the row or line."""
 
 import math
 from pathlib import Path
@@ -57,7 +57,7 @@ def world_of(path: Path, duration_s: float = 2.0, rate_hz: float = 10.0, **netwo
 
 
 def refusal(path: Path, **network: Any) -> str:
-    """What is said of a file that cannot be used: one line, which begins with its name."""
+    """Return the error of a bad file without its name, with which it must begin."""
     with pytest.raises(ScenarioError) as caught:
         world_of(path, **network)
     text = str(caught.value)
@@ -237,7 +237,7 @@ def test_other_files_are_refused_by_their_name(tmp_path: Path) -> None:
 def test_a_file_without_end_in_sight_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(samples_module, "MOST_SAMPLES", 5)
     path = write(tmp_path, "t.csv", HEADER + "".join(f"a,{time},{time},0\n" for time in range(9)))
-    assert "more than 5 samples; with network.start_s" in refusal(path)
+    assert "more than 5 samples; set network.start_s" in refusal(path)
     assert world_of(path, duration_s=1.0, start_s=0.0, longest_gap_s=2.0).node_ids == ("a",)
 
 

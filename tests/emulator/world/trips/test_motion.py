@@ -1,4 +1,4 @@
-"""What of trips is believed, and where that puts vehicles: stands, held samples, jumps, gaps, headings."""
+"""Cleaning of recorded trips, and the motion: standing, held positions, jumps, gaps, headings."""
 
 import math
 
@@ -35,7 +35,7 @@ def x_of(course: Motion, vehicle: int = 0) -> np.ndarray:
 
 
 def there(course: Motion, vehicle: int = 0) -> tuple[float, float]:
-    """From when until when, in seconds, a vehicle is there."""
+    """Return the first and the last time, in seconds, at which a vehicle is present."""
     periods = np.flatnonzero(np.isfinite(x_of(course, vehicle)))
     assert len(periods) == periods[-1] - periods[0] + 1, "without a break"
     return periods[0] / 10, periods[-1] / 10
@@ -52,7 +52,7 @@ def test_samples_that_are_repeated_to_reach_a_rate_are_not_stands() -> None:
 
 
 def test_a_receiver_that_held_its_position_is_bridged_and_the_jump_at_its_end_is_a_drive() -> None:
-    """As in the Ann Arbor trips: 5.7 s at one place, and 130 m further on within the next 0.3 s."""
+    """Like an Ann Arbor trip: 5.7 s at one position, and 130 m further on within the next 0.3 s."""
     time_s = np.arange(0, 20, 0.1)
     true_m = 22 * time_s
     said_m = np.where((time_s > 5) & (time_s < 10.75), 22 * 5.0, true_m)
@@ -109,7 +109,7 @@ def test_a_jump_too_far_for_the_longest_gap_is_leaving_and_entering() -> None:
     assert gone[-1] == pytest.approx(19.9, abs=0.11), "it is away for the longest gap"
 
 
-def test_what_is_mostly_jumps_is_no_trip() -> None:
+def test_a_trip_of_mostly_jumps_is_refused() -> None:
     rng = np.random.default_rng(1)
     with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: check units"):
         drive(trip(np.arange(100) / 10, rng.uniform(0, 1e4, 100)))
@@ -162,7 +162,7 @@ def test_the_run_begins_where_it_is_told_to() -> None:
     assert x_of(course)[:100] == pytest.approx(50 + np.arange(100) / 10)
 
 
-def test_who_is_there_for_less_than_a_second_takes_no_part() -> None:
+def test_a_vehicle_present_for_less_than_a_second_takes_no_part() -> None:
     course = drive(trip([0, 10], [0, 10]), trip([4, 4.8], [0, 1], name="b"), trip([9.5, 20], [0, 9], name="c"))
     assert course.node_ids == ("a",)
     with pytest.raises(ScenarioError, match="no vehicle is present for 1 s of the 10 s from 0 s"):
