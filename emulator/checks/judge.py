@@ -129,7 +129,7 @@ def _name(check: Check) -> str:
 
 
 def _downgrade_if_overloaded(checks: list[CheckResult]) -> list[CheckResult]:
-    """Where the machine did not keep up, what is to happen in time is unknown rather than broken."""
+    """Turn what is to happen in time from invalid to unknown where the machine did not keep up."""
     if all(check.verdict is Verdict.VALID for check in checks if check.name in OF_THE_MACHINE):
         return checks
     return [

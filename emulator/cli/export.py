@@ -46,7 +46,7 @@ LINK_COLUMNS = {
 
 
 class Format(StrEnum):
-    """What a run can be exported to."""
+    """Formats to which a run can be exported."""
 
     PCAPNG = "pcapng"
     MCAP = "mcap"

@@ -1,4 +1,4 @@
-"""`vnet render` and `vnet play`: a run that is over, drawn anew from its files alone."""
+"""`vnet render` and `vnet play`: a finished run, drawn from its files alone."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def view(
 
 
 def _is_on(run: Path) -> bool:
-    """Whether a run is going on in this folder."""
+    """Return whether a run is going on in this folder."""
     way = read_control_file(run)
     if way is None:
         return False

@@ -82,7 +82,7 @@ class RunFiles:
 
     @cached_property
     def record(self) -> Record:
-        """What verdict.json says. A format that this vnet does not know is refused."""
+        """Contents of verdict.json. A format that this vnet does not know is refused."""
         path = self.folder / VERDICT_FILE
         record = self._read(path, lambda: read_record(path))
         if not 1 <= record.format <= FORMAT:
@@ -100,7 +100,7 @@ class RunFiles:
 
     @cached_property
     def world(self) -> RecordedWorld:
-        """What world.npz holds. Folders of format 1 have none: their input files are needed."""
+        """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
@@ -154,12 +154,12 @@ class RunFiles:
 
     @property
     def has_record(self) -> bool:
-        """Whether there is a verdict.json: the run has come to its end."""
+        """True if there is a verdict.json: the run has come to its end."""
         return (self.folder / VERDICT_FILE).exists()
 
     @property
     def when(self) -> datetime:
-        """When the run ended, or was last heard of, in local time. Raises VnetError if the folder is gone."""
+        """Local time at which the run ended, or last wrote something. Raises VnetError if the folder is gone."""
         for path in (self.folder / VERDICT_FILE, self.folder / EVENTS_FILE, self.folder):
             try:
                 return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
@@ -168,7 +168,7 @@ class RunFiles:
         raise VnetError(f"{self.folder}: no such folder")
 
     def _read(self, path: Path, read: Callable[[], T]) -> T:
-        """What `read` makes of a file; what goes wrong is told in one line."""
+        """Return what `read` makes of a file; VnetError says in one line what is wrong with it."""
         try:
             return read()
         except FileNotFoundError:
