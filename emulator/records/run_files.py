@@ -59,6 +59,10 @@ Columns = Mapping[str, Collection[str]]
 T = TypeVar("T")
 
 
+class LaterFormatError(VnetError):
+    """A folder is of a format that a later vnet writes."""
+
+
 class RunFiles:
     """A run's folder. Each file is read when it is first asked for; VnetError says what is wrong with it.
 
@@ -86,11 +90,20 @@ class RunFiles:
         path = self.folder / VERDICT_FILE
         record = self._read(path, lambda: read_record(path))
         if not 1 <= record.format <= FORMAT:
-            raise VnetError(
+            raise LaterFormatError(
                 f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
                 f"reads 1 to {FORMAT}"
             )
         return replace(record, reproduce=_from_here(record.reproduce, self.folder))
+
+    def _refuse_later_format(self) -> None:
+        """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""
+        try:
+            _ = self.record
+        except LaterFormatError:
+            raise
+        except VnetError:
+            return
 
     @cached_property
     def events(self) -> list[Event]:
@@ -102,6 +115,7 @@ class RunFiles:
     def world(self) -> RecordedWorld:
         """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
+        self._refuse_later_format()
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
         if self.record.format > 1:
@@ -181,6 +195,7 @@ class RunFiles:
     def _table(self, name: str, left_out: Collection[str] = ()) -> pa.Table:
         """A table with the types that it must have."""
         path, schema = self.folder / name, TABLES[name]
+        self._refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
             raise VnetError(f"{self.folder}: not a finished run's folder: there is no {name} in it")
