@@ -1,4 +1,4 @@
-"""The end of a run: its tables, its verdict, and how to have it again."""
+"""The end of a run: its tables, its verdict, and the command that reproduces it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from emulator.records.verdicts import Finding, unknown
 
 
 def _start_up_s(emulation: Emulation) -> float | None:
-    """How long the processes took to start and join; None if they never did."""
+    """Time in s that the processes took to start and join; None if they never did."""
     started = [event for event in emulation.folder.events if event.kind == "started"]
     return float(started[0].details["start_up_s"]) if started else None
 
@@ -85,7 +85,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
 
 
 def _busy(emulation: Emulation) -> pa.Table | None:
-    """How busy the medium was; None where senders share none."""
+    """Table of channel busy ratios; None where there is no MAC."""
     if emulation.scenario.radio.mac is None:
         return None
     windows = emulation.engine.busy_ratios(emulation.emulated_ns)
@@ -104,7 +104,7 @@ def _judged(judgement: Judgement) -> dict[str, Any]:
 def run_again(
     emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str, options: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Have a concluded run once more, in processes of its own, and add to its verdict how the two compare.
+    """Repeat a concluded run in processes of its own, and add to its verdict how the two compare.
 
     Returns the new contents of verdict.json.
     """

@@ -1,4 +1,4 @@
-"""What nodes reported in a period, as arrays: the same for a run that is on, and for one that is read again."""
+"""Reports of one period as arrays: the same for a run that is on, and for one that is read from its folder."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ WEIGHT = "weight."
 
 @dataclass(frozen=True)
 class Beliefs:
-    """What nodes reported in a period: arrays (n, 2) and (n, 4), NaN where a node said nothing; and by node the
-    numbers of its cloud, point by point, and the weights (n,) of its fusion.
+    """Reports of one period: arrays (n, 2) and (n, 4), NaN where a node reported nothing.
+
+    By node, also the numbers of its cloud, point by point, and the weights (n,) of its fusion.
     """
 
     estimate_m: Array

@@ -1,4 +1,4 @@
-"""How busy each vehicle found the medium: the share of the time in which it sensed it taken, in 100 ms."""
+"""Channel busy ratio (CBR) of each vehicle: the share of each 100 ms in which it sensed the medium busy."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ def _source(module: str, own: str) -> Path | None:
 
 
 def _find(module: str) -> ModuleSpec | None:
-    """Where a module is, found without importing it or its packages; as programs are: beside here, too."""
+    """Find a module without importing it or its packages; the current folder counts, as it does for programs."""
     parent, _, _ = module.rpartition(".")
     try:
         if not parent:
@@ -132,7 +132,7 @@ def _find(module: str) -> ModuleSpec | None:
 
 
 def _is_installed(path: Path) -> bool:
-    """Whether a file is of the standard library, or was installed."""
+    """Return whether a file is of the standard library, or was installed."""
     return any(path.is_relative_to(folder) for folder in _installed_folders())
 
 
@@ -142,7 +142,7 @@ def _installed_folders() -> tuple[Path, ...]:
 
 
 def _imported(module: str, path: Path) -> Iterator[str]:
-    """What a source imports, by absolute name; a name that is imported from a package may be a module, or not."""
+    """Names that a source imports, absolute; a name that is imported from a package may be a module, or not."""
     try:
         tree = ast.parse(path.read_bytes())
     except (OSError, SyntaxError, ValueError):

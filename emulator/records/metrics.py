@@ -278,7 +278,7 @@ def anees_band(samples: int) -> tuple[float, float]:
 
 
 def _is_not_finite(report: Report) -> bool:
-    """Whether any number of a report is NaN or infinite."""
+    """Return whether any number of a report is NaN or infinite."""
     numbers = [*(report.estimate_m or ()), *(report.covariance_m2 or ())]
     for value in report.values.values():
         numbers += value if isinstance(value, list) else [value]

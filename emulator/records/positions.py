@@ -1,4 +1,4 @@
-"""Where vehicles were when a frame was sent, and who was then in range of whom."""
+"""Positions of vehicles when a frame was sent, and who was then in range of whom."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Places:
         self._connectivity = connectivity
 
     def index(self, time_ns: IntArray) -> IntArray:
-        """Which of the K positions count at these instants."""
+        """Index of the position, of the K, at each of these instants."""
         return np.asarray(time_ns // self._period_ns if self._moves else np.zeros_like(time_ns))
 
     def known(self, time_ns: IntArray) -> Mask:
-        """At which instants positions are known: a run may end within a period, of which no states are kept."""
+        """Mask of the instants at which positions are known: those of the periods that the run completed."""
         return np.asarray(self.index(time_ns) < len(self._position_m))
 
     def present(self) -> Mask:
@@ -54,7 +54,7 @@ class Places:
         return self._connectivity.power_mw(self.position_m(index), self.distance_m(index))
 
     def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
-        """How far the two of each pair (n,) are apart at these instants; NaN where that is not known."""
+        """Distances (n,) in m from senders to receivers at these instants; NaN where they are not known."""
         there = self.known(time_ns)
         index, sender, receiver = self.index(time_ns)[there], sender[there], receiver[there]
         offset = self._position_m[index, sender] - self._position_m[index, receiver]
@@ -63,7 +63,7 @@ class Places:
         return distance_m
 
     def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Mask:
-        """Which pairs of vehicles are in range at these instants; none where that is not known."""
+        """Mask (n,) of the senders and receivers in range at these instants; False where that is not known."""
         return np.asarray(self._of_pairs(self.in_range, sender, receiver, time_ns) > 0)
 
     def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
@@ -98,7 +98,7 @@ class Places:
         return np.array(out, np.intp).reshape(shape), np.array(into, np.intp).reshape(shape)
 
     def receivers_in_range(self, sender: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
-        """How many were in range of each of these senders at these instants; -1 where that is not known."""
+        """Number of vehicles in range of each of these senders at these instants; -1 where that is not known."""
         count = np.full(len(sender), -1, dtype=np.intp)
         there = self.known(time_ns)
         count[there] = self._degrees[0][self.index(time_ns)[there], sender[there]]
@@ -115,7 +115,7 @@ class Places:
 
     @property
     def most_in_range(self) -> int:
-        """How many senders any receiver ever had in range."""
+        """Largest number of senders that any receiver ever had in range."""
         return int(self._degrees[1].max(initial=0))
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What users ask of a radio: delivery ratio, reception against distance, inter-reception time, age of information,
+"""Radio metrics of a run: packet delivery ratio, also against distance, inter-packet gap, age of information,
 latency; by link (a sender and a receiver), by vehicle and over all, from a run's trace and states.
 
 A pair is a frame, as its sender handed it over, and a receiver in range that was up. What faults send again, or let

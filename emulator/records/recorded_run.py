@@ -43,7 +43,7 @@ class Span:
     planned: bool
 
     def holds(self, time_ns: IntArray) -> Mask:
-        """At which of these instants it is true."""
+        """Mask of the instants within the span."""
         return np.asarray((self.start_ns <= time_ns) & (time_ns < self.end_ns))
 
 
@@ -67,18 +67,18 @@ class RecordedRun(RecordedTables):
 
     @property
     def guard_ns(self) -> int:
-        """How close to a change of faults nothing can be said."""
+        """Time before and after a change of faults in which nothing can be said."""
         return REALTIME_GUARD_NS if self.scenario.run.pacing == "realtime" else 0
 
     @cached_property
     def closed_ns(self) -> int:
-        """When emulated time came to its end."""
+        """Instant at which emulated time ended."""
         cut = [event.time_ns for event in self.event("interrupted", "stalled")]
         return min([self.scenario.duration_ns, *cut])
 
     @cached_property
     def deaths_ns(self) -> dict[int, int]:
-        """When nodes ended by themselves, by their numbers: they stay down."""
+        """Instants at which nodes ended by themselves, by their numbers: they stay down."""
         deaths: dict[int, int] = {}
         for event in self.event(*ENDINGS):
             if event.node is not None:
@@ -88,7 +88,7 @@ class RecordedRun(RecordedTables):
 
     @cached_property
     def down(self) -> list[Span]:
-        """When nodes were down: taken by a fault until it ended, not in the network, or for good."""
+        """Spans in which nodes were down: taken by a fault until it ended, not in the network, or for good."""
         spans = []
         for planned in self.plan:
             ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
@@ -100,7 +100,7 @@ class RecordedRun(RecordedTables):
         return [*spans, *self._absences(), *deaths]
 
     def _absences(self) -> Iterator[Span]:
-        """When nodes were not in the network, as the events tell it."""
+        """Spans in which nodes were not in the network, as the events tell it."""
         if not self.moves or not self.node_ids:
             return
         since = dict.fromkeys(np.flatnonzero(~self.places.present()[0]).tolist(), 0)
@@ -114,14 +114,14 @@ class RecordedRun(RecordedTables):
             yield Span(node, start_ns, NEVER_NS, True)
 
     def _back_ns(self, node: int, end_ns: int) -> int:
-        """When a node was up again after a fault: at its end, or in real time as soon as its process was there."""
+        """Instant at which a node was up again after a fault: its end, or in real time its process's return."""
         if self.scenario.run.pacing == "realtime":
             there = (e.time_ns for e in self.event("restarted", "entered") if e.node == self.node_ids[node])
             return min((time_ns for time_ns in there if time_ns >= end_ns), default=NEVER_NS)
         return end_ns if end_ns < self.closed_ns else NEVER_NS
 
     def is_down(self, node: NDArray[np.intp], time_ns: IntArray) -> Mask:
-        """Which of these nodes are down at these instants."""
+        """Mask of these nodes that are down at these instants."""
         nodes = np.array([span.node for span in self.down], dtype=np.intp)
         edges_ns = np.array([(span.start_ns, span.end_ns) for span in self.down], dtype=np.int64).reshape(-1, 2)
         down = np.zeros(len(node), dtype=bool)
@@ -157,7 +157,7 @@ class RecordedRun(RecordedTables):
         return np.asarray(code[column.indices.to_numpy()] if len(column) else np.zeros(0), dtype=np.int64)
 
     def caused_by(self, *kinds: str) -> Mask:
-        """Which rows name a fault of one of these kinds."""
+        """Mask of the rows that name a fault of one of these kinds."""
         return np.isin(self.cause, [planned.number for planned in self.plan if planned.fault.kind in kinds])
 
     @cached_property
@@ -173,7 +173,7 @@ class RecordedRun(RecordedTables):
         return Nodes(self.node_ids, position_m, degree)
 
     def acting(self, planned: PlannedFault, time_ns: IntArray, widen_ns: int = 0) -> Mask:
-        """At which instants a fault acts; `widen_ns` before its start and after its end as well."""
+        """Mask of the instants at which a fault acts, or is less than `widen_ns` away."""
         return np.asarray((planned.start_ns - widen_ns <= time_ns) & (time_ns < planned.end_ns + widen_ns))
 
     def struck(self, planned: PlannedFault) -> Mask:
@@ -212,7 +212,7 @@ class RecordedRun(RecordedTables):
                 yield off_ns, min(back_ns, end_ns), one[:, None] | one[None, :]
 
     def reached(self, planned: PlannedFault, widen_ns: int = 0) -> Mask:
-        """Which rows of the trace were sent on a link while a fault acted there; those near a change count as well,
+        """Mask of the rows that were sent on a link while a fault acted there; those near a change count as well,
         or not if `widen_ns` is negative.
         """
         late, early = self._reached(planned, widen_ns), self._reached(planned, -widen_ns)

@@ -69,19 +69,19 @@ class RecordedTables:
 
     @property
     def moves(self) -> bool:
-        """Whether vehicles drive, enter and leave; else they stand but for their place in the lane."""
+        """True if vehicles drive, enter and leave; else only their lateral offsets change."""
         return self.scenario.network.moves
 
     @cached_property
     def places(self) -> Places:
-        """Where the vehicles were. Raises ScenarioError if the scenario's links do not fit them."""
+        """Positions of the vehicles. Raises ScenarioError if the scenario's links do not fit them."""
         connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self._links())
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
         return Places(some, self.moves, self.scenario.period_ns, connectivity)
 
     def _links(self) -> Mask | None:
-        """Who (row) hears whom (column), (N, N), where the scenario says so; files are not read again."""
+        """Links (N, N), who (row) hears whom (column), where the scenario gives them; no input file is read."""
         radio, count = self.scenario.radio, len(self.node_ids)
         if not isinstance(radio.links, Path):
             return load_links(radio, count)
@@ -110,42 +110,42 @@ class RecordedTables:
 
     @cached_property
     def sender(self) -> NDArray[np.intp]:
-        """Who sent each row's frame."""
+        """Sender of each row's frame."""
         return self.nodes("sender")
 
     @cached_property
     def receiver(self) -> NDArray[np.intp]:
-        """Who was to hear it."""
+        """Receiver of each row."""
         return self.nodes("receiver")
 
     @cached_property
     def sent_ns(self) -> IntArray:
-        """When it was sent."""
+        """Instant at which each row's frame was sent."""
         return self.column("sent_ns")
 
     @cached_property
     def arrival_ns(self) -> IntArray:
-        """When it arrived; -1 where it did not."""
+        """Instant of each row's arrival; -1 where the frame did not arrive."""
         return self.column("arrival_ns")
 
     @cached_property
     def shares_air(self) -> bool:
-        """Whether the trace tells when frames were on air."""
+        """True if the trace tells when frames were on air."""
         return "on_air_ns" in self.trace.column_names
 
     @cached_property
     def on_air_ns(self) -> IntArray:
-        """When its transmission began; -1 where it never did."""
+        """Begin of each row's transmission; -1 where it never began."""
         return self.column("on_air_ns")
 
     @cached_property
     def airtime_ns(self) -> IntArray:
-        """How long its transmission takes, but for throttles."""
+        """Duration of each row's transmission, but for throttles."""
         return airtimes_ns(self.scenario.radio, self.column("size_bytes"))
 
     @cached_property
     def seq(self) -> IntArray:
-        """Its number among its sender's."""
+        """Sequence number of each row's frame."""
         return self.column("seq")
 
     @cached_property
@@ -160,22 +160,22 @@ class RecordedTables:
 
     @cached_property
     def arrived(self) -> Mask:
-        """Whether it came as far as its receiver."""
+        """Mask of the rows whose frame came as far as its receiver."""
         return self.outcome_is(*ARRIVED)
 
     def outcome_is(self, *names: str) -> Mask:
-        """Which rows have one of these outcomes."""
+        """Mask of the rows with one of these outcomes."""
         mask = pc.is_in(self.trace["outcome"].cast(pa.string()), pa.array(names))
         return np.asarray(mask.to_numpy(zero_copy_only=False), dtype=bool)
 
     @cached_property
     def placed(self) -> Mask:
-        """Whether it is known where the vehicles were when a row's frame was sent."""
+        """Mask of the rows for whose instant of sending positions are known."""
         return self.places.known(self.sent_ns)
 
     @cached_property
     def in_range(self) -> Mask:
-        """Whether a row's sender and receiver were then in range of each other, as far as that is known."""
+        """Mask of the rows whose receiver was known to be in range of the sender."""
         return self.places.pairs_in_range(self.sender, self.receiver, self.sent_ns)
 
     @cached_property
@@ -215,7 +215,7 @@ class RecordedTables:
 
     @property
     def periods(self) -> int:
-        """How many periods were kept."""
+        """Number of periods that were kept."""
         return int(self._place[0].max(initial=-1)) + 1
 
     def vectors(self, name: str) -> Array:
@@ -247,5 +247,5 @@ class RecordedTables:
         return reported
 
     def period_starts_ns(self) -> IntArray:
-        """When each period starts."""
+        """Instant at which each period starts."""
         return np.arange(self.periods, dtype=np.int64) * self.scenario.period_ns

@@ -1,4 +1,4 @@
-"""What readers of a run need of its world beside the states, so that no input file has to be there: `world.npz`."""
+"""The world as a run's folder keeps it beside the states, so that no input file has to be there: `world.npz`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class RecordedWorld:
 
     @classmethod
     def of(cls, world: World) -> RecordedWorld:
-        """What is to be recorded of a world."""
+        """Take from a world what is to be recorded."""
         lanes, course_m = world.lane_map, world.course_m
         area_m = np.array([np.nanmin(course_m, axis=(0, 1)), np.nanmax(course_m, axis=(0, 1))])
         return cls(
@@ -81,7 +81,7 @@ class RecordedWorld:
 
 
 def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
-    """Raises VnetError unless the arrays have their kinds and shapes."""
+    """Raise VnetError unless the arrays have their kinds and shapes."""
     sizes = {"2": 2, "n": len(arrays.get("node_ids", ())), "l": len(arrays.get("lane_heading_rad", ()))}
     for name, (kind, dimensions) in ARRAYS.items():
         if name not in arrays:

@@ -59,6 +59,10 @@ Columns = Mapping[str, Collection[str]]
 T = TypeVar("T")
 
 
+class LaterFormatError(VnetError):
+    """A folder is of a format that a later vnet writes."""
+
+
 class RunFiles:
     """A run's folder. Each file is read when it is first asked for; VnetError says what is wrong with it.
 
@@ -82,15 +86,24 @@ class RunFiles:
 
     @cached_property
     def record(self) -> Record:
-        """What verdict.json says. A format that this vnet does not know is refused."""
+        """Contents of verdict.json. A format that this vnet does not know is refused."""
         path = self.folder / VERDICT_FILE
         record = self._read(path, lambda: read_record(path))
         if not 1 <= record.format <= FORMAT:
-            raise VnetError(
+            raise LaterFormatError(
                 f"{path}: format {record.format}, of vnet {printable(record.versions.get('vnet', '?'))}; this vnet "
                 f"reads 1 to {FORMAT}"
             )
         return replace(record, reproduce=_from_here(record.reproduce, self.folder))
+
+    def _refuse_later_format(self) -> None:
+        """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""
+        try:
+            _ = self.record
+        except LaterFormatError:
+            raise
+        except VnetError:
+            return
 
     @cached_property
     def events(self) -> list[Event]:
@@ -100,8 +113,9 @@ class RunFiles:
 
     @cached_property
     def world(self) -> RecordedWorld:
-        """What world.npz holds. Folders of format 1 have none: their input files are needed."""
+        """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
+        self._refuse_later_format()
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
         if self.record.format > 1:
@@ -154,12 +168,12 @@ class RunFiles:
 
     @property
     def has_record(self) -> bool:
-        """Whether there is a verdict.json: the run has come to its end."""
+        """True if there is a verdict.json: the run has come to its end."""
         return (self.folder / VERDICT_FILE).exists()
 
     @property
     def when(self) -> datetime:
-        """When the run ended, or was last heard of, in local time. Raises VnetError if the folder is gone."""
+        """Local time at which the run ended, or last wrote something. Raises VnetError if the folder is gone."""
         for path in (self.folder / VERDICT_FILE, self.folder / EVENTS_FILE, self.folder):
             try:
                 return datetime.fromtimestamp(path.stat().st_mtime).astimezone()
@@ -168,7 +182,7 @@ class RunFiles:
         raise VnetError(f"{self.folder}: no such folder")
 
     def _read(self, path: Path, read: Callable[[], T]) -> T:
-        """What `read` makes of a file; what goes wrong is told in one line."""
+        """Return what `read` makes of a file; VnetError says in one line what is wrong with it."""
         try:
             return read()
         except FileNotFoundError:
@@ -181,6 +195,7 @@ class RunFiles:
     def _table(self, name: str, left_out: Collection[str] = ()) -> pa.Table:
         """A table with the types that it must have."""
         path, schema = self.folder / name, TABLES[name]
+        self._refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
             raise VnetError(f"{self.folder}: not a finished run's folder: there is no {name} in it")

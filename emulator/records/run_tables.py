@@ -44,7 +44,7 @@ class TableFile:
         self._columns = [*columns, *(name for name in perhaps if name in self._file.schema_arrow.names)]
 
     def error(self, text: str) -> VnetError:
-        """What is wrong with the file."""
+        """Make the error that says what is wrong with the file."""
         return VnetError(f"{self.path}: {text}")
 
     def pieces(self, rows: int = ROWS_AT_ONCE) -> Iterator[pa.Table]:
@@ -55,7 +55,7 @@ class TableFile:
 
     @contextlib.contextmanager
     def sound(self) -> Iterator[None]:
-        """What fails in here is the file's fault."""
+        """Blame the file for what fails in here."""
         try:
             yield
         except (OSError, pa.ArrowException, ValueError) as error:
@@ -80,7 +80,7 @@ class TraceReader:
         self._ended = False
 
     def until(self, end_ns: int) -> NDArray[np.void]:
-        """What was sent before `end_ns` and not decided by the last time, as records of type `ROW`.
+        """Return what was sent before `end_ns` and not decided by the last time, as records of type `ROW`.
 
         Digests and causes are left out. Raises VnetError if the trace cannot be read or is no trace of this run.
         """

@@ -1,4 +1,4 @@
-"""What a run says of itself in `verdict.json`, read as a foreign file: typed and bounded."""
+"""The verdict of a run from `verdict.json`, read as a foreign file: typed and bounded."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Record:
 
     @property
     def in_range(self) -> int:
-        """How many pairs of a frame and a receiver in range there were."""
+        """Number of attempted receptions: one frame at one receiver in range."""
         return sum(count for outcome, count in self.frames_by_outcome.items() if outcome != "out_of_range")
 
     def share_of(self, outcome: str) -> float | None:

@@ -1,4 +1,4 @@
-"""What a check comes to: valid, invalid or unknown, in words, figures and offending rows."""
+"""The result of a check: valid, invalid or unknown, in words, figures and offending rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NO_FAULTS = "the scenario has no faults"
 
 
 class Verdict(StrEnum):
-    """What a check, or a run, comes to."""
+    """Verdict of a check, or of a run."""
 
     VALID = "valid"
     INVALID = "invalid"

@@ -108,7 +108,7 @@ class Source:
 
     @cached_property
     def end_s(self) -> float:
-        """When the run ended, or what is kept of it does; more than zero."""
+        """End of the run, or of what is kept of it, in s; more than zero."""
         if found := maybe(lambda: self.record.emulated_s):
             return found
         last_ns = max((event.time_ns for event in maybe(lambda: self.events) or ()), default=0)
@@ -116,7 +116,7 @@ class Source:
 
     @cached_property
     def spans(self) -> list[Span]:
-        """When faults acted, as the events say."""
+        """Spans in which faults acted, as the events say."""
         started: dict[str, float] = {}
         spans = []
         for event in maybe(lambda: self.events) or ():
@@ -134,7 +134,7 @@ class Source:
 
 
 def maybe(read: Callable[[], T]) -> T | None:
-    """What `read` returns, or None where it meets a VnetError."""
+    """Return what `read` returns, or None where it meets a VnetError."""
     try:
         return read()
     except VnetError:
@@ -142,7 +142,7 @@ def maybe(read: Callable[[], T]) -> T | None:
 
 
 def why_not(read: Callable[[], object]) -> str:
-    """Why `read` raises VnetError; "" where it does not."""
+    """Return why `read` raises VnetError; "" where it does not."""
     try:
         read()
     except VnetError as error:

@@ -91,7 +91,7 @@ class _Playback:
 
 
 class _Down:
-    """Who was down when."""
+    """Spans in which vehicles were down."""
 
     def __init__(self, recorded: RecordedRun) -> None:
         self._count = len(recorded.node_ids)
@@ -100,7 +100,7 @@ class _Down:
         self._end_ns = np.array([span.end_ns for span in recorded.down], dtype=np.int64)
 
     def at(self, time_ns: int) -> NDArray[np.bool_]:
-        """Who was down at an instant (n,)."""
+        """Mask (n,) of the vehicles that were down at an instant."""
         down = np.zeros(self._count, dtype=bool)
         down[self._node[(self._start_ns <= time_ns) & (time_ns < self._end_ns)]] = True
         return down

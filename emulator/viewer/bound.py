@@ -1,4 +1,4 @@
-"""The limit of cooperation: what one filter would find that heard every fix, at once and without loss.
+"""The hears-all bound: the error of one filter that hears every fix, at once and without loss.
 
 One particle filter for each connected component of the network, on the same fixes as the vehicles', with the
 constants of the world itself. No cooperation of vehicles that hear only each other can be expected to do better.
@@ -51,7 +51,7 @@ class HearsAllBound:
         )
         seeds = np.random.default_rng(scenario.run.seed).spawn(int(self._component.max()) + 1)
         self._filters = [Rbpf(config, lanes, seed) for seed in seeds]
-        self._begin_anew()
+        self._forget_fixes()
         self._next_ns: int | None = None
         self._last_ns = 0
 
@@ -76,7 +76,7 @@ class HearsAllBound:
         squares = np.sum(error_m**2, axis=1)[self._component]
         return float(np.sqrt(squares[reporting].mean()))
 
-    def _begin_anew(self) -> None:
+    def _forget_fixes(self) -> None:
         """Forget the fixes since the last step."""
         count = len(self._node_ids)
         self._fixes = np.zeros(count, dtype=int)
@@ -106,4 +106,4 @@ class HearsAllBound:
                     mean_m[n], covariance_m2[n], heading_rad, float(age_s[n])
                 )
             rbpf.step(elapsed_s, observations)
-        self._begin_anew()
+        self._forget_fixes()

@@ -12,6 +12,7 @@ from emulator.checks.judge import check_run
 from emulator.records import run_folder
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.stream.playback import messages
 from tests.emulator.checks.test_judge import run_scenario
 from tests.emulator.scenario.test_sumo import load as sumo_scenario
 from tests.emulator.scenario.test_sumo import sumo
@@ -168,8 +169,10 @@ def test_a_folder_of_a_later_format_is_refused(inputs: Path, tmp_path: Path) -> 
     run_scenario(tmp_path / "run", with_files(inputs))
     path = tmp_path / "run" / "verdict.json"
     path.write_text(path.read_text().replace('"format": 2', '"format": 3', 1))
-    with pytest.raises(VnetError, match=r"format 3, of vnet [\w.]+; this vnet reads 1 to 2"):
-        check_run(tmp_path / "run")
+    run = RecordedRun.open(tmp_path / "run")
+    for read in (lambda: check_run(run.folder), lambda: list(messages(run.folder)), lambda: run.states):
+        with pytest.raises(VnetError, match=r"format 3, of vnet [\w.]+; this vnet reads 1 to 2"):
+            read()
 
 
 # Who opens the files.
