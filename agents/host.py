@@ -50,7 +50,7 @@ class _Found:
 
 
 Item = tuple[bytes, int] | type[_Lost] | type[_Found]
-"""What Zenoh's threads queue: a message and when it came (monotonic ns), or how the emulator is."""
+"""Entry of the queue that Zenoh's threads fill: a message with its arrival (monotonic ns), or a state."""
 
 
 def run_agent(

@@ -53,7 +53,7 @@ def test_the_hooks_before_a_commit_are_the_linters_of_make() -> None:
 
 
 def test_every_package_that_is_installed_has_an_exact_version() -> None:
-    """Of the packages that `pyproject.toml` names; what those need is installed by `make` and listed with it."""
+    """Return the packages that `pyproject.toml` names; `make` installs and lists what those need."""
     pinned = re.findall(r"^([\w.-]+)==", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
     wanted = [*PROJECT["project"]["dependencies"]]
     for extra in PROJECT["project"]["optional-dependencies"].values():

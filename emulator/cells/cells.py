@@ -31,7 +31,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
-from emulator.records.atomic import whole, write_atomically
+from emulator.records.atomic import atomically, write_atomically
 from emulator.records.code_digest import digests_of, entries_of
 from emulator.records.divergence import first_divergences
 from emulator.records.run_folder import RunFolder
@@ -54,7 +54,7 @@ class Cell:
     scenario: Scenario
     from_s: float = 0.0
     keeps_states: bool = False
-    """Whether every vehicle's state in every period is kept as well."""
+    """True if every vehicle's state in every period is kept too."""
 
     @property
     def digest(self) -> str:
@@ -158,10 +158,10 @@ def run_cell(cell: Cell, store: Path, live: bool = False) -> None:
             event = broken[0]
             raise VnetError(f"cell {cell.labels}: {event.node} {event.kind}: {event.details.get('error', '')}")
     figures = measure(emulation, cell.from_s)
-    with whole(store / f"{cell.digest}.parquet") as part:
+    with atomically(store / f"{cell.digest}.parquet") as part:
         pq.write_table(emulation.metrics.metrics_table(), part)
     if cell.keeps_states:
-        with whole(_states_path(store, cell)) as part:
+        with atomically(_states_path(store, cell)) as part:
             pq.write_table(emulation.metrics.states_table(), part)
     write_atomically(_result_path(store, cell), json.dumps(figures))
 

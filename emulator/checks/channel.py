@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import binom
 
 from emulator.radio.outcomes import Outcome
-from emulator.records.recorded_run import ARRIVED, NEVER_NS, ON_AIR, RecordedRun
+from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.faults import StaleMessages
@@ -84,7 +84,7 @@ def _orphans(recorded: RecordedRun) -> Mask:
     """Copies that name no fault, or no original that was sent by then."""
     copies = recorded.copy > 0
     frame, index = np.unique(recorded.frame, return_inverse=True)
-    original_ns = np.full(len(frame), NEVER_NS)
+    original_ns = np.full(len(frame), END_OF_TIME_NS)
     np.minimum.at(original_ns, index[~copies], recorded.sent_ns[~copies])
     named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
@@ -168,7 +168,7 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
     judged = capped | recorded.outcome_is("fault", *ON_AIR)
     judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns)
     everybody = np.arange(len(recorded.node_ids))
-    edges = {0, NEVER_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
+    edges = {0, END_OF_TIME_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
     if recorded.moves:
         edges |= set(recorded.period_starts_ns().tolist())
     wrong = np.zeros(len(capped), dtype=bool)
@@ -278,7 +278,7 @@ def _replaced(recorded: RecordedRun) -> Mask:
     A sender's frames are remembered from when a fault first makes it misbehave.
     """
     replaced = np.zeros(len(recorded.trace), dtype=bool)
-    remembered_ns = np.full(len(recorded.node_ids), NEVER_NS)
+    remembered_ns = np.full(len(recorded.node_ids), END_OF_TIME_NS)
     for planned in recorded.plan:
         if isinstance(planned.fault, SenderFault):
             remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)

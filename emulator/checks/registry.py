@@ -75,9 +75,9 @@ class Check:
     name: str = ""
     without_positions: WithoutPositions = WithoutPositions.NOT_APPLICABLE
     realtime_sensitive: bool = False
-    """Whether a machine that did not keep up can make it invalid; the verdict is then unknown."""
+    """True if a machine that did not keep up can make it invalid; the verdict is then unknown."""
     of_machine: bool = False
-    """Whether it tells if the machine kept up."""
+    """True if the check itself tells whether the machine kept up."""
 
     def __post_init__(self) -> None:
         if not self.name:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.records.recorded_run import NEVER_NS, RecordedRun
+from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import ProcessFault
@@ -173,8 +173,8 @@ def _times_up(recorded: RecordedRun, node: int) -> list[tuple[int, int]]:
     for span in sorted((span for span in recorded.down if span.node == node), key=lambda span: span.start_ns):
         if span.start_ns > from_ns:
             times.append((from_ns, span.start_ns))
-        from_ns = max(from_ns, NEVER_NS if span.end_ns == NEVER_NS else span.end_ns + start_up_ns)
-    return [*times, (from_ns, NEVER_NS)] if from_ns < NEVER_NS else times
+        from_ns = max(from_ns, END_OF_TIME_NS if span.end_ns == END_OF_TIME_NS else span.end_ns + start_up_ns)
+    return [*times, (from_ns, END_OF_TIME_NS)] if from_ns < END_OF_TIME_NS else times
 
 
 def check_presence(recorded: RecordedRun) -> Finding:
@@ -223,7 +223,7 @@ def _is_told(recorded: RecordedRun, change: Change, told: set[Change]) -> bool:
         absent_at_first = not recorded.places.present()[0][recorded.number[node]]
         return last[0] == "left" if last else absent_at_first
     number = recorded.number[node]
-    if recorded.deaths_ns.get(number, NEVER_NS) <= time_ns or recorded.scenario.run.pacing == "realtime":
+    if recorded.deaths_ns.get(number, END_OF_TIME_NS) <= time_ns or recorded.scenario.run.pacing == "realtime":
         return True
     ended = [p for p in recorded.plan if isinstance(p.fault, ProcessFault) and p.fault.ends and p.nodes[number]]
     return any(planned.acts_at(time_ns) for planned in ended)

@@ -18,7 +18,7 @@ from emulator.cli.viewing import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
-from emulator.records.atomic import disk_errors, whole
+from emulator.records.atomic import atomically, disk_errors
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.terminal.console import one_line_errors
@@ -67,7 +67,7 @@ def radio(
             with disk_errors(out):
                 out.mkdir(parents=True, exist_ok=True)
             for name, table in tables.items():
-                with whole(out / f"{name}.parquet") as part:
+                with atomically(out / f"{name}.parquet") as part:
                     pq.write_table(table, part, compression="zstd")
         _print(metrics, Console())
 
@@ -131,13 +131,13 @@ def export(
 def _write(path: Path, recorded: OpenedRun, writer: Callable[[OpenedRun, BinaryIO], int]) -> int:
     """Write a file in one step; return what `writer` counts."""
     _refuse_existing(path)
-    with whole(path) as part, part.open("wb") as file:
+    with atomically(path) as part, part.open("wb") as file:
         return writer(recorded, file)
 
 
 def _write_folder(path: Path, recorded: RecordedRun) -> list[str]:
     _refuse_existing(path)
-    with whole(path) as part:
+    with atomically(path) as part:
         part.mkdir(parents=True)
         return write_csv(recorded, part)
 

@@ -1,8 +1,8 @@
 """Control of a running emulator: queries on `control/{verb}`, answered by the run itself.
 
 `status`, `inject` (a fault as JSON) and `heal` (a fault's name, or `all`). What is wrong with a query comes back as
-one line of error. A run leaves the operator's way in, `control.json` and the credentials in `operator.json` (both
-0600), in its folder for as long as it lasts.
+one line of error. During a live run its folder has the control endpoint, `control.json`, and the operator's
+credentials, `operator.json` (both 0600).
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def control_endpoint(folder: Path, endpoint: str, access: Access, sinks: Sinks |
 
 @contextmanager
 def _connected(folder: Path, endpoint: str, login: Credentials) -> Iterator[zenoh.Session]:
-    """A session with the run; one that was killed has left its way in behind."""
+    """A session with the run; one that was killed has left its control file behind."""
     with ExitStack() as stack:
         try:
             session = stack.enter_context(open_client(endpoint, login, LEASE_MS))

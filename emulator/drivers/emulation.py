@@ -256,7 +256,7 @@ class Emulation:
         return planned
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
-        """End a fault right after `now_ns`, and write that down. Raises ScenarioError if none is called so."""
+        """End a fault right after `now_ns`, and write that down. Raises ScenarioError if there is no such fault."""
         planned = self.faults.heal(label, now_ns + 1)
         self._change_plan()
         return planned

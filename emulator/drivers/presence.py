@@ -34,11 +34,11 @@ class NodeState(StrEnum):
 
 _S = NodeState
 _STOPPED = {_S.UP: _S.DOWN, _S.RESTARTING: _S.DOWN, _S.ENTERING: _S.OUTSIDE}
-"""What a node becomes that is stopped; no other is there to be stopped."""
+"""State of a node after it is stopped, by its state before; nodes in other states cannot be stopped."""
 _LEFT = {_S.DOWN: _S.OUTSIDE, _S.ENDED: _S.ENDED_OUTSIDE}
-"""What a node becomes when its vehicle leaves. Its program is stopped first."""
+"""State of a node after its vehicle has left, by its state before. Its program is stopped first."""
 _STARTED = {_S.NEW: _S.ENTERING, _S.OUTSIDE: _S.ENTERING, _S.DOWN: _S.RESTARTING}
-"""What a node becomes that is started."""
+"""State of a node after it is started, by its state before."""
 _OUTSIDE = {_S.NEW, _S.OUTSIDE, _S.ENTERING, _S.ENDED_OUTSIDE}
 
 

@@ -17,9 +17,9 @@ from vnet.transport import wire
 from vnet.units import NS_PER_S
 
 WORST_PROCESSES = 8
-"""How many of the processes with the most late deliveries an event names."""
+"""Number of processes, those with the most late deliveries, that an event names."""
 WORST_SECONDS = 20
-"""How many of the seconds with the most late deliveries an event names."""
+"""Number of seconds, those with the most late deliveries, that an event names."""
 
 
 class RealTime:

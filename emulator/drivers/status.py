@@ -18,14 +18,14 @@ from emulator.records.run_folder import Event
 from vnet.units import NS_PER_S
 
 BINS = 120
-"""Into so many equal parts of the run the figures over time are summed up."""
+"""Number of equal parts of the run in which figures over time are averaged."""
 RATES_OVER_S = 1.0
-"""Of emulated time."""
+"""Emulated time over which rates are averaged."""
 SPEED_OVER_S = 10.0
-"""Of wall clock."""
+"""Wall-clock time over which the speed is averaged."""
 SPEED_EVERY_S = 0.1
 FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m")
-"""Those of `PeriodFigures` that one wants to see."""
+"""Figures of `PeriodFigures` that are shown."""
 EVENTS_KEPT = 8
 FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total")
 """Kinds of events that hold measurements, and are no news."""

@@ -21,7 +21,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def atomically(path: Path) -> Iterator[Path]:
     """Yield a path beside `path` at which to write a file or a folder; move it to `path` at the end of the block.
 
     If the block raises, nothing is left, and what was at `path` stays as it was. A folder replaces an empty folder
@@ -38,7 +38,7 @@ def whole(path: Path) -> Iterator[Path]:
 
 def write_atomically(path: Path, content: bytes | str) -> None:
     """Write a whole file in one step; characters that are no text become `?`. Raises VnetError."""
-    with whole(path) as part:
+    with atomically(path) as part:
         part.write_bytes(content.encode("utf-8", "replace") if isinstance(content, str) else content)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from vnet.types import Array
 
 WEIGHT = "weight."
-"""How the values begin by which programs report the weights of their fusion; a node's id follows."""
+"""Prefix of the reported values that are weights of a fusion; a node's id follows."""
 
 
 @dataclass(frozen=True)

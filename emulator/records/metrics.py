@@ -44,7 +44,7 @@ STATES = pa.schema(
     }
 )
 ROWS_A_PIECE = 2048
-"""How many states are kept as Python's numbers at most, but for the rest of a period."""
+"""Largest number of states kept as Python numbers, except for the rest of a period."""
 _COMMON_VALUES = {
     "common_error_m": "common_error_estimate_m",
     "common_error_covariance_m2": "common_error_covariance_m2",
@@ -68,7 +68,7 @@ class PeriodFigures:
     time_ns: int
     """Its start."""
     reporting: int
-    """How many vehicles reported in it."""
+    """Number of vehicles that reported in it."""
     common_error_rmse_m: float | None
     """√(mean‖x_i − c‖²) over the network."""
     deviation_m: float | None
@@ -84,17 +84,17 @@ class PeriodFigures:
     component_deviation_m: list[float | None]
     """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None
-    """Of the vehicles' estimates of their positions."""
+    """RMSE of the vehicles' estimates of their positions."""
     fix_rmse_m: float | None
-    """Of the raw fixes."""
+    """RMSE of the raw fixes."""
     consensus_error_m: float | None
     """√(mean‖m_i − x̄‖²), with x̄ of the vehicle's component."""
     common_error_anees: float | None
-    """Of the common error."""
+    """ANEES of the common error."""
     position_anees: float | None
-    """Of the positions."""
+    """ANEES of the positions."""
     not_finite: int
-    """How many reports held NaN or infinity."""
+    """Number of reports that held NaN or infinity."""
 
 
 class Metrics:

@@ -1,4 +1,4 @@
-"""A finished run, read from its folder: `RecordedRun.open` is the one way in for all that look at one.
+"""A finished run, read from its folder: `RecordedRun.open` is the one reader, for everything that reads a run.
 
 It has the run's files as arrays, who was up when, and which fault acted where and when. The faults' plan is worked
 out again from the scenario and the true positions, so that a run is judged from its files.
@@ -27,7 +27,8 @@ from vnet.types import IntArray, Mask
 __all__ = ["ARRIVED", "ON_AIR", "OpenedRun", "RecordedRun", "Span"]
 
 NO_FAULT, UNHEARD_OF = -1, -2
-NEVER_NS = np.iinfo(np.int64).max
+END_OF_TIME_NS = np.iinfo(np.int64).max
+"""Later than every instant of a run."""
 REALTIME_GUARD_NS = 50_000_000
 """In real time nobody can say on which side of a fault's start or end a frame was that close to it."""
 ENDINGS = ("died", "crashed", "finished", "spun")
@@ -94,9 +95,9 @@ class RecordedRun(RecordedTables):
             ends = isinstance(planned.fault, ProcessFault) and planned.fault.ends
             if ends and planned.start_ns < min(self.closed_ns, planned.end_ns):
                 for node in np.flatnonzero(planned.nodes).tolist():
-                    if self.deaths_ns.get(node, NEVER_NS) > planned.start_ns:
+                    if self.deaths_ns.get(node, END_OF_TIME_NS) > planned.start_ns:
                         spans.append(Span(node, planned.start_ns, self._back_ns(node, planned.end_ns), True))
-        deaths = [Span(node, time_ns, NEVER_NS, False) for node, time_ns in self.deaths_ns.items()]
+        deaths = [Span(node, time_ns, END_OF_TIME_NS, False) for node, time_ns in self.deaths_ns.items()]
         return [*spans, *self._absences(), *deaths]
 
     def _absences(self) -> Iterator[Span]:
@@ -111,14 +112,14 @@ class RecordedRun(RecordedTables):
             elif node in since:
                 yield Span(node, since.pop(node), event.time_ns, True)
         for node, start_ns in since.items():
-            yield Span(node, start_ns, NEVER_NS, True)
+            yield Span(node, start_ns, END_OF_TIME_NS, True)
 
     def _back_ns(self, node: int, end_ns: int) -> int:
         """Instant at which a node was up again after a fault: its end, or in real time its process's return."""
         if self.scenario.run.pacing == "realtime":
             there = (e.time_ns for e in self.event("restarted", "entered") if e.node == self.node_ids[node])
-            return min((time_ns for time_ns in there if time_ns >= end_ns), default=NEVER_NS)
-        return end_ns if end_ns < self.closed_ns else NEVER_NS
+            return min((time_ns for time_ns in there if time_ns >= end_ns), default=END_OF_TIME_NS)
+        return end_ns if end_ns < self.closed_ns else END_OF_TIME_NS
 
     def is_down(self, node: NDArray[np.intp], time_ns: IntArray) -> Mask:
         """Mask of these nodes that are down at these instants."""

@@ -29,7 +29,7 @@ from vnet.types import Array, IntArray, Mask
 
 ARRIVED = decided_at(Stage.ARRIVAL)
 ON_AIR = decided_at(Stage.RECEPTION, Stage.ARRIVAL)
-"""What becomes of pairs that come as far as the radio."""
+"""Outcomes of receptions that get as far as the receiver's radio."""
 
 
 @dataclass(frozen=True)

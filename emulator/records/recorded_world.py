@@ -15,7 +15,7 @@ from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array, Mask
 
 LARGEST_BYTES = 1 << 30
-"""Of one array of the file; the links of ten thousand vehicles take 100 MB."""
+"""Largest size of one array of the file; the links of ten thousand vehicles take 100 MB."""
 ARRAYS: dict[str, tuple[str, str]] = {
     "node_ids": ("U", "n"),
     "position_m": ("f", "n × 2"),

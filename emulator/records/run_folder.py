@@ -18,7 +18,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from emulator.records.atomic import disk_errors, whole
+from emulator.records.atomic import atomically, disk_errors
 from emulator.records.code_digest import code_digests
 from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
 from vnet.errors import VnetError
@@ -110,7 +110,7 @@ class RunFolder:
 
     def put(self, name: str, write: Callable[[Path], None]) -> None:
         """Have `write` make a file beside its place, then move it there in one step."""
-        with whole(self.path / name) as part:
+        with atomically(self.path / name) as part:
             write(part)
 
     def put_json(self, name: str, data: dict[str, Any]) -> None:

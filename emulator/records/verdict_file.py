@@ -15,7 +15,7 @@ from vnet.errors import VnetError
 
 LARGEST_BYTES = 64 * 2**20
 RENAMED_CHECKS = {"bit:": "effect:"}
-"""How names of checks began in folders of format 1, and how they begin now."""
+"""Prefixes of the names of checks: that of format 1, and today's."""
 
 
 @dataclass(frozen=True)

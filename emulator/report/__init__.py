@@ -1,1 +1,1 @@
-"""What a run leaves for people to look at: its report, the index of all runs, and two runs side by side."""
+"""Pages about runs: the report of one, the index of all, and two side by side."""

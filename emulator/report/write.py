@@ -109,7 +109,7 @@ class Details:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to show."""
+        """True if there is nothing to show."""
         return not (self.values or self.tables or self.texts)
 
 

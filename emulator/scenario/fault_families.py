@@ -80,15 +80,15 @@ class Fault(Section):
     chapter: ClassVar[str] = "The network"
     """The heading of the kind's family in docs/reference/faults.md."""
     acts_on: ClassVar[str] = "the network"
-    """What the reference page says that the kind acts on."""
+    """Targets of the kind, in the words of the reference page."""
     campaign_weight: ClassVar[int] = 1
-    """How often campaigns draw the kind, relative to others."""
+    """Frequency at which campaigns draw the kind, relative to others."""
     live_only: ClassVar[bool] = False
-    """Whether a simulation has nothing that the kind could act on; campaigns then never draw it."""
+    """True if a simulation has nothing that the kind could act on; campaigns then never draw it."""
     cuts: ClassVar[bool] = False
-    """Whether no frame passes a link on which the fault acts."""
+    """True if no frame passes a link on which the fault acts."""
     follows_vehicles: ClassVar[bool] = False
-    """Whether a selector by position is evaluated again each period; if not, once, at the fault's start."""
+    """True if a selector by position is evaluated again each period; otherwise once, at the fault's start."""
 
     kind: str
     """Name of the kind."""
@@ -171,9 +171,9 @@ class ProcessFault(NodeFault):
 
     chapter: ClassVar[str] = "Processes"
     ends: ClassVar[bool] = False
-    """Whether the programs are ended and start again after the fault; if not, they are paused."""
+    """True if the programs are ended and start again after the fault; otherwise they are paused."""
     forced: ClassVar[bool] = False
-    """Whether the programs are ended without notice."""
+    """True if the programs are ended without notice."""
 
     @classmethod
     def draw_target(cls, choose: Chooser, processes: Sequence[tuple[str, ...]]) -> dict[str, Any]:
@@ -204,11 +204,11 @@ class DelayFault(LinkFault):
 
     @property
     def bounds_ms(self) -> tuple[float, float]:
-        """The least and the greatest added latency in ms."""
+        """Least and greatest extra latency in ms."""
         raise NotImplementedError
 
     def added_ms(self, draws: Array) -> Array:
-        """Return the added latency (N,) in ms at each receiver, from uniform draws (N,) in [0, 1)."""
+        """Return the extra latency (N,) in ms at each receiver, from uniform draws (N,) in [0, 1)."""
         raise NotImplementedError
 
 

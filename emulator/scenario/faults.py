@@ -165,7 +165,7 @@ class Delay(DelayFault):
 
     kind: Literal["delay"]
     delay_ms: Annotated[float, Drawn(1, 500)] = Field(gt=0, le=60_000)
-    """Added latency."""
+    """Extra latency."""
 
     @property
     def bounds_ms(self) -> tuple[float, float]:
@@ -182,11 +182,11 @@ class Jitter(DelayFault):
 
     kind: Literal["jitter"]
     jitter_ms: Annotated[float, Drawn(1, 300)] = Field(gt=0, le=60_000)
-    """Greatest added latency; uniform from 0."""
+    """Greatest extra latency; uniform from 0."""
 
     @property
     def bounds_ms(self) -> tuple[float, float]:
-        """Zero and the greatest added latency."""
+        """Zero and the greatest extra latency."""
         return 0.0, self.jitter_ms
 
     def added_ms(self, draws: Array) -> Array:

@@ -21,9 +21,9 @@ class _PathLoss(Section):
     """The keys of every path loss."""
 
     tx_power_dbm: float = Field(20.0, ge=-100, le=100)
-    """What all send with, antennas included."""
+    """Transmit power of every vehicle, antenna gains included."""
     floor_dbm: float = Field(-94.0, ge=-300, le=100)
-    """Pairs whose mean power, with shadowing and without fading, is below it are out of range."""
+    """Receptions with less mean power (with shadowing, without fading) are out of range."""
 
 
 class FreeSpace(_PathLoss):
@@ -32,7 +32,7 @@ class FreeSpace(_PathLoss):
     kind: Literal["free_space"]
     """This model."""
     frequency_ghz: float = Field(5.9, ge=0.1, le=100)
-    """Of the carrier."""
+    """Carrier frequency."""
 
 
 class LogDistance(_PathLoss):
@@ -41,9 +41,9 @@ class LogDistance(_PathLoss):
     kind: Literal["log_distance"]
     """This model."""
     exponent: float = Field(2.0, gt=0, le=10)
-    """How fast the power falls."""
+    """Path loss exponent."""
     reference_db: float = Field(47.86, ge=0, le=300)
-    """What is lost in the first metre."""
+    """Path loss at a distance of one metre."""
 
 
 class DualSlope(_PathLoss):
@@ -52,13 +52,13 @@ class DualSlope(_PathLoss):
     kind: Literal["dual_slope"]
     """This model."""
     exponent: float = Field(2.1, gt=0, le=10)
-    """How fast the power falls up to `break_m`."""
+    """Path loss exponent up to `break_m`."""
     far_exponent: float = Field(3.8, gt=0, le=10)
-    """How fast it falls beyond."""
+    """Path loss exponent beyond it."""
     break_m: float = Field(100.0, ge=1, le=1e6)
-    """Where the slope changes."""
+    """Breakpoint distance, at which the exponent changes."""
     reference_db: float = Field(47.86, ge=0, le=300)
-    """What is lost in the first metre."""
+    """Path loss at a distance of one metre."""
 
 
 class TwoRay(_PathLoss):
@@ -67,32 +67,32 @@ class TwoRay(_PathLoss):
     kind: Literal["two_ray"]
     """This model."""
     frequency_ghz: float = Field(5.9, ge=0.1, le=100)
-    """Of the carrier."""
+    """Carrier frequency."""
     antenna_m: float = Field(1.5, gt=0, le=1000)
-    """How high above the ground both antennas are."""
+    """Height of both antennas above the ground."""
     permittivity: float = Field(1.02, gt=1, le=1000)
-    """Of the ground, relative to the vacuum's."""
+    """Relative permittivity of the ground."""
 
 
 PathLoss = Annotated[FreeSpace | LogDistance | DualSlope | TwoRay, Field(discriminator="kind")]
 
 
 class Shadowing(Section):
-    """`[radio.shadowing]`: log-normal, the same both ways of a link, and similar on links whose ends are near."""
+    """`[radio.shadowing]`: log-normal, symmetric, and correlated between links with nearby ends."""
 
     sigma_db: float = Field(3.0, ge=0, le=50)
-    """Standard deviation."""
+    """Standard deviation of the shadowing."""
     decorrelation_m: float = Field(25.0, gt=0, le=1e6)
-    """Moving one end so far leaves a correlation of 1/e."""
+    """Displacement of one end at which the correlation has fallen to 1/e."""
 
 
 class Fading(Section):
     """`[radio.fading]`: Nakagami, drawn for each frame and receiver."""
 
     m: tuple[Annotated[float, Field(ge=0.5, le=100)], ...] = (1.5, 0.75)
-    """The shapes up to each of the distances `until_m`, and beyond the last; 1 is Rayleigh."""
+    """Shape parameters up to each of the distances `until_m`, and beyond the last; 1 is Rayleigh fading."""
     until_m: tuple[Annotated[float, Field(gt=0, le=1e9)], ...] = (80.0,)
-    """The distances, which grow."""
+    """Distances at which the shape changes, increasing."""
 
     @model_validator(mode="after")
     def _a_shape_for_each_stretch(self) -> Fading:
@@ -104,39 +104,39 @@ class Fading(Section):
 
 
 class Receiver(Section):
-    """`[radio.receiver]`: what a signal must stand out from. Its defaults hold wherever signals have a power."""
+    """`[radio.receiver]`: noise and detection thresholds. The defaults hold wherever a path loss is configured."""
 
     noise_dbm: float = Field(-104.0, ge=-300, le=100)
-    """The thermal noise in 10 MHz."""
+    """Thermal noise in 10 MHz."""
     noise_figure_db: float = Field(7.0, ge=0, le=100)
-    """What the receiver adds to it."""
+    """Noise figure of the receiver, added to the thermal noise."""
     min_snr_db: float = Field(4.0, ge=-50, le=100)
-    """A frame is detected from so much above noise and interference on."""
+    """Least ratio of signal to noise and interference at which a frame is detected."""
     min_rssi_dbm: float = Field(-82.0, ge=-300, le=100)
-    """And from this power on."""
+    """Least received power at which a frame is detected."""
 
 
 class Mac(Section):
-    """`[radio.mac]`: all share one medium, and listen before they talk."""
+    """`[radio.mac]`: a shared medium with carrier sensing (802.11p's EDCA)."""
 
     access_category: Literal["VO", "VI", "BE", "BK"] = "BE"
-    """Of 802.11p's EDCA: how long one listens, and from how many slots the backoff is drawn."""
+    """Access category of EDCA; it sets the interframe space and the contention window."""
     carrier_sense_dbm: float = Field(-85.0, ge=-300, le=100)
-    """The medium is busy where the sum of all signals is at least this."""
+    """Total received power from which the medium is busy."""
 
 
 class EtsiReactive(Section):
-    """The reactive table of ETSI TS 102 687. Each 100 ms a sender goes one state up or down, towards the one whose
-    channel busy ratio it has."""
+    """The reactive table of ETSI TS 102 687. Every 100 ms a sender moves one state up or down, towards
+    that of its channel busy ratio."""
 
     kind: Literal["etsi"]
     """This control."""
     busy: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.3, 0.4, 0.5, 0.65)
-    """The channel busy ratios at which the second state begins, the third, …"""
+    """Channel busy ratios at which the second state begins, the third, …"""
     pause_ms: tuple[Annotated[float, Field(ge=0, le=60_000)], ...] = (50.0, 100.0, 200.0, 250.0, 1000.0)
-    """By state, the least time from one frame of a sender to the next."""
+    """Least time between two frames of a sender, by state."""
     waiting: int = Field(1, ge=1, le=1_000_000)
-    """Frames that wait for their turn; a newer one takes the oldest one's place (`held_back`)."""
+    """Frames that may wait; a newer frame replaces the oldest one (`held_back`)."""
 
     @model_validator(mode="after")
     def _a_pause_for_each_state(self) -> EtsiReactive:
@@ -148,27 +148,27 @@ class EtsiReactive(Section):
 
 
 class Limeric(Section):
-    """LIMERIC, the adaptive approach of ETSI TS 102 687. Each 200 ms a sender's share of the time becomes
-    (1 - `alpha`) share + `beta` (`target` - busy ratio)."""
+    """LIMERIC, the adaptive approach of ETSI TS 102 687. Every 200 ms a sender's duty cycle becomes
+    (1 - `alpha`) duty cycle + `beta` (`target` - channel busy ratio)."""
 
     kind: Literal["limeric"]
     """This control."""
     alpha: float = Field(0.016, gt=0, lt=1)
-    """How fast the past is forgotten."""
+    """Forgetting factor of the duty cycle."""
     beta: float = Field(0.0012, gt=0, lt=1)
-    """How fast the share follows."""
+    """Gain of the difference from the target."""
     target: float = Field(0.68, gt=0, lt=1)
     """Target channel busy ratio."""
     most_up: float = Field(0.0005, gt=0, lt=1)
-    """The share grows by no more at a time because the medium is free."""
+    """Largest increase of the duty cycle in one step, on a free medium."""
     most_down: float = Field(0.00025, gt=0, lt=1)
-    """It shrinks by no more because the medium is busy."""
+    """Largest decrease of the duty cycle in one step, on a busy medium."""
     least: float = Field(0.0006, gt=0, lt=1)
     """The smallest share."""
     most: float = Field(0.03, gt=0, le=1)
     """The largest share."""
     waiting: int = Field(1, ge=1, le=1_000_000)
-    """Frames that wait for their turn; a newer one takes the oldest one's place (`held_back`)."""
+    """Frames that may wait; a newer frame replaces the oldest one (`held_back`)."""
 
 
 Congestion = Annotated[EtsiReactive | Limeric, Field(discriminator="kind")]

@@ -77,11 +77,11 @@ class Network(Section):
     """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
     CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
     vehicles: int = Field(38, ge=1, le=10_000)
-    """How many are generated; they are called v01, v02, …"""
+    """Number of generated vehicles; their ids are v01, v02, …"""
     layout: Literal["urban", "dense"] = "urban"
     """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
     size_m: float = Field(3000.0, ge=1000, le=10_000)
-    """How far the generated city reaches from one end to the other."""
+    """Extent of the generated city, from one end to the other."""
     seed: int = Field(1, ge=0, lt=2**63)
     """Draws the generated network, the city and its traffic, or SUMO's traffic, and nothing of the run."""
     start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
@@ -124,7 +124,7 @@ class Map(Section):
     sigma_m: float = Field(0.0, ge=0, le=WILD_M)
     """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
     aside_m: float = Field(0.0, ge=-FAR_M, le=FAR_M)
-    """How far to the right of the map's lanes vehicles really drive, in the mean; negative: to the left."""
+    """Mean distance of the driven line to the right of the map's lanes; negative: to the left."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)
     """Programs are given the roads within so much of the box in which vehicles drive."""
 
@@ -146,7 +146,7 @@ class Gnss(Section):
     sigma_m: float = Field(1.0, ge=0, le=WILD_M)
     """Standard deviation of the receiver's noise in each axis."""
     heading: bool = True
-    """Whether fixes bear a heading."""
+    """True if fixes have a heading."""
     heading_sigma_rad: float = Field(0.01, ge=0, le=1)
     """Standard deviation of that heading."""
 
@@ -155,7 +155,7 @@ class Lateral(Section):
     """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
 
     half_width_m: float = Field(0.85, gt=0, le=FAR_M)
-    """How far it strays at most; the map tells programs."""
+    """Largest lateral offset; programs know it from the map."""
     sigma_m: float = Field(0.4, ge=0, le=WILD_M)
     """Standard deviation of the offset, before it is reflected at the half-width."""
     tau_s: float = Field(20.0, gt=0)
@@ -177,23 +177,23 @@ class Radio(Section):
     """
 
     range_m: float = Field(3000.0, gt=0, le=FAR_M)
-    """All within it hear each other, unless there are `links` or a `path_loss`."""
+    """Range of the disc: all vehicles within it hear each other, unless there are `links` or a `path_loss`."""
     links: Path | tuple[tuple[int, ...], ...] | None = None
-    """Who hears whom, in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header
-    (relative to the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the
-    network's vehicles; the diagonal means nothing."""
+    """Links in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header (relative to
+    the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the network's
+    vehicles; the diagonal is ignored."""
     max_peers: int = Field(30, ge=1, le=MANY)
-    """Each receiver hears so many senders at most: the nearest that are up."""
+    """Peer cap: each receiver hears at most so many senders, the nearest that are up."""
     loss: float = Field(0.0, ge=0, le=1)
-    """Probability that a frame is lost, drawn for each receiver by itself."""
+    """Probability that a frame is lost, independently at each receiver."""
     latency_ms: float = Field(2.0, ge=0.001, le=1000 * DAY_S)
     """Least time from the end of the transmission to the arrival."""
     jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
-    """Added to the latency: uniform up to so much, drawn for each receiver."""
+    """Jitter of the latency: uniform from 0, drawn for each receiver."""
     access_jitter_ms: float = Field(1.0, ge=0, le=1000 * DAY_S)
-    """Wait before the transmission: uniform up to so much, drawn for each frame."""
+    """Random wait before the transmission: uniform from 0, drawn for each frame."""
     delivery_tick_us: int = Field(0, ge=0, le=MANY)
-    """Arrivals are rounded up to a multiple of it; 0 rounds nothing."""
+    """Arrivals are rounded up to a multiple of it; 0 means no rounding."""
     max_payload_bytes: int = Field(1400, ge=1, le=65_000)
     """A longer payload is refused."""
     bitrate_mbps: float = Field(6.0, ge=1e-6)
@@ -202,13 +202,13 @@ class Radio(Section):
     queue_frames: int = Field(64, ge=1, le=MANY)
     """Frames that may wait at a sender; further ones are dropped (`queue_full`)."""
     path_loss: PathLoss | None = None
-    """How much weaker signals arrive; in place of the range, the power decides who hears whom."""
+    """Path loss; it replaces the range: received power decides connectivity."""
     shadowing: Shadowing | None = None
-    """What stands in the way of some signals and not of others."""
+    """Shadowing by obstacles, which differs between links."""
     fading: Fading | None = None
-    """How the power of one frame differs from the mean."""
+    """Fading: variation of the power from frame to frame."""
     receiver: Receiver | None = None
-    """Noise, and what is detected; its defaults hold wherever signals have a power."""
+    """Noise and detection thresholds; the defaults hold wherever a path loss is configured."""
     mac: Mac | None = None
     """All share one medium, and listen before they talk; without it nobody is in anybody's way."""
     congestion: Congestion | None = None

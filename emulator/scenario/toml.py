@@ -16,9 +16,9 @@ from vnet.bounded import read_bounded
 from vnet.errors import printable, shown
 
 LARGEST_BYTES = 4 * 2**20
-"""Of a file; a matrix of links for a thousand vehicles takes three of the four megabytes."""
+"""Largest size of a file; a matrix of links for a thousand vehicles takes three of the four megabytes."""
 DEEPEST = 32
-"""How many tables and arrays may stand in each other."""
+"""Largest nesting depth of tables and arrays."""
 _INTEGERS = range(-(2**63), 2**64)  # what msgpack can carry
 
 _KEY = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""

@@ -1,4 +1,4 @@
-"""What a run prints at its end: the verdict, the figures, where the files are and what to type next."""
+"""Summary that a run prints at its end: verdict, figures, files, and the next commands."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def _synchronous(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[...
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Where a test has failed, say where the files of its runs are and how to have the last one again."""
+    """Add the folders of a failed test's runs to its report, and the command that reproduces the last one."""
     report = yield
     runs = item.stash.get(_runs, [])
     if report.failed and runs:

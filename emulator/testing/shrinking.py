@@ -51,7 +51,7 @@ def _halves(items: tuple[Any, ...]) -> Iterator[tuple[Any, ...]]:
 
 
 def _fewer(fault: Fault) -> Iterator[Fault]:
-    """Of fewer vehicles."""
+    """Propose schedules with fewer vehicles."""
     for name in type(fault).model_fields:
         value = getattr(fault, name)
         if isinstance(value, Selector):

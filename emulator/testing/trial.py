@@ -39,7 +39,7 @@ STACKS_AT = 0.9
 
 @dataclass(frozen=True)
 class Trial:
-    """How a run came out: the verdict of each check, and what those that failed say."""
+    """Result of a run: the verdict of each check, and the texts of those that failed."""
 
     verdicts: dict[str, Verdict]
     texts: dict[str, str]
@@ -58,7 +58,7 @@ class Trial:
 
 
 UNKNOWN = Trial({}, {})
-"""Of a run that was given up."""
+"""Result of a run that was given up."""
 
 
 def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:

@@ -1,4 +1,4 @@
-"""The radio is held to ns-3's curves without ns-3: `recorded.json` is what `python -m benchmarks.ns3` wrote."""
+"""The radio against recorded curves of ns-3: `python -m benchmarks.ns3` wrote `recorded.json`."""
 
 import json
 import os

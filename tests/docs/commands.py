@@ -98,7 +98,7 @@ def run(words: Sequence[str], status: int, folder: Path) -> str | None:
 
 
 def _expensive(arguments: list[str]) -> bool:
-    """Whether a command of vnet takes long, or a clock on the wall."""
+    """Return True if a command of vnet takes long, or a clock on the wall."""
     given = dict(pairwise(arguments))
     short = float(given.get("--duration", "inf")) <= SHORT_S
     many = arguments[0] == "campaign" and int(given.get("--runs", "200")) > MOST_RUNS
@@ -127,7 +127,7 @@ def parse(words: Sequence[str]) -> None:
 
 
 def _look_at(program: str, arguments: list[str]) -> None:
-    """What can be said of a command that is not vnet's."""
+    """Check a command that is not vnet's."""
     if program == "make":
         targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
         if wrong := {word for word in arguments if "=" not in word} - set(targets):
@@ -144,11 +144,11 @@ def _disarm(command: Any) -> None:
 
 
 def _nothing(*_: object, **__: object) -> None:
-    """What a disarmed command does."""
+    """Run a disarmed command."""
 
 
 def _captured(command: Any, arguments: list[str]) -> tuple[str, int]:
-    """What a command prints, on stdout and then on stderr, and its exit status."""
+    """Return the output of a command, stdout before stderr, and its exit status."""
     out, error = io.StringIO(), io.StringIO()
     status: object = 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):

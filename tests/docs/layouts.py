@@ -34,7 +34,7 @@ class Field:
     bounds: str = ""
 
     def allows(self, number: float) -> bool:
-        """Whether a number is within the bounds."""
+        """Return True if a number is within the bounds."""
         inside = all(_number(low) <= number <= _number(high) for low, high in _RANGE.findall(self.bounds))
         compare: dict[str, Callable[[float, float], bool]] = {"<": lambda a, b: a < b, ">": lambda a, b: a > b}
         return inside and all(compare[sign](number, _number(limit)) for sign, limit in _LIMIT.findall(self.bounds))
@@ -82,7 +82,7 @@ class Layouts:
     # Reading.
 
     def problem_of(self, kind: str, values: Any, sizes: dict[str, int] | None = None) -> str:
-        """What is wrong with a message or part, an array of its values or a map by name; empty if nothing is."""
+        """Say what is wrong with a message or part: an array of its values, or a map by name; else empty."""
         fields = self.by_name[kind]
         if isinstance(values, dict):
             if list(values) != [field.name for field in fields]:
@@ -177,7 +177,7 @@ class Layouts:
 
 
 def _is_array(type_: str, size: int, sizes: dict[str, int]) -> bool:
-    """Whether so many bytes are an array of this type; `sizes` are those that letters stand for, k is any."""
+    """Return True if so many bytes are an array of this type; `sizes` are those of its letters, k is any."""
     item, _, shape = type_.partition(" ")
     lengths = [int(part) if part.isdigit() else sizes.get(part) for part in shape.strip("()").split(", ")]
     known = math.prod(length for length in lengths if length is not None) * _ITEM_BYTES[item]

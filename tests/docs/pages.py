@@ -28,7 +28,7 @@ from tests.docs.markdown import Block, blocks
 from tests.support.paths import ROOT
 
 NOT_INSTALLED = re.compile(r"^(import|from) pandas\b", re.MULTILINE)
-"""What examples use and vnet does not need: such blocks are only compiled."""
+"""Packages that examples use and vnet does not need: such blocks are only compiled."""
 _FILE = re.compile(r"# (\S+\.(?:py|toml))\n")
 
 
@@ -146,7 +146,7 @@ def _at(place: str) -> Any:
 
 
 def shows(printed: str, shown: str) -> bool:
-    """Whether `shown` is an excerpt of what was printed; see the module's text. How wide a gap is means nothing."""
+    """Return True if `shown` is an excerpt of what was printed; see the module. The width of gaps is ignored."""
     pattern = "".join(
         r"(?:.*\n)*?" if line == "…" else ".*".join(map(re.escape, line.split("…"))) + "\n"
         for line in _lines(shown)

@@ -56,18 +56,18 @@ def test_a_key_without_a_docstring_is_refused() -> None:
 
 
 def test_docstrings_of_attributes_are_found() -> None:
-    assert attribute_docstrings(Example) == {"first": "Of\nthe first."}
+    assert attribute_docstrings(Example) == {"first": "Text of\nthe first."}
 
 
 class Example:
     """A class."""
 
     first: int = 1
-    """Of
+    """Text of
     the first."""
     second: int = 2
     third = 3
-    """Of no annotation."""
+    """Text without an annotation."""
 
 
 def test_a_column_without_a_text_is_refused() -> None:

@@ -7,7 +7,7 @@ from vnet import Node
 
 
 class Diary:
-    """What a program saw, in order, as one number."""
+    """Digest of what a program saw, in order, as one number."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -86,7 +86,7 @@ async def some_end(node: Node) -> None:
 
 
 async def does_not_give_up(node: Node) -> None:
-    """Goes on after it was cancelled, and says so to all; its last words are many."""
+    """Goes on after it was cancelled, and says so to all; its final messages are many."""
 
     async def stubborn() -> None:
         waiter = asyncio.get_running_loop().create_future()

@@ -1,4 +1,4 @@
-"""What every reader of a run's folder makes of it, as plain texts and bytes that can be compared."""
+"""Results of every reader of a run's folder, as plain texts and bytes that can be compared."""
 
 import io
 import shutil
@@ -25,7 +25,7 @@ Readings = dict[str, str | bytes]
 
 
 def readings(folder: Path, other: Path, scratch: Path) -> Readings:
-    """What all `READERS` make of a run, without its folder's name; `other` is the run that it is compared with."""
+    """Return the results of all `READERS` for a run, without its folder's name; `other` is compared with it."""
     recorded = RecordedRun.open(folder)
     pcapng, mcap = io.BytesIO(), io.BytesIO()
     write_pcapng(recorded, pcapng)
@@ -47,7 +47,7 @@ def readings(folder: Path, other: Path, scratch: Path) -> Readings:
 
 
 def rendered(folder: Path) -> str:
-    """What `vnet render` draws of a run."""
+    """Return the drawing that `vnet render` makes of a run."""
     command("render", str(folder))
     drawn = read_back(folder / "recording.rrd")
     del drawn["/__properties"]  # when it was made

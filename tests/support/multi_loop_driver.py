@@ -31,7 +31,7 @@ _numbers = count()
 
 
 class Killed(BaseException):
-    """What happens to a process that is killed: nothing more runs."""
+    """Kill a process: nothing more of it runs."""
 
 
 class Over(Exception):

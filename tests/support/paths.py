@@ -1,4 +1,4 @@
-"""Where the repository is, for tests that read its files or start commands in it."""
+"""Path of the repository, for tests that read its files or start commands in it."""
 
 from pathlib import Path
 

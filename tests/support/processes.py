@@ -5,7 +5,7 @@ import select
 
 
 def has_ended(pid: int, timeout_s: float) -> bool:
-    """Whether a process has ended, or ends within `timeout_s`."""
+    """Return True if a process has ended, or ends within `timeout_s`."""
     try:
         descriptor = os.pidfd_open(pid)
     except ProcessLookupError:

@@ -16,7 +16,7 @@ from emulator.viewer.drawing import TIMELINE
 
 @dataclass
 class Entity:
-    """What was drawn of one entity: components that are always there, and by time (s)."""
+    """Drawing of one entity: components that are always there, and by time (s)."""
 
     static: dict[str, Any] = field(default_factory=dict)
     at: dict[str, dict[float, Any]] = field(default_factory=lambda: defaultdict(dict))

@@ -8,7 +8,7 @@ _PIECES = re.compile(r"\x1b\[(\??)(\d*(?:;\d+)*)([A-Za-z])|(\r)|(\n)|([^\x1b\r\n
 class Screen:
     """Understands what vnet writes, and refuses anything else.
 
-    Lines that are too wide are broken, and broken anew when it is made narrower, as terminals do.
+    Lines that are too wide are broken, and broken again when it is made narrower, as terminals do.
     """
 
     def __init__(self, width: int, height: int) -> None:

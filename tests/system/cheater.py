@@ -19,7 +19,7 @@ VICTIM = "v01"
 
 
 def try_to_log_in(endpoint: str, credentials: Credentials | None) -> bool:
-    """Whether the router lets these credentials in."""
+    """Return True if the router accepts these credentials."""
     try:
         with open_client(endpoint, credentials, 2000):
             return True

@@ -20,10 +20,14 @@ TIMEOUT_S = 300
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark all tests of this folder as slow; pytest hands over those of other folders, too."""
+    """Mark all tests of this folder as slow, and let their processes hear Ctrl-C however pytest was started.
+
+    `items` holds the tests of other folders too.
+    """
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent):
             item.add_marker(pytest.mark.slow)
+            item.add_marker(pytest.mark.usefixtures("default_signals"))
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Finished:
 
     @property
     def fingerprint(self) -> tuple[str, str]:
-        """What must be the same wherever the same run is run: the trace and the metrics."""
+        """Results that must be the same wherever the same run is run: the trace and the metrics."""
         return self.verdict["trace_sha256"], self.verdict["metrics_sha256"]
 
     @property

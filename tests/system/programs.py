@@ -67,7 +67,7 @@ async def dies(node: Node) -> None:
 
 
 async def spins(node: Node) -> None:
-    """One vehicle goes on for ever at one instant."""
+    """One vehicle does not let time advance."""
     async for fix in node.gnss:
         await node.radio.broadcast(b"x")
         while node.id == "v02" and fix.time_ns >= 500_000_000:

@@ -1,4 +1,4 @@
-"""What a user meets when things go wrong: one clear line, no process left, files readable."""
+"""Failures as a user meets them: one clear line, no process left, files readable."""
 
 import resource
 import signal

@@ -37,7 +37,7 @@ IN_PAIRS = [
     {"kind": "restart", "at_s": 1.4, "duration_s": 0.4, "nodes": {"ids": ["v03", "v04"]}},
     {"kind": "skew", "at_s": 0.7, "duration_s": 1.1, "offset_ms": -130, "nodes": {"ids": ["v02", "v04"]}},
 ]
-"""What shares a process shares its fate."""
+"""Check that nodes that share a process end together."""
 
 
 def write(folder: Path, faults: Sequence[dict[str, Any]], **sections: dict[str, Any]) -> str:
@@ -180,5 +180,5 @@ def test_in_real_time_processes_are_killed_restarted_and_paused_and_none_is_left
     last = {row["sender"]: row["sent_ns"] for row in done.trace()}
     assert all(sent_ns > 3_000_000_000 for sent_ns in last.values()), "all are there at the end"
     during = [r["sent_ns"] for r in done.trace() if r["sender"] == "v03" and 6.5e8 < r["sent_ns"] < 1.3e9]
-    assert during == [], "who stands still says nothing"
+    assert during == [], "a paused vehicle says nothing"
     assert processes_of(done.folder) == {}

@@ -28,7 +28,7 @@ def own(number: int, frame: object) -> None:
 
 @pytest.fixture(params=[own, signal.SIG_IGN], ids=["own", "ignored"], autouse=True)
 def handlers(request: pytest.FixtureRequest) -> Iterator[list[object]]:
-    """What the caller has set; SIGCHLD must not be ignored by whoever starts processes."""
+    """Signal handlers of the caller; SIGCHLD must not be ignored by whoever starts processes."""
     chosen = dict.fromkeys(HANDLED[:2], request.param) | {signal.SIGCHLD: own}
     earlier = {number: signal.signal(number, handler) for number, handler in chosen.items()}
     yield list(chosen.values())

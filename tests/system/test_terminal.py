@@ -1,4 +1,4 @@
-"""What users see at a terminal, through the commands they type: a picture, one line for each mistake, JSON."""
+"""Terminal output for users, through the commands they type: a picture, one line for each mistake, JSON."""
 
 import errno
 import fcntl
@@ -271,7 +271,7 @@ def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
 
 
 def test_a_run_that_was_killed_is_said_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It leaves its way in behind."""
+    """It leaves its control file behind."""
     monkeypatch.setattr(session, "CONNECT_TIMEOUT_MS", 100)
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen

@@ -44,7 +44,7 @@ def router(access: Access) -> Iterator[zenoh.Session]:
 
 
 def joins(router: zenoh.Session, credentials: Credentials) -> bool:
-    """Whether the router lets these credentials in."""
+    """Return True if the router accepts these credentials."""
     try:
         with open_client(router_endpoint(router), credentials, LEASE_MS):
             return True

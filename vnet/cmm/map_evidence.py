@@ -35,7 +35,7 @@ class MapEvidence:
     """The update of the particles from the map.
 
     lateral_tau_s: time in which a vehicle's offset in a straight lane is renewed.
-    lateral_m: way in which it is, on the map of a city.
+    lateral_m: direction in which it is, on the map of a city.
     """
 
     def __init__(self, matcher: Matcher, lateral_tau_s: float, lateral_m: float) -> None:

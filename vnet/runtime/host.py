@@ -28,7 +28,7 @@ from vnet.transport import wire
 
 Program = Callable[[Node], Awaitable[None]]
 Programs = Mapping[str, Program]
-"""What each node runs, by id."""
+"""Program of each node, by id."""
 
 _current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
 """On whose behalf code runs: a node, in one of its incarnations."""

@@ -35,7 +35,7 @@ Exchange = Callable[[int | None], int]
 
 
 class SpinError(VirtualTimeError):
-    """A program that goes on for ever at one instant."""
+    """A program that does not let time advance (busy loop)."""
 
 
 class LoopAbandonedError(VirtualTimeError):

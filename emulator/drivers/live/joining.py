@@ -21,7 +21,7 @@ RECORDER = "recorder"
 RECORDER_POLL_S = 0.05
 """Seconds between two looks whether the recorder listens: nothing tells of it."""
 SHOWN_NODES = 8
-"""How many of the missing nodes an error names."""
+"""Number of missing nodes that an error names."""
 
 
 class Joining:

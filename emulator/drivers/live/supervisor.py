@@ -61,7 +61,7 @@ _TRANSITIONS = {
 class _Process:
     state: ProcessState
     death: dict[str, Any] | None = None
-    """How it has ended, until the pacing has taken it."""
+    """Details of its end, until the pacing has taken them."""
 
 
 class Supervisor:
@@ -98,7 +98,7 @@ class Supervisor:
         self.failure: VnetError | None = None
         self.on_death: Callable[[], None] = changes.set
         self.reconnecting = False
-        """Whether the emulator itself is not connected: that connections are lost then says nothing."""
+        """True while the emulator itself is disconnected: lost connections then mean nothing."""
 
     def begin(self, processes: Iterable[Sequence[str]]) -> None:
         """Give each process (its nodes, its id first) a state, now that every node that must be there is ready."""

@@ -1,4 +1,4 @@
-"""What conformance checks have found: one line a check, with the bytes of a wrong message."""
+"""Findings of the conformance checks: one line a check, with the bytes of a wrong message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a single message of an agent, whatever came before it."""
+"""Checks of a single message of an agent, independent of the messages before it."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from vnet.units import NS_PER_S
 DURATION_NS = NS_PER_S
 MOST_GRANTS = 2000
 PACKET_AFTER_NS = 30_000_000
-"""How long after each fix a packet arrives."""
+"""Time from each fix to the arrival of a packet."""
 CLOCK_ERROR_NS = 5_000_000
 MALFORMED = (b"\xc1", b"", b"\x93\xa5Grant\xa1x", b"\x91\xa9Nonsense1", b"\x81\x01\x02")
 """No msgpack, nothing, a wrong type, an unknown kind, a map."""
@@ -42,7 +42,7 @@ class Barrier:
             answer = self.grant(clocks)
 
     def _wake_ns(self, answer: wire.Yield) -> int | None:
-        """When the agent must be granted next."""
+        """Time of the agent's next grant."""
         due_ns = [answer.next_timer_ns]
         due_ns += [self._next_fix * self.scene.world.period_ns] if answer.waiting_gnss else []
         due_ns += [self._next_packet_ns] if answer.waiting_radio else []

@@ -20,7 +20,7 @@ from vnet.transport.access import Access, is_tls
 from vnet.transport.certificates import certifier
 
 PATIENCE_S = 5.0
-"""How long an answer may take: as long as an emulator waits for a process to end."""
+"""Time that an answer may take: as long as an emulator waits for a process to end."""
 Pacing = Literal["lockstep", "realtime"]
 
 SCENES: dict[str, tuple[Pacing, Callable[[Scene], None]]] = {
@@ -44,7 +44,7 @@ SCENES: dict[str, tuple[Pacing, Callable[[Scene], None]]] = {
 
 @dataclass(frozen=True)
 class Conformance:
-    """What is to be played against which command."""
+    """Scenes to be played, and the command that they are played against."""
 
     command: Sequence[str]
     scenario: Scenario

@@ -127,7 +127,7 @@ class Clock:
             self.scene.findings.fail("missed", f"nothing of {list(map(list, self._missed))}")
 
     def end(self) -> None:
-        """The run is over: last words, then exit status 0."""
+        """The run is over: a final message, then exit status 0."""
         scene = self.scene
         scene.findings.expect("final")
         scene.bench.say(wire.End(None, "the run is over"))

@@ -15,9 +15,9 @@ from emulator.world.world import World
 from vnet.transport import wire
 
 ORPHAN_TIMEOUT_S = 1.0
-"""What the welcome says: how long an agent waits for an emulator that is gone."""
+"""Time that an agent waits for an emulator that is gone, as the welcome says."""
 QUIET_S = 0.3
-"""How long a scene listens for what must not come."""
+"""Time that a scene listens for messages that must not come."""
 SHORTEST_NONCE = 8
 OTHERS_NONCE = b"of another session"
 PAYLOADS = (b"a packet", b"", b"\xc1 no msgpack", b"\x81\xa1x")
@@ -43,7 +43,7 @@ class Scene:
     welcome: wire.Welcome = field(init=False)
     nonce: bytes = b""
     silent: bool = True
-    """Whether nothing but Hello and StackDump may be said: the run has not begun."""
+    """True while only Hello and StackDump are allowed, before the run begins."""
 
     def __post_init__(self) -> None:
         limit = self.scenario.radio.max_payload_bytes
@@ -191,10 +191,10 @@ class Scene:
 
 
 START_UP_S = 20.0
-"""How long a process may take to start and to load its program."""
+"""Time that a process may take to start and to load its program."""
 WAIT_S = 0.05
 
 
 def _is_an_answer(hello: wire.Hello) -> bool:
-    """Whether a hello answers the welcome."""
+    """True if a hello answers the welcome."""
     return hello.ready or hello.failure is not None

@@ -132,7 +132,7 @@ def test_the_default_report_divides_by_the_limit_of_the_same_seeds() -> None:
 
 
 def wanted(**rmse: float) -> dict[str, str]:
-    """What the report says of what is wanted, on the one network there is."""
+    """Return the report's table of requirements, on the one network there is."""
     section = reports.default_profile(made_up(rmse)).split("## ")[1]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if "|" in line]
     return {row[0]: row[1] for row in rows[2:]}

@@ -22,7 +22,7 @@ PERIOD_NS = 200_000_000
 IDS = ["v01", "v02", "v03", "v04"]
 Entry = tuple[int, int, str]
 diary: dict[str, list[Entry]] = {}
-"""What the programs below saw, by node: when by the loop's clock, in which incarnation, and what."""
+"""Record of the programs below, by node: when by the loop's clock, in which incarnation, and what."""
 
 
 def note(node: Node, what: str) -> None:
@@ -154,7 +154,7 @@ def test_who_is_killed_is_silent_deaf_and_comes_back_as_another() -> None:
     assert [what for _, _, what in noted["v02"] if not what.startswith("fix")][1:] == [
         next(what for t, _, what in noted["v02"] if t == 1_700_000_000),
         "ends",
-    ], "no last words of the killed one: it is gone at once"
+    ], "no final message of the killed one: it is gone at once"
     assert not any(row["size_bytes"] == len(b"last words") for row in rows(emulation))
     begun = {incarnation: (t, what) for t, incarnation, what in noted["v02"] if what.startswith("begins")}
     assert [begun[0][0], begun[1][0]] == [0, 1_700_000_000]
@@ -219,7 +219,7 @@ def test_at_the_resume_come_packets_then_fixes_then_timers_each_in_order() -> No
     assert packets == sorted(packets)
     assert woken[12:16] == [f"fix {t}" for t in range(600_000_000, 1_300_000_000, PERIOD_NS)]
     later = [(t, what) for t, _, what in noted["v02"] if t > 1_300_000_000 and what in ("first", "strike")]
-    assert later[:2] == [(1_550_000_000, "strike"), (1_600_000_000, "first")], "then each sleeps its time anew"
+    assert later[:2] == [(1_550_000_000, "strike"), (1_600_000_000, "first")], "then each sleeps its time again"
     assert before[-1][2].startswith("packet")
 
 

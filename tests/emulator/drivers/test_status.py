@@ -41,7 +41,7 @@ def emulate(folder: Path, **sections: object) -> Emulation:
 
 @pytest.fixture(scope="module")
 def shots(tmp_path_factory: pytest.TempPathFactory) -> list[Snapshot]:
-    """What was to be seen before the run, and after each of its periods."""
+    """Snapshots before the run, and after each of its periods."""
     emulation = emulate(tmp_path_factory.mktemp("course") / "run", fault=[KILLED])
     clock = Clock()
     emulation.watch(clock.tick)

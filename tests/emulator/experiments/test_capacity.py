@@ -1,4 +1,4 @@
-"""How many peers the air has room for: what is measured, and where loss begins."""
+"""Capacity of the channel: what is measured, and where loss begins."""
 
 import gc
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What is odd but allowed works: nobody in range, one vehicle, a network in parts, a single particle."""
+"""Odd but allowed networks: nobody in range, one vehicle, a network in parts, a single particle."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Whom a fault acts on: each selector against its plain definition, and choices that depend on nothing else."""
+"""Targets of faults: each selector against its plain definition, and choices that depend on nothing else."""
 
 import math
 from typing import Any

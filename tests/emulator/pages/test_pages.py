@@ -29,7 +29,7 @@ HOSTILE = [MARKUP, ATTRIBUTE, "' onmouseover='alert(1)", "{{ 7 * 7 }}{% include 
 
 
 class Elements(HTMLParser):
-    """How often a page has each element, its attributes, and its text."""
+    """Count each element of a page, its attributes, and its text."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

@@ -23,7 +23,7 @@ US = 1_000
 PHYSICAL = {"path_loss": {"kind": "log_distance"}, "fading": {}, "mac": {}}
 seeds = st.integers(0, 2**63 - 1)
 Send = tuple[int, int, int]
-"""When, who, how many bytes."""
+"""Transmissions: time, sender, bytes."""
 Span = tuple[int, int]
 """From when until when."""
 
@@ -371,16 +371,16 @@ def test_every_pair_has_one_outcome_and_what_collided_met_a_frame_in_its_receive
 
 
 def test_the_same_frames_alone_show_what_would_have_arrived() -> None:
-    """Outcomes in a crowd against those of each frame by itself: faded in both, or collided only in the crowd."""
+    """Outcomes among many vehicles, against those of each frame alone: faded in both, or collided only there."""
     position_m = scattered(12, 3, side_m=900)
-    crowd, lonely = (engine(position_m, 5, **PHYSICAL) for _ in range(2))
+    vehicles, lonely = (engine(position_m, 5, **PHYSICAL) for _ in range(2))
     for number in range(40):
         for node in range(12):
-            crowd.transmit(number * 20 * MS + 150 * US * node, node, [bytes(300)])
+            vehicles.transmit(number * 20 * MS + 150 * US * node, node, [bytes(300)])
             lonely.transmit((number * 12 + node) * 20 * MS, node, [bytes(300)])
-    crowd.drain()
+    vehicles.drain()
     lonely.drain()
     alone = {(row["sender"], row["seq"], row["receiver"]): row["outcome"] for row in rows(lonely)}
     assert set(alone.values()) == {"delivered", "faded"}
-    seen = Counter((alone[row["sender"], row["seq"], row["receiver"]], row["outcome"]) for row in rows(crowd))
+    seen = Counter((alone[row["sender"], row["seq"], row["receiver"]], row["outcome"]) for row in rows(vehicles))
     assert set(seen) == {("faded", "faded"), ("delivered", "delivered"), ("delivered", "collided")}

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from emulator.records.atomic import whole, write_atomically
+from emulator.records.atomic import atomically, write_atomically
 from vnet.errors import VnetError
 
 
 def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write_atomically(path, "first")
-    with whole(path) as part:
+    with atomically(path) as part:
         part.write_text("second")
         assert path.read_text() == "first", "until the block is over"
         assert part.parent == path.parent, "a move within one file system"
@@ -24,7 +24,7 @@ def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:
 def test_a_failure_leaves_what_was_there_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write_atomically(path, "first")
-    with pytest.raises(KeyboardInterrupt), whole(path) as part:
+    with pytest.raises(KeyboardInterrupt), atomically(path) as part:
         part.write_text("half")
         raise KeyboardInterrupt
     assert path.read_text() == "first"
@@ -33,12 +33,12 @@ def test_a_failure_leaves_what_was_there_and_nothing_else(tmp_path: Path) -> Non
 
 def test_a_folder_appears_whole(tmp_path: Path) -> None:
     path = tmp_path / "csv"
-    with pytest.raises(ZeroDivisionError), whole(path) as part:
+    with pytest.raises(ZeroDivisionError), atomically(path) as part:
         part.mkdir()
         (part / "a.csv").write_text("half")
         raise ZeroDivisionError
     assert not list(tmp_path.iterdir())
-    with whole(path) as part:
+    with atomically(path) as part:
         part.mkdir()
         (part / "a.csv").write_text("x")
     assert [each.name for each in path.iterdir()] == ["a.csv"]

@@ -1,4 +1,4 @@
-"""What programs may report, however odd, is measured or left out; it never stops a run or its recording."""
+"""Odd reports of programs: each is measured or left out; it never stops a run or its recording."""
 
 import math
 from pathlib import Path

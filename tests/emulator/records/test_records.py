@@ -1,4 +1,4 @@
-"""What is kept of a run and how it is judged: damage to a trace is found by the check whose business it is."""
+"""Records of a run and their judgement: damage to a trace is found by the check whose business it is."""
 
 import json
 from pathlib import Path

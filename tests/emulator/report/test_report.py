@@ -55,7 +55,7 @@ class Page(HTMLParser):
 
 
 def vnet(arguments: list[str]) -> Any:
-    """Run a command in this process; without a fixed hash seed, it would start itself anew."""
+    """Run a command in this process; without a fixed hash seed, it would restart itself."""
     return CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, arguments)
 
 
@@ -68,7 +68,7 @@ def simulate(folder: Path, *options: str, scenario: str = "faults.toml") -> Path
 
 @pytest.fixture(scope="module")
 def cooperative(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short run of the flagship."""
+    """A short run of the cooperative positioning program."""
     options = ("--duration", "2", "--no-report", "--set", "program.options.particles=50")
     return simulate(tmp_path_factory.mktemp("runs") / "coop", *options, scenario="twelve.toml")
 

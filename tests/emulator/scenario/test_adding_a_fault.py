@@ -34,11 +34,11 @@ def spike() -> Iterator[type[Fault]]:
         probability: Annotated[Probability, Drawn(1, 5, per=10)] = 0.1
         """Probability of delaying a frame, at each receiver independently."""
         longest_ms: Annotated[float, Drawn(50, 500)] = Field(300.0, gt=1, le=60_000)
-        """Longest added latency; the shortest is 1 ms."""
+        """Longest extra latency; the shortest is 1 ms."""
 
         @property
         def bounds_ms(self) -> tuple[float, float]:
-            """Zero and the longest added latency."""
+            """Zero and the longest extra latency."""
             return 0.0, self.longest_ms
 
         def added_ms(self, draws: Array) -> Array:
@@ -84,7 +84,7 @@ def test_a_scenario_states_it_and_says_what_is_wrong_with_it(tmp_path: Path, spi
 def test_the_reference_page_describes_it(spike: type[Fault]) -> None:
     page = fault_page.page()
     assert "| [`latency_spike`](#latency_spike) | links | Some frames arrive much later" in page
-    assert "| `longest_ms` | number | `300` | ms | > 1, ≤ 60000 | Longest added latency" in page
+    assert "| `longest_ms` | number | `300` | ms | > 1, ≤ 60000 | Longest extra latency" in page
 
 
 def test_campaigns_draw_it_with_its_parameters(spike: Any) -> None:

@@ -28,7 +28,7 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "skew": {"offset_ms": 250.0},
     "drift": {"rate_ppm": 300.0},
 }
-"""What a kind cannot do without."""
+"""Parameters that a kind requires."""
 DEFAULTS: dict[str, dict[str, Any]] = {
     "partition": {"groups": "halves"},
     "burst_loss": {"enter": 0.05, "leave": 0.3, "loss_bad": 1.0, "loss_good": 0.0},
@@ -196,7 +196,7 @@ def test_any_faults_survive_being_written_and_read(
 
 
 def same(one: FaultPlan, other: FaultPlan) -> bool:
-    """Whether two plans do the same at all times, by the same names and with the same luck."""
+    """Return True if two plans do the same at all times, by the same names and with the same draws."""
     return [(p.label, p.start_ns, p.end_ns, p.nodes.tolist()) for p in one.faults] == [
         (p.label, p.start_ns, p.end_ns, p.nodes.tolist()) for p in other.faults
     ]

@@ -37,7 +37,7 @@ class Terminal(io.StringIO):
 
 
 class Pictures:
-    """What is drawn: the lines of now."""
+    """Return the lines that are drawn now."""
 
     def __init__(self, *lines: str) -> None:
         self.lines = list(lines)

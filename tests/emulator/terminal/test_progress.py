@@ -1,4 +1,4 @@
-"""How a run gets on, told to terminals, logs and machines; and whoever listens, the run is the same."""
+"""Progress of a run, for terminals, logs and machines; and whoever listens, the run is the same."""
 
 import io
 import json

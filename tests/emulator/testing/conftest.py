@@ -1,4 +1,4 @@
-"""What these tests need imported once: pytester forgets what a session imported, and numpy cannot come twice."""
+"""Modules that these tests import once: pytester forgets what a session imported, and numpy cannot come twice."""
 
 from importlib import import_module
 

@@ -8,7 +8,7 @@ PERIOD_NS = 100_000_000
 
 
 async def impatient(node: Node) -> None:
-    """A beacon that crashes when it finds that it stood still."""
+    """A beacon that crashes when it finds that it was paused."""
     last_ns = node.now_ns
     while True:
         await asyncio.sleep(0.1)
@@ -30,7 +30,7 @@ async def proud(node: Node) -> None:
 
 
 async def stubborn(node: Node) -> None:
-    """A beacon that hangs for good when it is started anew."""
+    """A beacon that hangs for good when it is restarted."""
     while node.incarnation:
         pass
     async for _ in node.gnss:

@@ -263,7 +263,7 @@ async def test_both(vnet_emulation, live):
 
 
 def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) -> None:
-    """What the test did, instant by instant, is in the scenario that it leaves."""
+    """Check that everything the test did, instant by instant, is in the scenario that it leaves."""
     run_tests(pytester, LIVE_OR_NOT).assert_outcomes(passed=2)
     folders = sorted((pytester.path.parent / "basetemp").glob("**/vnet-1"))
     again = pytester.path / "again"

@@ -99,7 +99,7 @@ def test_a_campaign_draws_the_same_for_a_seed_and_every_kind_at_last() -> None:
     plan = Plan.of(scenario, "random", 120, 5)
     drawn = [plan.draw(number) for number in range(120)]
     assert [plan.draw(number).fault for number in range(5)] == [run.fault for run in drawn[:5]]
-    assert Plan.of(scenario, "random", 1, 9).draw(0) == drawn[4], "a failure is had again by its seed alone"
+    assert Plan.of(scenario, "random", 1, 9).draw(0) == drawn[4], "a failure is reproduced by its seed alone"
     assert {fault.kind for run in drawn for fault in run.fault} == set(simulated_kinds())
     assert {len(run.fault) for run in drawn} == {1, 2, 3, 4}
 

@@ -42,7 +42,7 @@ LATE_S = 1.5
 
 @pytest.fixture(scope="module", autouse=True)
 def strict() -> Iterator[None]:
-    """What Rerun would only warn of is an error."""
+    """Turn Rerun's warnings into errors."""
     rr.set_strict_mode(True)
     yield
     rr.set_strict_mode(False)
@@ -50,7 +50,7 @@ def strict() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> Told:
-    """What a simulated run with faults tells, having crossed the wire."""
+    """Messages of a simulated run with faults, having crossed the wire."""
     scenario = Scenario.model_validate(
         {
             "run": {"duration_s": 3.0, "name": "told", "settle_s": 0.5},

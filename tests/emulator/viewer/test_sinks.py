@@ -1,4 +1,4 @@
-"""Where recordings go: what may be chosen, what is listened at, and that all sinks get everything."""
+"""Destinations of recordings: what may be chosen, what is listened at, and that all sinks get everything."""
 
 import os
 import signal
@@ -189,7 +189,7 @@ def everything_of_ours() -> set[str]:
 
 
 def _numbers(path: Path) -> dict[float, list[float]]:
-    """What has been drawn so far; none while the last message is half written or the file is not there."""
+    """Return what has been drawn so far; none while the last message is half written or the file is not there."""
     try:
         drawn = read_back(path)
     except (ValueError, RuntimeError):

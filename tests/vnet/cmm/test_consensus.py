@@ -304,7 +304,7 @@ def test_an_average_is_not_drawn_to_a_state_beyond_the_gate() -> None:
 
 @pytest.mark.parametrize("alive_rounds", [20, 80])
 def test_who_gives_to_the_dead_keeps_the_mean_of_before(alive_rounds: int) -> None:
-    """If they die before the first mean has settled, there is none until one has begun anew without them."""
+    """If they die before the first mean has settled, there is none until one has begun again without them."""
     nodes = {name: RatioConsensus(name) for name in "abc"}
     rng = np.random.default_rng(1)
     shares: dict[str, Share] = {}

@@ -78,7 +78,7 @@ def test_what_is_ready_stands_in_a_deque(loop: StandingLoop) -> None:
 
 
 class Appended(deque[asyncio.Handle]):
-    """A queue that knows what was put in with `append`, and refuses every other way in."""
+    """A queue that knows what was put in with `append`, and refuses every other method."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What a process starts with `die_with_parent` ends with it, even if it is killed and signals are ignored."""
+"""Processes started with `die_with_parent` end with their parent, even if it is killed and signals are ignored."""
 
 import subprocess
 import sys

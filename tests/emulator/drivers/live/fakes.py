@@ -1,4 +1,4 @@
-"""What surrounds the parts of a live run, without processes and without Zenoh: it notes what it is told to do."""
+"""Surroundings of the parts of a live run, without processes and without Zenoh: it notes what it is told to do."""
 
 import signal
 from collections.abc import Callable, Coroutine, Iterable, Sequence

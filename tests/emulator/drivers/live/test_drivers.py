@@ -195,7 +195,7 @@ def test_a_message_of_the_other_pacing_is_refused(monkeypatch: pytest.MonkeyPatc
 
 
 def frames(node: str, message: Any) -> wire.AgentMessage | None:
-    """A process in real time that acknowledges every batch, and says its last words when it is told to end."""
+    """A process in real time that acknowledges every batch, and sends a final message when it is told to end."""
     if isinstance(message, wire.Batch):
         sent = [wire.Frame(node, b"x")] if message.fixes else []
         return wire.Frames(b"1", message.seq, message.seq + 1, [], wire.Traffic(sent))
