@@ -2,6 +2,7 @@
 
 - `python`: written to a file if it begins with `# NAME.py`. A program (a function of `node: Node`) is run by the
   page's own commands, or else simulated; tests run under pytest; everything else is executed, in one namespace.
+  `python of PATH` is an excerpt of a file of the repository, at any depth of indentation.
 - `toml`: loaded as a scenario; written to a file if it begins with `# NAME.toml`.
 - `csv NAME`: written to that file.
 - `sh`: each command is run, or parsed (`tests.docs.commands`); its comment may say `status 1`.
@@ -76,6 +77,9 @@ class Page:
             commands.run(words, 3, self._folder)
 
     def _python(self, block: Block) -> str | None:
+        if block.name.startswith("of "):
+            _check_excerpt(block)
+            return None
         code = compile(block.text, block.place, "exec")
         if NOT_INSTALLED.search(block.text):
             return None
@@ -143,6 +147,14 @@ def _at(place: str) -> Any:
         raise DocsError(f"{place}: {error}") from None
     except Exception as error:
         raise DocsError(f"{place}: {type(error).__name__}: {error}") from error
+
+
+def _check_excerpt(block: Block) -> None:
+    """Raise DocsError unless the lines of a block are consecutive lines of the file that it names."""
+    path = ROOT / block.name.removeprefix("of ")
+    excerpt, source = ([line.strip() for line in text.splitlines()] for text in (block.text, path.read_text()))
+    if not any(source[at : at + len(excerpt)] == excerpt for at in range(len(source))):
+        raise DocsError(f"is no excerpt of {path.relative_to(ROOT)}")
 
 
 def shows(printed: str, shown: str) -> bool:

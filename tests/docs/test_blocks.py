@@ -63,6 +63,10 @@ BROKEN = {
         "```yaml\non: push\njobs:\n  a:\n    runs-on: x\n    steps:\n      - run: vnet simulate\n```\n",
         "SCENARIO",
     ),
+    "an excerpt that is none": (
+        "```python of agents/beacon.py\nprint('not there')\n```\n",
+        "no excerpt of agents/beacon.py",
+    ),
 }
 
 
