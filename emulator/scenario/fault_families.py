@@ -11,7 +11,7 @@ draws it, and which law it follows. The layers above act on families:
 | `LossFault`, `DelayFault` | `radio/link_faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
 | `SenderFault` | `radio/sender_faults.py` | `checks/senders.py` |
 | `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
-| `Infrastructure` | `drivers/live.py` | `checks/fault_effects.py` |
+| `Infrastructure` | `drivers/live/reconnection.py` | `checks/fault_effects.py` |
 """
 
 from __future__ import annotations

@@ -13,15 +13,13 @@ from emulator.drivers.live.inbox import Refusals
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.viewer.sinks import Sinks
-from vnet.errors import ProgramError, TransportError, VnetError
+from vnet.errors import ProgramError, TransportError, VnetError, first_names
 from vnet.transport import wire
 from vnet.transport.access import OBSERVER
 
 RECORDER = "recorder"
 RECORDER_POLL_S = 0.05
 """Seconds between two looks whether the recorder listens: nothing tells of it."""
-SHOWN_NODES = 8
-"""Number of missing nodes that an error names."""
 
 
 class Joining:
@@ -113,6 +111,5 @@ class Joining:
 
     def _describe_missing(self, timeout_s: float) -> str:
         missing = self._members.missing or ["the recorder"]
-        shown = ", ".join(missing[:SHOWN_NODES]) + (", …" if len(missing) > SHOWN_NODES else "")
         total = len(self._emulation.world.node_ids)
-        return f"{len(missing)} of {total} nodes have not joined within {timeout_s:g} s: {shown}"
+        return f"{len(missing)} of {total} nodes have not joined within {timeout_s:g} s: {first_names(missing)}"

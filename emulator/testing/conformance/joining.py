@@ -30,7 +30,7 @@ def joining(scene: Scene) -> None:
     scene.bench.say(scene.make_welcome(OTHERS_NONCE))
     scene.bench.say(wire.End(OTHERS_NONCE, "another session is refused", refused=True))
     deadline_s = time.monotonic() + QUIET_S
-    while (heard := scene.hear(deadline_s - time.monotonic())) is not None:
+    while (wait_s := deadline_s - time.monotonic()) > 0 and (heard := scene.hear(wait_s)) is not None:
         if isinstance(heard.message, wire.Hello) and heard.message.ready:
             scene.findings.fail("others_nonce", "ready after another's welcome", heard.data)
             raise SceneOverError
@@ -79,9 +79,9 @@ def ask_stack(scene: Scene, timeout_s: float) -> None:
     while time.monotonic() < deadline_s:
         scene.bench.say(wire.StackRequest())
         wait_s = time.monotonic() + ASK_EVERY_S
-        while (said := scene.hear(wait_s - time.monotonic())) is not None:
+        while (left_s := wait_s - time.monotonic()) > 0 and (said := scene.hear(left_s)) is not None:
             if isinstance(said.message, wire.StackDump):
-                while scene.hear(QUIET_S) is not None:  # what answers earlier requests
+                for _ in scene.until_quiet():  # answers to earlier requests
                     pass
                 return
         scene.check_stays()

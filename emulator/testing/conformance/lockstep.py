@@ -136,7 +136,7 @@ def survives(scene: Scene) -> bool:
     scene.findings.expect("malformed")
     for data in MALFORMED:
         scene.bench.say(data)
-    while (said := scene.hear(QUIET_S)) is not None:
+    for said in scene.until_quiet():
         if isinstance(said.message, wire.Yield):
             scene.findings.fail("malformed", "a Yield", said.data)
     status = scene.bench.agent.exit_status

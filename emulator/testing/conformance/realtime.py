@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 
+from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.lockstep import PACKET_AFTER_NS, survives
 from emulator.testing.conformance.scene import Scene
@@ -36,6 +37,7 @@ class Clock:
         self._next_fix = -(-start_ns // scene.world.period_ns)
         self._origin_ns = 0
         self.final = False
+        scene.take_frames = self._take
 
     def _now_ns(self, at_ns: int | None = None) -> int:
         return (time.monotonic_ns() if at_ns is None else at_ns) - self._origin_ns
@@ -76,13 +78,12 @@ class Clock:
         """Take what the agent says until this instant of the run."""
         while (wait_ns := time_ns - self._now_ns()) > 0:
             said = self.scene.hear(wait_ns / 1e9)
-            if said is not None and isinstance(said.message, wire.Frames):
-                self._take(said.message, said.data, said.at_ns)
-            elif said is None and self.scene.bench.agent.exit_status is not None:
+            if said is None and self.scene.bench.agent.exit_status is not None:
                 self.scene.check_stays()
 
-    def _take(self, message: wire.Frames, data: bytes, at_ns: int) -> None:
-        findings = self.scene.findings
+    def _take(self, said: Said) -> None:
+        message, data, at_ns, findings = said.message, said.data, said.at_ns, self.scene.findings
+        assert isinstance(message, wire.Frames)
         findings.expect("frames_seq", "missed", "acknowledges")
         if self._frames_seq is not None and message.seq != self._frames_seq:
             findings.fail("frames_seq", f"seq = {message.seq}, and not {self._frames_seq}", data)
@@ -111,8 +112,9 @@ class Clock:
 
     def be_absent(self) -> None:
         """Go away and come back: what the agent said meanwhile is lost."""
+        self.scene.take_frames = None
         absence(self.scene)
-        self._frames_seq = None
+        self.scene.take_frames, self._frames_seq = self._take, None
 
     def check_acknowledged(self) -> None:
         """Wait until all batches are acknowledged, and the gaps are named."""
@@ -133,11 +135,8 @@ class Clock:
         scene.bench.say(wire.End(None, "the run is over"))
         deadline_ns = self._now_ns() + NS_PER_S
         while not self.final and self._now_ns() < deadline_ns:
-            said = scene.hear((deadline_ns - self._now_ns()) / 1e9)
-            if said is None:
+            if scene.hear((deadline_ns - self._now_ns()) / 1e9) is None:
                 break
-            if isinstance(said.message, wire.Frames):
-                self._take(said.message, said.data, said.at_ns)
         if not self.final:
             scene.findings.fail("final", "no such Frames within 1 s")
         scene.await_exit("ends", scene.patience_s, fails=False)

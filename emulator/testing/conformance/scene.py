@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
@@ -44,6 +44,8 @@ class Scene:
     nonce: bytes = b""
     silent: bool = True
     """True while only Hello and StackDump are allowed, before the run begins."""
+    take_frames: Callable[[Said], None] | None = None
+    """Function that counts the Frames of a real-time run, in whichever step of the scene they arrive."""
 
     def __post_init__(self) -> None:
         limit = self.scenario.radio.max_payload_bytes
@@ -63,8 +65,20 @@ class Scene:
             elif self.silent and not isinstance(said.message, wire.Hello | wire.StackDump):
                 self.findings.fail("silence", type(said.message).__name__, said.data)
             else:
+                if self.take_frames is not None and isinstance(said.message, wire.Frames):
+                    self.take_frames(said)
                 return said
         return None
+
+    def until_quiet(self) -> Iterator[Said]:
+        """Yield messages until nothing but Frames has come for `QUIET_S`, for `patience_s` at most."""
+        deadline_s = time.monotonic() + self.patience_s
+        quiet_s = time.monotonic() + QUIET_S
+        while (wait_s := min(quiet_s, deadline_s) - time.monotonic()) > 0:
+            said = self.hear(wait_s)
+            if said is not None and not isinstance(said.message, wire.Frames):
+                quiet_s = time.monotonic() + QUIET_S
+                yield said
 
     def await_message(
         self,
@@ -81,7 +95,7 @@ class Scene:
         self.findings.expect(check)
         deadline_s = time.monotonic() + timeout_s
         last: Said | None = None
-        while (said := self.hear(deadline_s - time.monotonic())) is not None:
+        while (wait_s := deadline_s - time.monotonic()) > 0 and (said := self.hear(wait_s)) is not None:
             if isinstance(said.message, kind) and fits(said.message):
                 return said.message, said
             last = said

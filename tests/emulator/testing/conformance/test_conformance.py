@@ -1,17 +1,23 @@
 """Conformance finds no fault with agents that have none, and tells agents with a mistake which one."""
 
+import itertools
 import sys
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from emulator.cli.commands import app
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import run_app
+from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.findings import CHECKS, Findings, decoding_problem, described
 from emulator.testing.conformance.play import SCENES, Conformance
+from emulator.testing.conformance.scene import Scene, SceneOverError
 from tests.support.paths import ROOT
 from vnet.errors import VnetError
+from vnet.transport import wire
 
 VALUES = ["--connect", "{endpoint}", "--run", "{run}", "--node", "{node}", "--credentials", "{credentials}"]
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py", *VALUES]
@@ -157,3 +163,24 @@ def test_what_does_not_decode_is_named_by_its_field(data: bytes, problem: str) -
 def test_bytes_that_are_no_msgpack_are_shown_all_the_same() -> None:
     assert described(b"\xc1" * 60).startswith("no msgpack (")
     assert described(b"\xc1" * 60).endswith("60 bytes: " + " ".join(["c1"] * 48) + " …")
+
+
+def frames(seq: int) -> Said:
+    """Frames as an agent in real time sends them all the time."""
+    message = wire.Frames(b"nonce", seq, 0, (), wire.Traffic())
+    return Said(wire.encode(message), 0, message, "")
+
+
+def test_an_agent_that_never_stops_sending_does_not_hold_a_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = itertools.count(step=0.01)
+    taken: list[Said] = []
+    monkeypatch.setattr("emulator.testing.conformance.scene.time.monotonic", lambda: next(now_s))
+    scene: Any = Scene.__new__(Scene)
+    scene.patience_s, scene.silent, scene.findings, scene.nonce = 5.0, False, Findings(), b""
+    endless = (frames(seq) for seq in itertools.count())
+    scene.bench = SimpleNamespace(hear=lambda timeout_s: next(endless), agent=SimpleNamespace(exit_status=None))
+    scene.take_frames = taken.append
+    assert list(scene.until_quiet()) == []
+    assert len(taken) > 3, "none is passed over"
+    with pytest.raises(SceneOverError):
+        scene.await_message(wire.StackDump, "stack", 1.0)
