@@ -83,14 +83,14 @@ def default(
     only: OnlyOption = None,
     live: LiveOption = False,
 ) -> None:
-    """vnet's own profile on the same networks, against the limit of any cooperation. Takes hours for all."""
+    """vnet's own profile on the same networks, against the hears-all bound. Takes hours for all."""
     from emulator.experiments import reports, result_figures
 
     with one_line_errors():
         folder = _folder(out, "default")
         cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
         results = _run(cells, folder, "default", only, live)
-        if any(row["mechanism"] == "limit" for row in results):
+        if any(row["mechanism"] == "bound" for row in results):
             result_figures.ratio_bars(results, folder / "default")
             _show(reports.default_profile(results), folder / "default.md")
 

@@ -73,13 +73,13 @@ def table2_cells(
 def default_cells(
     networks: dict[str, dict[str, Any]], seeds: Sequence[int], rows: dict[str, dict[str, Any]] | None = None
 ) -> list[Cell]:
-    """vnet's own profile on the same networks: centralized, the limit of each component, and the mechanisms."""
+    """vnet's own profile on the same networks: centralized, the bound of each component, and the mechanisms."""
     cells = []
     for network, section in networks.items():
         for seed in seeds:
-            for mechanism in ("centralized", "limit"):
+            for mechanism in ("centralized", "bound"):
                 labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
-                cells.append(Cell(labels, bound_scenario(section, seed, mechanism == "limit"), SETTLED_S))
+                cells.append(Cell(labels, bound_scenario(section, seed, mechanism == "bound"), SETTLED_S))
             for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
                 labels = {"network": network, "mechanism": mechanism, "seed": seed}
                 cells.append(Cell(labels, default_scenario(section, seed, options), SETTLED_S))

@@ -20,8 +20,8 @@ from emulator.records.metrics import anees_band
 from emulator.records.paper_values import PAPER_RMSE_M
 
 Result = Mapping[str, Any]
-LIMIT_RATIO = 1.35
-"""Optimized weights are wanted within so many times the limit, on each network and in each component."""
+BOUND_RATIO = 1.35
+"""Optimized weights are wanted within so many times the bound, on each network and in each component."""
 
 PAPER_TABLE1: dict[float | str, tuple[float, float]] = {
     "optimized": (0.13, 0.58),
@@ -123,7 +123,7 @@ def _table2_section(results: Sequence[Result], name: str) -> str:
 
 
 def default_profile(results: Sequence[Result]) -> str:
-    """vnet's own profile: RMSE, the ratio to the limit, consistency and cost of each mechanism."""
+    """vnet's own profile: RMSE, the ratio to the bound, consistency and cost of each mechanism."""
     networks = unique(results, "network")
     mechanisms = unique(results, "mechanism")
 
@@ -133,8 +133,8 @@ def default_profile(results: Sequence[Result]) -> str:
             row = [mechanism]
             for network in networks:
                 found = select(results, network=network, mechanism=mechanism)
-                limit = select(results, network=network, mechanism="limit")
-                row.append(cell(*_same_seeds(found, limit)) if found else "–")
+                bound = select(results, network=network, mechanism="bound")
+                row.append(cell(*_same_seeds(found, bound)) if found else "–")
             rows.append(row)
         return f"## {title}\n\n" + markdown_table(["mechanism", *(n.upper() for n in networks)], rows)
 
@@ -142,8 +142,8 @@ def default_profile(results: Sequence[Result]) -> str:
         "# The default profile",
         _wanted(results, networks),
         table("RMSE of the common error [m]", lambda a, _: mean_and_error(column(a, "rmse_m"))),
-        table("Relative to the limit, the same seeds", _ratio_to_limit),
-        table("Relative to the limit, by component", _component_ratios),
+        table("Relative to the bound, the same seeds", _ratio_to_bound),
+        table("Relative to the bound, by component", _component_ratios),
         table("Network deviation [m]", lambda a, _: mean_and_error(column(a, "deviation_m"))),
         table("RMSE of the position [m]", lambda a, _: mean_and_error(column(a, "position_rmse_m"))),
         table("ANEES of the common error", lambda a, _: mean_and_error(column(a, "common_error_anees"), 2)),
@@ -155,23 +155,23 @@ def default_profile(results: Sequence[Result]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _same_seeds(rows: list[Result], limit: list[Result]) -> tuple[list[Result], list[Result]]:
+def _same_seeds(rows: list[Result], bound: list[Result]) -> tuple[list[Result], list[Result]]:
     seeds = {row["seed"] for row in rows}
-    return rows, [row for row in limit if row["seed"] in seeds]
+    return rows, [row for row in bound if row["seed"] in seeds]
 
 
-def _ratio_to_limit(rows: list[Result], limit: list[Result]) -> str:
-    ratio, error = paired_ratio(column(rows, "rmse_m"), column(limit, "rmse_m"))
+def _ratio_to_bound(rows: list[Result], bound: list[Result]) -> str:
+    ratio, error = paired_ratio(column(rows, "rmse_m"), column(bound, "rmse_m"))
     return with_error(ratio, error, ".2f")
 
 
-def _component_ratios(rows: list[Result], limit: list[Result]) -> str:
-    return " / ".join(f"{ratio:.2f}" for ratio in _by_component(rows, limit)) or "–"
+def _component_ratios(rows: list[Result], bound: list[Result]) -> str:
+    return " / ".join(f"{ratio:.2f}" for ratio in _by_component(rows, bound)) or "–"
 
 
-def _by_component(rows: list[Result], limit: list[Result]) -> list[float]:
-    """Ratios to the limit of each component; none if the components are not the same."""
-    ours, bound = (np.array([row["component_rmse_m"] for row in some]) for some in (rows, limit))
+def _by_component(rows: list[Result], references: list[Result]) -> list[float]:
+    """Ratios to the bound of each component; none if the components are not the same."""
+    ours, bound = (np.array([row["component_rmse_m"] for row in some]) for some in (rows, references))
     if ours.shape != bound.shape:
         return []
     return [paired_ratio(a.tolist(), b.tolist())[0] for a, b in zip(ours.T, bound.T, strict=True)]
@@ -185,12 +185,12 @@ def _cost(rows: list[Result], _: list[Result]) -> str:
 
 def _wanted(results: Sequence[Result], networks: Sequence[str]) -> str:
     """The requirements on optimized weights, and whether they are met."""
-    names = [f"at most {LIMIT_RATIO} × the limit", "in each component", "no vehicle diverged"]
+    names = [f"at most {BOUND_RATIO} × the bound", "in each component", "no vehicle diverged"]
     names += [f"{a} not worse than {b}" for a, b in COMPARED]
     columns = []
     for network in networks:
         rows = select(results, network=network, mechanism="optimized")
-        pair = _same_seeds(rows, select(results, network=network, mechanism="limit"))
+        pair = _same_seeds(rows, select(results, network=network, mechanism="bound"))
         if not rows or len(pair[1]) != len(rows):
             columns.append(["–"] * len(names))
             continue
@@ -199,8 +199,8 @@ def _wanted(results: Sequence[Result], networks: Sequence[str]) -> str:
         diverged = sum(column(rows, "divergent"))
         columns.append(
             [
-                f"{_yes(ratio <= LIMIT_RATIO)}: {with_error(ratio, error, '.2f')}",
-                f"{_yes(largest <= LIMIT_RATIO)}: {largest:.2f}",
+                f"{_yes(ratio <= BOUND_RATIO)}: {with_error(ratio, error, '.2f')}",
+                f"{_yes(largest <= BOUND_RATIO)}: {largest:.2f}",
                 f"{_yes(diverged == 0)}: {diverged} in {len(rows)} runs",
                 *(_not_worse(*_difference(results, network, a, b)) for a, b in COMPARED),
             ]
@@ -253,7 +253,7 @@ def _notes(results: Sequence[Result]) -> str:
     runs = len(unique(results, "seed"))
     low, high = anees_band(runs)
     return (
-        f"100 s, counted from 20 s on; up to {in_seeds(runs)}. `limit` is one centralized filter "
+        f"100 s, counted from 20 s on; up to {in_seeds(runs)}. `bound` is one centralized filter "
         "a connected component, `centralized` one over all. `one hop` mixes particles as the paper does and passes "
         "no fixes on. Not worse: not by more than two standard errors of the paired difference. ANEES is 1 for a "
         f"consistent filter; the 95 % band of {runs} independent samples of two degrees of freedom is {low:.2f} to "

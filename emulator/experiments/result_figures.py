@@ -32,7 +32,7 @@ from emulator.experiments.style import (
 from emulator.experiments.tables import mean_and_standard_error, paired_ratio
 from vnet.types import Array
 
-RATIO_LINES = {1.0: "the limit", 1.05: "1.05", 1.35: "1.35"}
+RATIO_LINES = {1.0: "the bound", 1.05: "1.05", 1.35: "1.35"}
 TIME_COLUMNS = {
     "common_error_rmse_m": "RMSE of the\ncommon error (m)",
     "deviation_m": "deviation across\nthe network (m)",
@@ -201,24 +201,24 @@ def ratio_bars(
     rows: Sequence[Mapping[str, Any]],
     out: Path,
     column: str = "rmse_m",
-    limit: str = "limit",
+    bound: str = "bound",
     lines: Mapping[float, str] | None = None,
 ) -> Path:
-    """The default profile: RMSE relative to the limit's, by network and mechanism, with ± 1 standard error.
+    """The default profile: RMSE relative to the bound's, by network and mechanism, with ± 1 standard error.
 
     `rows` are results with `network`, `mechanism`, `seed` and `column`; seeds are paired. `lines` are levels to
     mark, and what to write there.
     """
-    return save(draw_ratio_bars(rows, column, limit, RATIO_LINES if lines is None else lines), out)
+    return save(draw_ratio_bars(rows, column, bound, RATIO_LINES if lines is None else lines), out)
 
 
 @styled
 def draw_ratio_bars(
-    rows: Sequence[Mapping[str, Any]], column: str, limit: str, lines: Mapping[float, str]
+    rows: Sequence[Mapping[str, Any]], column: str, bound: str, lines: Mapping[float, str]
 ) -> Figure:
-    ratios = _ratios(rows, column, limit)
+    ratios = _ratios(rows, column, bound)
     networks = list(dict.fromkeys(str(row["network"]) for row in rows))
-    mechanisms = [name for name in dict.fromkeys(str(row["mechanism"]) for row in rows) if name != limit]
+    mechanisms = [name for name in dict.fromkeys(str(row["mechanism"]) for row in rows) if name != bound]
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     axes = figure.subplots()
     axes.set_yscale("log")
@@ -236,24 +236,24 @@ def draw_ratio_bars(
     axes.set_xticks(range(len(networks)), [shown(network) for network in networks])
     axes.set_xlim(-0.5, len(networks) - 0.5)
     axes.grid(axis="x", visible=False)
-    axes.set_ylabel("RMSE of the common error,\nratio to the limit (log scale)")
-    axes.set_title("How near each mechanism comes to the limit of its network, ± 1 standard error", pad=10)
+    axes.set_ylabel("RMSE of the common error,\nratio to the bound (log scale)")
+    axes.set_title("How near each mechanism comes to the bound of its network, ± 1 standard error", pad=10)
     figure.legend(loc="outside lower center", ncols=4, handlelength=2.6, handleheight=1.3)
     return figure
 
 
 def _ratios(
-    rows: Sequence[Mapping[str, Any]], column: str, limit: str
+    rows: Sequence[Mapping[str, Any]], column: str, bound: str
 ) -> dict[tuple[str, str], tuple[float, float]]:
-    """Ratio to the limit and its standard error by network and mechanism; without those that have none."""
+    """Ratio to the bound and its standard error by network and mechanism; without those that have none."""
     values: dict[tuple[str, str], dict[Any, float | None]] = {}
     for row in rows:
         values.setdefault((str(row["network"]), str(row["mechanism"])), {})[row["seed"]] = row[column]
     ratios = {}
     for (network, mechanism), by_seed in values.items():
-        reference = values.get((network, limit), {})
+        reference = values.get((network, bound), {})
         pair = paired_ratio([*by_seed.values()], [reference.get(seed) for seed in by_seed])
-        if mechanism != limit and not np.isnan(pair[0]):
+        if mechanism != bound and not np.isnan(pair[0]):
             ratios[network, mechanism] = pair
     return ratios
 

@@ -57,7 +57,7 @@ class Look:
 
 LOOKS = {
     "centralized": Look(BLACK, "-", "s", ""),
-    "limit": Look(GREY, (0, (1, 1)), "D", "...."),
+    "bound": Look(GREY, (0, (1, 1)), "D", "...."),
     "optimized": Look(BLUE, "-", "o", "////"),
     "random": Look(RED, (0, (5, 2)), "^", "xxxx"),
     "none": Look(GREEN, (0, (4, 1.5, 1, 1.5)), "v", "----"),

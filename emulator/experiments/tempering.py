@@ -2,7 +2,7 @@
 
 A filter that takes its vehicles to change their offsets in the lane sooner than they do counts old evidence as new
 and is too sure of itself (ANEES over 1); one that takes them to keep them longer is less sure than it could be. So
-ANEES chooses τ: for the limit, whose filter has so many particles that nothing else is wrong with it, and for
+ANEES chooses τ: for the bound, whose filter has so many particles that nothing else is wrong with it, and for
 cooperation.
 """
 
@@ -28,7 +28,7 @@ TAUS_S = (2.5, 5.0, 10.0, 20.0, 40.0, 80.0)
 WORLD_TAU_S = 20.0
 """Over how long the offsets of the default world change."""
 COOPERATIVE_ON = "n3"
-"""The network on which the cooperative default is swept too: it takes as long as all of the limit."""
+"""The network on which the cooperative default is swept too: it takes as long as all of the bound."""
 COMMON, POSITION = "common_error_anees", "position_anees"
 _NAMES = {COMMON: "common error", POSITION: "position"}
 _LOOKS: tuple[tuple[str, str, Any], ...] = (
@@ -48,15 +48,15 @@ def tempering_cells(
     taus_s: Sequence[float] = TAUS_S,
     duration_s: float = DEFAULT_S,
 ) -> list[Cell]:
-    """Each τ in the default world: for the limit on all networks, for the cooperative default on one of them."""
+    """Each τ in the default world: for the bound on all networks, for the cooperative default on one of them."""
     cells = []
     for network, section in networks.items():
-        for mechanism in ("limit", "optimized") if network == COOPERATIVE_ON else ("limit",):
+        for mechanism in ("bound", "optimized") if network == COOPERATIVE_ON else ("bound",):
             for tau_s in taus_s:
                 for seed in seeds:
                     labels: Labels = {"network": network, "mechanism": mechanism, "tau_s": tau_s, "seed": seed}
                     options = {"lateral_tau_s": tau_s}
-                    if mechanism == "limit":
+                    if mechanism == "bound":
                         scenario = bound_scenario(section, seed, True, options, duration_s)
                     else:
                         scenario = default_scenario(section, seed, options, duration_s)
@@ -88,7 +88,7 @@ def report(results: Sequence[Result]) -> str:
         f"{WORLD_TAU_S:g} s. ANEES is 1 for a consistent filter, more for one that is too sure; the 95 % band of "
         f"{runs} independent samples of two degrees of freedom is {low:.2f} to {high:.2f} (*: out of it). The "
         "samples within a run are not independent, but there are more than one: the standard error says how well "
-        "the mean is known. The limit reports no covariance of positions."
+        "the mean is known. The bound reports no covariance of positions."
     )
     return "\n\n".join(parts) + "\n"
 

@@ -46,7 +46,7 @@ CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
 LIMIT_VEHICLES = 100
-"""The limit is worked out for so many vehicles at most: it takes the longer the more there are."""
+"""Most vehicles for which the bound is computed: its cost grows with their number."""
 WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
 LONGEST_DETAIL = 60
 NAMED_DOWN = 6
@@ -92,7 +92,7 @@ class OverviewScene:
         canvas.rings("position", POSITION_RINGS_M)
         common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
         if self._limit is not None:
-            common.append(("limit: one filter that hears all", GREEN, 1.5))
+            common.append(("bound: one filter that hears all", GREEN, 1.5))
         if self._paper is not None:
             common.append((self._paper[0], GREY, 1.5))
         canvas.series("figures/common", common)

@@ -89,11 +89,11 @@ def test_table_two_puts_the_papers_figures_beside() -> None:
     assert "4.30" in text and "3.00" in text, "the paper's random N3, and ours over optimized"
 
 
-def test_ratios_to_the_limit_are_drawn(tmp_path: Path) -> None:
+def test_ratios_to_the_bound_are_drawn(tmp_path: Path) -> None:
     rows = [
         {"network": n, "mechanism": m, "seed": s, "rmse_m": value * s}
         for n in PAPER_VEHICLES
-        for m, value in {"limit": 0.2, "optimized": 0.21, "none": 0.5}.items()
+        for m, value in {"bound": 0.2, "optimized": 0.21, "none": 0.5}.items()
         for s in (1, 2)
     ]
     assert is_picture(result_figures.ratio_bars(rows, tmp_path / "ratios"))

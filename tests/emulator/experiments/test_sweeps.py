@@ -43,11 +43,11 @@ def test_the_tempering_is_swept_once_and_leaves_a_table_its_numbers_and_a_pictur
     small = partial(tempering.tempering_cells, taus_s=(5.0, 20.0), duration_s=2.0)
     monkeypatch.setattr(tempering, "tempering_cells", small)
     text = run_small(monkeypatch, tmp_path, "tempering")
-    assert "## limit on N3" in text and "## optimized on N3" in text
+    assert "## bound on N3" in text and "## optimized on N3" in text
     assert "0.12 to 2.79" in text, "the band of two runs"
     rows = pq.read_table(tmp_path / "tempering.parquet").to_pylist()
     assert {(row["mechanism"], row["tau_s"], row["seed"]) for row in rows} == {
-        (mechanism, tau_s, seed) for mechanism in ("limit", "optimized") for tau_s in (5.0, 20.0) for seed in (1, 2)
+        (mechanism, tau_s, seed) for mechanism in ("bound", "optimized") for tau_s in (5.0, 20.0) for seed in (1, 2)
     }
     by_tau = {row["tau_s"]: row["common_error_anees"] for row in rows if row["seed"] == 1}
     assert by_tau[5.0] != by_tau[20.0], "τ has reached the filters"
@@ -78,23 +78,23 @@ def test_all_networks_run_equally_long() -> None:
     assert found == {"n1": (30.0, 20.0), "n2": (30.0, 20.0), "n3": (30.0, 20.0)}
 
 
-def test_cooperation_is_swept_on_one_network_and_the_limit_on_all() -> None:
+def test_cooperation_is_swept_on_one_network_and_the_bound_on_all() -> None:
     networks = dict.fromkeys(PAPER_VEHICLES, TINY["n3"])
     cells = tempering.tempering_cells(networks, [1])
     filters = {(cell.labels["network"], cell.labels["mechanism"]) for cell in cells}
-    assert filters == {("n1", "limit"), ("n2", "limit"), ("n3", "limit"), ("n3", "optimized")}
+    assert filters == {("n1", "bound"), ("n2", "bound"), ("n3", "bound"), ("n3", "optimized")}
     for cell in cells:
         options = cell.scenario.program.options
         assert options["lateral_tau_s"] == cell.labels["tau_s"]
         assert cell.scenario.world.lateral.tau_s == tempering.WORLD_TAU_S, "the world stays as it is"
-        assert ("particles" in options) == (cell.labels["mechanism"] == "limit")
+        assert ("particles" in options) == (cell.labels["mechanism"] == "bound")
 
 
 def made_up(anees: dict[tuple[str, float], float]) -> list[dict[str, Any]]:
     return [
         {
             "network": network,
-            "mechanism": "limit",
+            "mechanism": "bound",
             "tau_s": tau_s,
             "seed": seed,
             "rmse_m": 0.2,

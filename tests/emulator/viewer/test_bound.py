@@ -1,4 +1,4 @@
-"""The limit: one filter that hears every fix of its component."""
+"""The bound: one filter that hears every fix of its component."""
 
 from pathlib import Path
 from typing import Any
@@ -36,12 +36,12 @@ def tell(folder: Path, program: str, **sections: dict[str, Any]) -> list[dict[st
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    return tell(tmp_path_factory.mktemp("limit") / "run", "agents.cooperative:main")
+    return tell(tmp_path_factory.mktemp("bound") / "run", "agents.cooperative:main")
 
 
 def steps(told: list[dict[str, Any]], particles: int = 500) -> list[float | None]:
-    limit = HearsAllBound(told[0], particles)
-    return [limit.step(period) for period in told[1:]]
+    bound = HearsAllBound(told[0], particles)
+    return [bound.step(period) for period in told[1:]]
 
 
 def late(values: list[float | None]) -> float:
