@@ -20,6 +20,7 @@ import pyarrow as pa
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_folder import SCENARIO_FILE
 from vnet.errors import VnetError
+from vnet.units import NS_PER_S
 
 Message = tuple[int, str, dict[str, Any]]
 """Time in ns, topic and content."""
@@ -150,7 +151,7 @@ def _finite(value: Any) -> Any:
 
 
 def _stamp(time_ns: int) -> dict[str, int]:
-    sec, nsec = divmod(time_ns, 1_000_000_000)
+    sec, nsec = divmod(time_ns, NS_PER_S)
     return {"sec": sec, "nsec": nsec}
 
 

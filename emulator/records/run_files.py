@@ -96,7 +96,7 @@ class RunFiles:
             )
         return replace(record, reproduce=_from_here(record.reproduce, self.folder))
 
-    def _refuse_later_format(self) -> None:
+    def refuse_later_format(self) -> None:
         """Raise VnetError if the folder is of a later format; its verdict may be missing or broken."""
         try:
             _ = self.record
@@ -115,7 +115,7 @@ class RunFiles:
     def world(self) -> RecordedWorld:
         """Contents of world.npz. Folders of format 1 have none: their input files are needed."""
         path = self.folder / WORLD_FILE
-        self._refuse_later_format()
+        self.refuse_later_format()
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
         if self.record.format > 1:
@@ -195,7 +195,7 @@ class RunFiles:
     def _table(self, name: str, left_out: Collection[str] = ()) -> pa.Table:
         """A table with the types that it must have."""
         path, schema = self.folder / name, TABLES[name]
-        self._refuse_later_format()
+        self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
             raise VnetError(f"{self.folder}: not a finished run's folder: there is no {name} in it")

@@ -50,7 +50,7 @@ class Record:
         return sum(count for outcome, count in self.frames_by_outcome.items() if outcome != "out_of_range")
 
     def share_of(self, outcome: str) -> float | None:
-        """The share of the pairs in range with this outcome; None without pairs."""
+        """Share of the attempted receptions with this outcome; None without any."""
         return self.frames_by_outcome.get(outcome, 0) / self.in_range if self.in_range else None
 
 

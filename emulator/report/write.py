@@ -37,9 +37,10 @@ WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 def write_report(folder: Path) -> Path:
     """Write RUN/report.html, and the index of `runs/` if the run lies there; returns the report's path.
 
-    Raises VnetError if `folder` is not a run's, or cannot be written.
+    Raises VnetError if `folder` is not a run's, is of a later format, or cannot be written.
     """
     source = Source(folder)
+    source.recorded.refuse_later_format()
     known = [maybe(read) is not None for read in (lambda: source.scenario_text, lambda: source.record)]
     if not any(known):
         raise VnetError(f"{folder}: not a run's folder: neither scenario.toml nor verdict.json can be read")

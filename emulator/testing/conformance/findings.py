@@ -105,7 +105,7 @@ def described(data: bytes) -> str:
     shown = data[:LONGEST_HEX].hex(" ") + (" …" if len(data) > LONGEST_HEX else "")
     try:
         decoded = printable(repr(msgpack.unpackb(data)), LONGEST_DECODED)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         decoded = f"no msgpack ({printable(str(error))})"
     return f"{decoded}; {len(data)} bytes: {shown}"
 
@@ -125,5 +125,5 @@ def _field(data: bytes, error: str) -> str:
         kind = _KINDS[message[0]]
         index = int(error.rpartition("`$[")[2].partition("]")[0])
         return f" ({kind.__name__}.{kind.__struct_fields__[index - 1]})"
-    except (ValueError, LookupError, TypeError):
+    except (ValueError, LookupError, TypeError, RecursionError):
         return ""

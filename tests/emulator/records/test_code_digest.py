@@ -122,3 +122,11 @@ def test_a_changed_program_is_told_in_one_line_and_recorded_and_the_run_goes_on(
     assert [note["message"] for note in notes if note["kind"] == "note"] == [told.stderr[12:-1]]
     other = simulate(program / "first" / "scenario.toml", program / "other", "--program", "agents.beacon:main")
     assert "changed" not in other.stderr
+
+
+def test_a_source_that_nests_too_deeply_has_a_digest_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "deep.py").write_text("x = " + "-" * 100_000 + "1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert digests_of(("deep:main",))["program"]

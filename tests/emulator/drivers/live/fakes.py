@@ -99,10 +99,6 @@ class FakeAttachment:
         self.sent.append((node, message))
         self.on_send(node, message)
 
-    def take_sent(self) -> list[tuple[str, wire.EmulatorMessage]]:
-        sent, self.sent = self.sent, []
-        return sent
-
     def is_watched(self, stream: str) -> bool:
         return False
 

@@ -150,8 +150,8 @@ def test_a_command_that_cannot_know_the_node_is_refused() -> None:
     [
         (b"\x97\xa5Yield\xc4\x01n\xa10\xc0\x90\x90\x93\x90\x90\x90", "(Yield.seq)"),
         (b"\x93\xa9StackDump\x01\xa0", "(StackDump.nonce)"),
-        (b"\xc1", "no message"),
-        (b"\x91\xa9Nonsense1", "no message"),
+        (b"\xc1", "not a message"),
+        (b"\x91\xa9Nonsense1", "not a message"),
     ],
 )
 def test_what_does_not_decode_is_named_by_its_field(data: bytes, problem: str) -> None:
@@ -184,3 +184,7 @@ def test_an_agent_that_never_stops_sending_does_not_hold_a_scene(monkeypatch: py
     assert len(taken) > 3, "none is passed over"
     with pytest.raises(SceneOverError):
         scene.await_message(wire.StackDump, "stack", 1.0)
+
+
+def test_bytes_that_nest_too_deeply_are_shown_all_the_same() -> None:
+    assert "1101 bytes" in described(b"\x91" * 1100 + b"\x01")
