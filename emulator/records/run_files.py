@@ -119,7 +119,7 @@ class RunFiles:
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
         if self.record.format > 1:
-            raise VnetError(f"{self.folder}: not a finished run's folder: there is no {WORLD_FILE} in it")
+            raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {WORLD_FILE} in it")
         try:
             return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
         except ScenarioError as error:
@@ -186,7 +186,8 @@ class RunFiles:
         try:
             return read()
         except FileNotFoundError:
-            raise VnetError(f"{self.folder}: not a run's folder: there is no {path.name} in it") from None
+            kind = "the folder of a finished run" if is_run_folder(self.folder) else "a run's folder"
+            raise VnetError(f"{self.folder}: not {kind}: there is no {path.name} in it") from None
         except OSError as error:
             raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
         except (ValueError, pa.ArrowException) as error:
@@ -198,7 +199,7 @@ class RunFiles:
         self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
-            raise VnetError(f"{self.folder}: not a finished run's folder: there is no {name} in it")
+            raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
         table: pa.Table = self._read(path, lambda: pq.read_table(path, columns=wanted and list(wanted)))
         for column in wanted or schema.names:

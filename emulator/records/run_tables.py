@@ -35,7 +35,8 @@ class TableFile:
         try:
             self._file = pq.ParquetFile(path)
         except FileNotFoundError:
-            raise VnetError(f"{path.parent}: not a finished run's folder: there is no {path.name} in it") from None
+            text = f"{path.parent}: not the folder of a finished run: there is no {path.name} in it"
+            raise VnetError(text) from None
         except (OSError, pa.ArrowException) as error:
             raise self.error(f"cannot be read: {_one_line(error)}") from None
         missing = [column for column in columns if column not in self._file.schema_arrow.names]

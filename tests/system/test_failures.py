@@ -138,7 +138,8 @@ def test_a_disk_that_fills_up_is_one_line_and_no_process_stays(tmp_path: Path) -
     )
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].startswith(f"vnet: {folder}: cannot write")
+    assert done.stderr.splitlines()[-1].startswith(f"vnet: {folder}/")
+    assert ": cannot write: " in done.stderr.splitlines()[-1]
     assert running_agents(folder) == []
 
 

@@ -144,7 +144,7 @@ def test_the_docs_name_every_field(tmp_path: Path) -> None:
     assert fields_in_the_docs("A `progress` object:") == progress.keys() - {"kind", "wall_s"}
     in_status = {field.name for field in fields(Snapshot)}
     beside = in_status - progress.keys()
-    assert fields_in_the_docs("## A run that is on") == beside
+    assert fields_in_the_docs("## A running emulator") == beside
     assert progress.keys() - in_status == {"kind", "vehicles", "faults_acting"}
     kinds = {line["kind"] for line in lines} | {"error"}
     assert kinds <= fields_in_the_docs("## JSON for machines")

@@ -88,11 +88,12 @@ def test_only_those_are_granted_an_instant_who_have_something_to_do_at_it() -> N
     assert times(lockstep.step()) == {"v01": 30 * MS}
 
 
-def test_a_timer_that_is_overdue_is_granted_now_and_time_never_goes_back() -> None:
+@pytest.mark.parametrize("next_ms", [10, 30])
+def test_a_timer_that_is_not_later_than_now_is_refused(next_ms: int) -> None:
     lockstep, _ = barrier()
     yield_all(lockstep, lockstep.start(), v01=30 * MS)
-    yield_all(lockstep, lockstep.step(), v01=10 * MS)
-    assert times(lockstep.step()) == {"v01": 30 * MS}
+    with pytest.raises(ProtocolError, match="its next timer is not later than 30000000"):
+        yield_all(lockstep, lockstep.step(), v01=next_ms * MS)
 
 
 def test_a_task_that_waits_for_fixes_is_woken_by_each_and_gets_what_it_has_missed() -> None:

@@ -82,8 +82,8 @@ def test_what_threads_put_comes_out_on_the_loop_in_order() -> None:
         (yield_of(0, b"of another"), "a message without the nonce of its process"),
         (yield_of(13), "no yield is owed"),
         (wire.encode(wire.Frames(b"1", 0, 0, [], wire.Traffic())), "an unexpected Frames"),
-        (b"\xc1 no message", "12 bytes that are no message"),
-        (b"", "0 bytes that are no message"),
+        (b"\xc1 no message", "12 bytes are not a message"),
+        (b"", "0 bytes are not a message"),
     ],
 )
 def test_what_cannot_be_taken_is_refused_and_the_rest_goes_on(payload: bytes, reason: str) -> None:

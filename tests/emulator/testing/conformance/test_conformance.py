@@ -120,7 +120,7 @@ def test_the_command_prints_a_line_for_each_check_and_ends_with_0(capsys: pytest
 def test_the_command_shows_the_bytes_of_what_is_wrong_and_ends_with_1(capsys: pytest.CaptureFixture[str]) -> None:
     assert conformance("--scene", "refusal", "--", *wrong("OfAnotherProcess")) == 1
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrong")]
-    assert "came in refusal: node 'v01', process_id 'v02'; ['Hello', 'v01', 'v02', b'" in line
+    assert "came in refusal: node 'v01', process_id 'v02'; ['Hello', 'v01', 'v02', b" in line
     assert "bytes: 98 a5 48 65 6c 6c 6f" in line
 
 
