@@ -18,6 +18,12 @@ WRONG = [sys.executable, "-P", "-m", "tests.emulator.testing.conformance.wrong_a
 LISTEN = ("--listen", "tcp/127.0.0.1:0")
 
 
+@pytest.fixture(autouse=True)
+def tests_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the processes of the agents with a mistake import this package."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+
+
 def start(stack: ExitStack, command: list[str], node: str, endpoint: str, folder: Path) -> subprocess.Popen[bytes]:
     credentials = str(folder / "access" / "credentials" / f"{node}.json")
     words = [*command, "--connect", endpoint, "--run", "beacon", "--node", node, "--credentials", credentials]

@@ -108,8 +108,9 @@ def test_a_recording_is_written_beside_the_run(vnet: Vnet) -> None:
 @pytest.mark.parametrize("command", ["run", "simulate"])
 @pytest.mark.parametrize("package", ["agents", "emulator"])
 def test_a_program_that_a_package_of_vnet_s_own_hides_is_named_in_one_line(
-    command: str, package: str, tmp_path: Path
+    command: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))  # found before the current folder, as where vnet is installed
     file = tmp_path / f"{package}.py"
     file.write_text("async def main(node):\n    pass\n")
     scenario = str(ROOT / "scenarios" / "beacon.toml")

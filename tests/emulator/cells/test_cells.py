@@ -115,8 +115,8 @@ def made_up(rmse: dict[str, float]) -> list[dict[str, object]]:
             "position_rmse_m": 0.5,
             "component_rmse_m": [value * seed],
             "common_error_anees": 1.0,
-            "position_anees": None if mechanism == "limit" else 1.0,
-            "bytes": None if mechanism == "limit" else 900.0,
+            "position_anees": None if mechanism == "bound" else 1.0,
+            "bytes": None if mechanism == "bound" else 900.0,
             "divergent": 0,
         }
         for mechanism, value in rmse.items()
@@ -125,7 +125,7 @@ def made_up(rmse: dict[str, float]) -> list[dict[str, object]]:
 
 
 def test_the_default_report_divides_by_the_limit_of_the_same_seeds() -> None:
-    text = reports.default_profile(made_up({"limit": 0.2, "optimized": 0.3, "random": 0.4, "none": 0.4}))
+    text = reports.default_profile(made_up({"bound": 0.2, "optimized": 0.3, "random": 0.4, "none": 0.4}))
     assert "1.50 ± 0.00" in text
     assert "-0.150 ± 0.050 (2 seeds)" in text
     assert "900 B; 0 in 2 runs" in text
@@ -139,14 +139,14 @@ def wanted(**rmse: float) -> dict[str, str]:
 
 
 def test_the_default_report_says_what_is_as_wanted_and_what_is_not() -> None:
-    good = wanted(limit=0.2, optimized=0.22, random=0.4, none=0.4)
-    assert good["at most 1.35 × the limit"] == "yes: 1.10 ± 0.00"
+    good = wanted(bound=0.2, optimized=0.22, random=0.4, none=0.4)
+    assert good["at most 1.35 × the bound"] == "yes: 1.10 ± 0.00"
     assert good["in each component"] == "yes: 1.10"
     assert good["no vehicle diverged"] == "yes: 0 in 2 runs"
     assert good["optimized not worse than random"] == "yes: better"
     assert good["random not worse than none"] == "yes: no difference seen"
-    bad = wanted(limit=0.2, optimized=0.3, random=0.2)
-    assert bad["at most 1.35 × the limit"] == "**no**: 1.50 ± 0.00"
+    bad = wanted(bound=0.2, optimized=0.3, random=0.2)
+    assert bad["at most 1.35 × the bound"] == "**no**: 1.50 ± 0.00"
     assert bad["in each component"] == "**no**: 1.50"
     assert bad["optimized not worse than random"] == "**no**: worse by 0.150 m"
     assert bad["random not worse than none"] == "–"
@@ -155,6 +155,6 @@ def test_the_default_report_says_what_is_as_wanted_and_what_is_not() -> None:
 def test_the_default_experiment_has_one_row_of_one_hop() -> None:
     cells = paper.default_cells({"n1": TINY}, [1, 2])
     mechanisms = [cell.labels["mechanism"] for cell in cells if cell.labels["seed"] == 2]
-    assert mechanisms == ["centralized", "limit", "optimized", "random", "none", "optimized, one hop"]
+    assert mechanisms == ["centralized", "bound", "optimized", "random", "none", "optimized, one hop"]
     options = next(c for c in cells if c.labels["mechanism"] == "optimized, one hop").scenario.program.options
     assert options["relay"] is False and options["exchange"] == "particles"
