@@ -1,1 +1,30 @@
-"""emulator: everything that vehicles live in. It stands on vnet and never imports agents."""
+"""emulator: everything that vehicles live in. It stands on vnet and never imports agents.
+
+Its public names are those of `__all__`; they are imported when they are first used, because commands import this
+package too and must start fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from emulator.records.run import Run
+
+__all__ = ["Run"]
+
+_PUBLIC = {"Run": "emulator.records.run"}
+"""Modules of the public names."""
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'emulator' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*globals(), *__all__])

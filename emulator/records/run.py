@@ -1,0 +1,174 @@
+"""A finished run as its user sees it: verdict, tables, events, scenario, and positions over time.
+
+`emulator.Run` is this class. It is the public face of `RecordedRun`, whose other members may change; checks of a
+user's own get one, and so does whoever reads a run from Python.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event
+from emulator.records.verdict_file import Record
+from emulator.records.verdicts import CheckResult, NotExercised, Verdict
+from emulator.scenario.scenario import Scenario
+from vnet.errors import VnetError, did_you_mean, first_names, shown
+from vnet.types import Array, IntArray, Mask
+from vnet.units import NS_PER_S
+
+
+class Run:
+    """A finished run, read from its `folder`; each file is read when it is first needed.
+
+    The tables are of `pyarrow`, with the columns of docs/reference/files.md; `to_pandas()` makes them data frames.
+    Arrays over vehicles have the order of `nodes`, arrays over periods that of `times_s`. Everything raises
+    VnetError, in one line, for a file that is missing or broken.
+    """
+
+    def __init__(self, recorded: RecordedRun, folder: Path, record: Record | None = None) -> None:
+        """Wrap what was recorded; without a `record` the run has not been judged yet."""
+        self.folder = folder
+        self._recorded = recorded
+        self._record = record
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Run:
+        """Return the run in `folder`. Raises VnetError if it is not the folder of a finished run."""
+        recorded = RecordedRun.open(Path(folder))
+        return cls(recorded, Path(folder), recorded.record)
+
+    def __repr__(self) -> str:
+        verdict = "not judged yet" if self._record is None else self._record.verdict.value
+        return f"<Run {str(self.folder)!r}: {verdict}>"
+
+    # The verdict.
+
+    @property
+    def _judged(self) -> Record:
+        if self._record is None:
+            raise VnetError(f"{self.folder}: has no verdict yet: its checks are still being made")
+        return self._record
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict: "valid", "invalid" or "unknown". Raises VnetError within a check, which comes before it."""
+        return self._judged.verdict
+
+    @property
+    def checks(self) -> list[CheckResult]:
+        """Results of the checks: `name`, `verdict`, `text` and `figures`. Raises VnetError within a check."""
+        return self._judged.checks
+
+    @property
+    def not_applicable(self) -> list[NotExercised]:
+        """Checks that the run could not exercise: `name` and `reason`. Raises VnetError within a check."""
+        return self._judged.not_exercised
+
+    @property
+    def figures(self) -> dict[str, float | None]:
+        """Figures of verdict.json by name: means after the first fifth of the run; None where there is none.
+
+        Raises VnetError within a check.
+        """
+        return self._judged.figures
+
+    @property
+    def reproduce(self) -> str:
+        """Command that runs the run again. Raises VnetError within a check."""
+        return self._judged.reproduce
+
+    # What was recorded.
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario as it was run, with every default: `run.scenario.radio.range_m`."""
+        return self._recorded.scenario
+
+    @property
+    def trace(self) -> pa.Table:
+        """Table of receptions: a row for each frame and receiver in range, with its one outcome."""
+        return self._recorded.trace
+
+    @property
+    def states(self) -> pa.Table:
+        """Table of vehicles: a row for each vehicle and period, with truth, fix and report."""
+        return self._recorded.states
+
+    @property
+    def metrics(self) -> pa.Table:
+        """Table of periods: a row for each period, with errors and counts over all vehicles."""
+        return self._recorded.metrics
+
+    @property
+    def events(self) -> Sequence[Event]:
+        """Events in the order of their recording: `time_ns`, `kind`, `node` (or None) and `details`."""
+        return self._recorded.events
+
+    @property
+    def nodes(self) -> list[str]:
+        """Ids of all vehicles."""
+        return self._recorded.node_ids
+
+    @property
+    def period_s(self) -> float:
+        """Length of a period in s: the time between two GNSS fixes."""
+        return self.scenario.period_ns / NS_PER_S
+
+    @property
+    def times_s(self) -> Array:
+        """Starts (periods,) in s of the periods that the run completed."""
+        return self._recorded.period_starts_ns() / NS_PER_S
+
+    @property
+    def last_fault_s(self) -> float:
+        """Time in s from which on no fault acts; 0 without faults."""
+        return self._recorded.last_heal_ns / NS_PER_S
+
+    def index(self, node: str) -> int:
+        """Return the index of a vehicle in arrays. Raises VnetError for an id that no vehicle has."""
+        if node not in self._recorded.number:
+            hint = did_you_mean(node, self.nodes)
+            raise VnetError(f"{shown(node)}: no such vehicle{hint}; there are {first_names(self.nodes)}")
+        return self._recorded.number[node]
+
+    # Over time.
+
+    def positions(self, time_s: float) -> Array:
+        """Return the true positions (N, 2) in m, east and north, in the period that holds `time_s`.
+
+        NaN where a vehicle is not in the network. Raises VnetError if the run has no such period.
+        """
+        return np.asarray(self._recorded.vectors("position_m")[self._period(time_s)])
+
+    def in_range(self, time_s: float) -> Mask:
+        """Return who is in radio range of whom at `time_s` (N, N): rows are senders, columns receivers.
+
+        The peer cap and faults are not considered. Raises VnetError if the run has no such period.
+        """
+        self._period(time_s)
+        places = self._recorded.places
+        time_ns = np.array([round(time_s * NS_PER_S)])
+        return places.in_range(int(places.index(time_ns)[0]))
+
+    def up(self, time_s: float) -> Mask:
+        """Return the vehicles (N,) that are up at `time_s`: in the network, not ended, and not ended by a fault."""
+        count = len(self.nodes)
+        times_ns: IntArray = np.full(count, round(time_s * NS_PER_S), dtype=np.int64)
+        return np.asarray(~self._recorded.is_down(np.arange(count), times_ns))
+
+    def reported(self, name: str) -> Array:
+        """Return a value of `node.report(…, name=value)` (periods, N); NaN where there is none."""
+        return self._recorded.value(name)
+
+    def _period(self, time_s: float) -> int:
+        """Index of the period that holds an instant."""
+        period, periods = int(round(time_s * NS_PER_S) // self.scenario.period_ns), self._recorded.periods
+        if not 0 <= period < periods:
+            end_s = periods * self.period_s
+            raise VnetError(f"time_s = {time_s:g}: the run has periods from 0 s to {end_s:g} s")
+        return period
