@@ -19,7 +19,9 @@ class Pacing(StrEnum):
     REALTIME = "realtime"
 
 
-ScenarioArgument = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML).")]
+ScenarioArgument = Annotated[
+    Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML), or the name of one that is shipped.")
+]
 ProgramOption = Annotated[
     str | None, typer.Option(metavar="MODULE:FUNCTION", help="Program of every vehicle, as hello:main.")
 ]

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
+from emulator.scenario.shipped import find_scenario
 from emulator.scenario.toml import parse_toml, read_toml
 from vnet.errors import ScenarioError, printable
 
@@ -31,5 +32,5 @@ def parse_recorded_scenario(text: str, path: Path) -> Scenario:
 
 def recorded_code(path: Path) -> dict[str, Any]:
     """Return the section `[code]` of a file, in which a run has recorded its code; empty if there is none."""
-    code = read_toml(path).get("code")
+    code = read_toml(find_scenario(path)).get("code")
     return code if isinstance(code, dict) else {}

@@ -20,6 +20,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import Section, first_problem
+from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
 from emulator.scenario.toml import DEEPEST, check_plain, parse_toml, read_toml
 from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
@@ -338,11 +339,12 @@ class Scenario(Section):
 
 
 def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
-    """Read a scenario and apply `section.key=value` overrides.
+    """Read a scenario, from its path or by its name if it is shipped, and apply `section.key=value` overrides.
 
     Values are in TOML syntax; bare words are strings. A relative `network.path` or `radio.links` is taken from
     the scenario's own folder. Raises `ScenarioError`.
     """
+    path = find_scenario(path)
     try:
         data = read_toml(path)
     except OSError as error:
@@ -374,7 +376,7 @@ def _instead(path: Path) -> str:
         inside = sorted(each.name for each in path.glob("*.toml"))
         if inside:
             return f"; in it there are {first_names(inside)}"
-        return did_you_mean(path.name, [each.name for each in path.parent.glob("*.toml")])
+        return did_you_mean(path.name, [*(each.name for each in path.parent.glob("*.toml")), *shipped_names()])
     except (OSError, ValueError):
         return ""
 
