@@ -31,6 +31,7 @@ LAYERS = (
     ("emulator.terminal", "emulator.testing"),
     ("emulator.experiments",),
     ("emulator.cli",),
+    ("emulator.__main__",),
 )
 """The lowest first: a module imports from its own package and from lower layers, never from a neighbour."""
 VNET_LAYERS = (

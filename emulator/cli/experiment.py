@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
+from emulator.cli.help import group
 from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
-from vnet.runtime.environment import fix_hash_seed
 
-app = typer.Typer(no_args_is_help=True, help="Run the paper's experiments, and vnet's own.")
+app = group("Run the paper's experiments, and vnet's own.")
 FOLDER = Path("runs/experiments")
 
 NetworksOption = Annotated[
@@ -227,7 +227,6 @@ def _run(
     cells: Sequence[Cell], folder: Path, name: str, only: list[str] | None, live: bool = False
 ) -> list[dict[str, Any]]:
     """Run the cells that are asked for; print the figures of single ones, keep all as Parquet."""
-    fix_hash_seed("emulator.cli")  # as in every process that runs programs
     wanted = _select(cells, only or [])
     results = run_cells(wanted, folder, live, name)
     if only is not None:

@@ -14,6 +14,7 @@ from msgspec import convert
 from rich.console import Console
 from rich.table import Table
 
+from emulator.cli.help import group
 from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
 from emulator.scenario.faults import KINDS, parse_fault
@@ -23,7 +24,7 @@ from emulator.terminal.painter import Painter
 from emulator.terminal.progress import terminal
 from vnet.errors import ScenarioError, VnetError, first_names
 
-app = typer.Typer(no_args_is_help=True, help="Inject faults into a running emulator, and heal them.")
+app = group("Inject faults into a running emulator, and heal them.")
 
 RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
 LATEST = Path("runs/latest")

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from emulator.cli.help import group
 from emulator.terminal.console import one_line_errors
 from emulator.world.maps.city import SIZE_M, city_roads
 from emulator.world.maps.files import read_roads, write_roads, writer_of
@@ -30,7 +31,7 @@ class DriveOn(StrEnum):
     LEFT = "left"
 
 
-app = typer.Typer(no_args_is_help=True, help="Look at maps, and convert them.")
+app = group("Look at maps, and convert them.")
 
 MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="OSM XML or PBF, SUMO .net.xml, GeoJSON or NPZ.")]
 OutArgument = Annotated[Path, typer.Argument(metavar="OUT", help="A file: .geojson, .json or .npz.")]

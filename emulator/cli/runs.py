@@ -50,7 +50,6 @@ from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError, VnetError
-from vnet.runtime.environment import fix_hash_seed
 from vnet.transport.session import quiet_zenoh
 
 
@@ -126,7 +125,6 @@ def simulate(
     report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
-    fix_hash_seed("emulator.cli")
     with one_line_errors(log_format):
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)

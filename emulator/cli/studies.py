@@ -19,7 +19,6 @@ from emulator.cli.options import (
     load,
 )
 from emulator.terminal.console import one_line_errors
-from vnet.runtime.environment import fix_hash_seed
 
 
 def analyze(
@@ -59,7 +58,6 @@ def campaign(
     ] = 300.0,
 ) -> None:
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
-    fix_hash_seed("emulator.cli")
     from emulator.testing.campaign import Plan, run_campaign
 
     with one_line_errors():

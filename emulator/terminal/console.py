@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -48,12 +49,20 @@ def _say(message: str, log_format: LogFormat) -> None:
         print(f"vnet: {message}", file=sys.stderr)
 
 
+def tolerate_any_sign() -> None:
+    """Have standard output print `?` for a sign that the terminal does not know, rather than fail."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
 def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
     """Run a command line to its end; returns its exit status. A line that makes no sense gets one line of error."""
     try:
         return app(list(arguments), prog_name="vnet", standalone_mode=False) or 0
     except typer.TyperException as error:
-        if type(error).__name__ != "NoArgsIsHelpError":  # then help has been printed
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error.format_message())
+        else:
             _say(_in_one_line(error), _asked_for(arguments))
         return WRONG_USAGE
 

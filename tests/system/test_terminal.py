@@ -224,26 +224,6 @@ def test_a_mistake_of_a_machine_gets_an_object(arguments: list[str], capsys: pyt
     assert "nowhere.toml: cannot be read" in error["message"] or "no such option: --sed" in error["message"]
 
 
-@pytest.mark.parametrize(
-    "command", ["", "run", "simulate", "emulator", "status", "fault inject", "campaign", "check"]
-)
-def test_help_fits_eighty_columns(
-    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    assert run_app(app, [*command.split(), "--help"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert max(map(len, lines)) <= 80
-    assert not [line for line in lines if "…" in line], "nothing is cut off"
-
-
-def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_app(app, []) == 2
-    told = capsys.readouterr()
-    assert "Run a scenario" in told.out
-    assert told.err == ""
-
-
 def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with long_run(folder) as process:

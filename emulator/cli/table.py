@@ -1,0 +1,99 @@
+"""The commands of `vnet`: where each one is, and what is known of it without importing it.
+
+Nothing heavy is imported here: `vnet --help` and a command that starts itself again need this table, and no more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Panel(StrEnum):
+    """The headings under which `vnet --help` lists the commands, in this order."""
+
+    RUN = "Run"
+    LOOK = "Look"
+    BREAK = "Break"
+    STUDY = "Study"
+    FILES = "Files"
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command or a group of commands.
+
+    `module` is a module of `emulator.cli`, and `attribute` the function or the group in it.
+    """
+
+    name: str
+    panel: Panel
+    module: str
+    attribute: str
+    summary: str
+    """One line of `vnet --help` at 80 columns; the command's own docstring says more."""
+    runs_programs: bool = False
+    """It runs programs in this process, which therefore needs a fixed hash seed."""
+
+
+COMMANDS = (
+    Command("run", Panel.RUN, "runs", "run", "Run a scenario, with a process for each vehicle."),
+    Command(
+        "simulate",
+        Panel.RUN,
+        "runs",
+        "simulate",
+        "Run it in one process: the same trace, faster.",
+        runs_programs=True,
+    ),
+    Command(
+        "emulator", Panel.RUN, "runs", "emulator", "Run it for agents that are started by hand, here or elsewhere."
+    ),
+    Command("access", Panel.RUN, "access", "access", "Write the users and rules of a separate router (zenohd)."),
+    Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
+    Command("check", Panel.LOOK, "check", "check", "Judge a finished run again."),
+    Command("report", Panel.LOOK, "report", "report", "Write a run's report, or a list of runs, as a page."),
+    Command(
+        "compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they first differ."
+    ),
+    Command(
+        "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
+    ),
+    Command("view", Panel.LOOK, "viewing", "view", "Open a run's recording in Rerun, or serve it."),
+    Command("play", Panel.LOOK, "playback", "play", "Play a finished run in Rerun."),
+    Command("fault", Panel.BREAK, "fault", "app", "Inject faults into a run that is on, and heal them."),
+    Command(
+        "campaign",
+        Panel.BREAK,
+        "studies",
+        "campaign",
+        "Run it many times under random faults, and shrink failures.",
+        runs_programs=True,
+    ),
+    Command(
+        "conformance", Panel.BREAK, "conformance", "conformance", "Check an agent of your own against the protocol."
+    ),
+    Command("analyze", Panel.STUDY, "studies", "analyze", "Analyze a network's graph without a run."),
+    Command(
+        "experiment",
+        Panel.STUDY,
+        "experiment",
+        "app",
+        "Run the paper's experiments, and vnet's own.",
+        runs_programs=True,
+    ),
+    Command(
+        "export", Panel.FILES, "export", "export", "Write a run for Wireshark (pcapng), Foxglove (mcap), or as CSV."
+    ),
+    Command(
+        "record", Panel.FILES, "viewing", "record", "Watch a run from outside, and write a Rerun recording of it."
+    ),
+    Command("render", Panel.FILES, "playback", "render", "Write a finished run's recording again from its files."),
+    Command("map", Panel.FILES, "map", "app", "Look at maps, and convert them."),
+)
+
+
+def find(arguments: list[str]) -> Command | None:
+    """Return the command that a command line names; None where it names none, or one that does not exist."""
+    name = next((argument for argument in arguments if not argument.startswith("-")), None)
+    return next((command for command in COMMANDS if command.name == name), None)

@@ -1,0 +1,132 @@
+"""The command line as a whole: what is imported for a command, and what help looks like."""
+
+import json
+import os
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from docs.generate.commands import contexts
+from emulator.cli import commands
+from emulator.cli.application import build_app
+from emulator.cli.table import COMMANDS, find
+from emulator.terminal.console import run_app
+from tests.support.paths import ROOT
+
+ALL = {context.command_path: context.command for context in contexts("vnet", typer.main.get_command(commands.app))}
+SLOW_TO_IMPORT = [
+    "numpy",
+    "scipy",
+    "pydantic",
+    "zenoh",
+    "pyarrow",
+    "matplotlib",
+    "rerun",
+    "rich",
+    "msgspec",
+    "asyncio",
+]
+# Imported at the start of Python: prints at its end, or where it would start again, which modules were imported.
+SPY = """
+import atexit, json, os, sys
+
+def execve(path, arguments, environment):
+    print(json.dumps(["again", environment["PYTHONHASHSEED"], *sorted(sys.modules)]), flush=True)
+    os._exit(0)
+
+os.execve = execve
+atexit.register(lambda: print(json.dumps(["end", "", *sorted(sys.modules)])))
+"""
+
+
+def spied(tmp_path: Path, *arguments: str) -> tuple[str, str, set[str]]:
+    """Run a command; return whether it ended or starts again, with which hash seed, and the modules imported."""
+    (tmp_path / "sitecustomize.py").write_text(SPY)
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    environment.pop("PYTHONHASHSEED", None)
+    command = [sys.executable, "-P", "-m", "emulator", *arguments]
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=True)
+    how, seed, *modules = json.loads(done.stdout.splitlines()[-1])
+    return how, seed, set(modules)
+
+
+@pytest.mark.parametrize("argument", ["--help", "--version"])
+def test_what_needs_no_command_imports_none(argument: str, tmp_path: Path) -> None:
+    how, _, modules = spied(tmp_path, argument)
+    assert how == "end"
+    assert modules & set(SLOW_TO_IMPORT) == set()
+    assert "typer" in modules, "the spy sees imports"
+
+
+@pytest.mark.parametrize("name", [command.name for command in COMMANDS if command.runs_programs])
+def test_what_runs_programs_starts_again_before_it_imports_anything(name: str, tmp_path: Path) -> None:
+    how, seed, modules = spied(tmp_path, name, "--help")
+    assert (how, seed) == ("again", "0")
+    assert modules & {*SLOW_TO_IMPORT, "typer"} == set()
+
+
+def test_the_commands_that_run_programs_are_those() -> None:
+    assert {command.name for command in COMMANDS if command.runs_programs} == {"simulate", "campaign", "experiment"}
+
+
+def test_a_command_line_names_its_command() -> None:
+    named = find(["run", "simulate"])
+    assert named is not None and named.name == "run"
+    assert find(["--help"]) is None
+    assert find(["runn"]) is None
+    assert find([]) is None
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(build_app([]), ["--version"]) == 0
+    assert capsys.readouterr().out.split()[0] == "vnet"
+
+
+def test_the_package_has_a_script_of_its_own_name() -> None:
+    scripts = {script.name: script.value for script in entry_points(group="console_scripts")}
+    assert scripts["vnet"] == "emulator.cli:main"
+
+
+def test_help_lists_every_command_on_a_line_of_eighty_columns(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run_app(build_app([]), ["--help"]) == 0
+    shown = capsys.readouterr().out
+    headings = [line for line in shown.splitlines() if line and not line.startswith((" ", "Usage", "Options"))]
+    assert headings == ["Run:", "Look:", "Break:", "Study:", "Files:"]
+    lines = {line.split()[0]: line for line in shown.split("Run:")[1].splitlines() if line.startswith("  ")}
+    assert {name: line.split(maxsplit=1)[1] for name, line in lines.items()} == {
+        command.name: command.summary for command in COMMANDS
+    }
+    assert next(iter(lines)) == "run"
+    assert max(map(len, lines.values())) <= 80
+
+
+@pytest.mark.parametrize("path", ALL)
+def test_help_of_every_command_fits_eighty_columns(
+    path: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    arguments = path.split()[1:]
+    wanted = find(arguments)
+    assert run_app(build_app([] if wanted is None else [wanted]), [*arguments, "--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not [line for line in lines if "│" in line], "there are no tables, which would be broken"
+    whole = " ".join("\n".join(lines).split())
+    if path != "vnet":
+        assert " ".join(str(ALL[path].help).split()) in whole
+    for parameter in ALL[path].params:
+        assert all(option in whole for option in parameter.opts if option.startswith("-"))
+
+
+def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(build_app([]), []) == 2
+    told = capsys.readouterr()
+    assert "Run a scenario" in told.out
+    assert told.err == ""
