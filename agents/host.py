@@ -23,7 +23,8 @@ from contextlib import ExitStack
 import zenoh
 
 from vnet.errors import ProgramError, TransportError, VnetError
-from vnet.runtime.host import Host, Programs, load_programs
+from vnet.runtime.host import Host, load_programs
+from vnet.runtime.programs import Programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import keys, wire
 from vnet.transport.credentials import Credentials

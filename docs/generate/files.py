@@ -34,7 +34,8 @@ FOLDER = {
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
-    "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append",
+    "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append. `programs.log`: "
+    "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign",
     "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",

@@ -62,7 +62,7 @@ def create_access(scenario: Scenario, world: World, listen: str = "", tls_names:
 
 
 def load_or_create_access(scenario: Scenario, world: World, folder: Path, listen: str, separate: bool) -> Access:
-    """The users of a run whose agents are started by hand; written where they are not there yet."""
+    """The users of a run whose agents are started by hand; new ones, not yet saved, where `folder` has none."""
     if (folder / "access.json").exists() or separate:
         access = Access.load(folder)
         nodes = {node for process in access.processes for node in process}
@@ -71,6 +71,4 @@ def load_or_create_access(scenario: Scenario, world: World, folder: Path, listen
                 f"access folder {folder} was made for another scenario; write a new one with: vnet access"
             )
         return access
-    access = create_access(scenario, world, listen)
-    access.save(folder, listen, folder.resolve())
-    return access
+    return create_access(scenario, world, listen)

@@ -11,13 +11,13 @@ from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, tell
 
 
-def create_folder(out: Path | None, path: Path, scenario: Scenario, log_format: LogFormat) -> RunFolder:
-    """Create the folder of a run of `scenario`, which was read from `path`.
+def prepare_folder(out: Path | None, path: Path, scenario: Scenario, log_format: LogFormat) -> RunFolder:
+    """Prepare the folder of a run of `scenario`, which was read from `path`; its `open` makes it.
 
     Where `path` is of another run's folder, and program or vnet have changed since, the run goes on: one line says
     so, and the event `code_changed` records it.
     """
-    folder = RunFolder.create(out, scenario)
+    folder = RunFolder.prepare(out, scenario)
     if changed := changed_code(recorded_code(path), folder.code):
         tell(f"{path}: {changed}", log_format)
         folder.event(0, "code_changed", what=changed)

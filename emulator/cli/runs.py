@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ import typer
 from rich.console import Console
 
 from emulator.cli.access import DEFAULT_ADDRESS, DEFAULT_LISTEN, create_access, load_or_create_access
-from emulator.cli.new_run import create_folder
+from emulator.cli.new_run import prepare_folder
 from emulator.cli.options import (
     DeterminismOption,
     DurationOption,
@@ -39,17 +40,20 @@ from emulator.drivers.conclude import conclude, run_again
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
+from emulator.drivers.program_check import program_check
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.signals import signals_ignored
 from emulator.drivers.simulate import simulate as run_simulation
-from emulator.records.run_folder import RunFolder
+from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, one_line_errors
 from emulator.terminal.progress import Progress, show_progress
+from emulator.terminal.standard_output import StandardOutput, result_only
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError, VnetError
+from vnet.runtime.programs import load_program
 from vnet.transport.session import quiet_zenoh
 
 
@@ -68,6 +72,11 @@ class OutputOptions:
     quiet: bool
     check_determinism: bool = False
     report: bool = True
+
+    @property
+    def only_the_result(self) -> bool:
+        """True if standard output is for the result alone, and not for what programs print."""
+        return self.quiet or self.log_format is LogFormat.JSON
 
 
 def run(
@@ -91,23 +100,27 @@ def run(
     quiet: QuietOption = False,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    with one_line_errors(log_format):
+    asked = OutputOptions(log_format, quiet, check_determinism, report)
+    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         loaded = load(scenario, overrides, program, pacing, seed, duration)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
-        world = build_world(loaded)
-        _check_vehicle(sinks, world)
-        access = create_access(loaded, world)
+        with program_check(loaded) as check:
+            world = build_world(loaded)
+            _check_vehicle(sinks, world)
+            access = create_access(loaded, world)
+            emulation = Emulation(loaded, world, prepare_folder(out, scenario, loaded, log_format))
+            check.wait()
         with ExitStack() as stack:
             separate = None
             if router is RouterKind.SEPARATE:
                 private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
                 separate = SeparateRouter(access, Path(private))
             options = LiveOptions(access, router=separate, record=sinks)
-            asked = OutputOptions(log_format, quiet, check_determinism, report)
-            _run_live(loaded, world, create_folder(out, scenario, loaded, log_format), options, asked)
+            emulation.folder.open(loaded)
+            _run_live(emulation, options, asked, output)
 
 
 def simulate(
@@ -125,20 +138,24 @@ def simulate(
     report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
-    with one_line_errors(log_format):
+    asked = OutputOptions(log_format, quiet, check_determinism, report)
+    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
+        emulation = Emulation(loaded, world, prepare_folder(out, scenario, loaded, log_format))
         sys.path.append(str(Path.cwd()))
-        emulation = Emulation(loaded, world, create_folder(out, scenario, loaded, log_format))
+        for entry in entries_of(loaded):
+            load_program(entry)
+        emulation.folder.open(loaded)
+        output.keep_in(emulation.folder.logs)
         with show_progress(emulation, log_format, quiet) as progress:
             with ExitStack() as stack:
                 if sinks is not None:
                     _record_here(emulation, sinks, stack)
                 wall_s, interrupted = run_simulation(emulation)
-            asked = OutputOptions(log_format, quiet, check_determinism, report)
-            _finish(emulation, progress, wall_s, interrupted, "simulate", asked)
+            _finish(emulation, progress, wall_s, interrupted, "simulate", asked, output)
 
 
 def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
@@ -186,7 +203,8 @@ def emulator(
     report: ReportOption = True,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
-    with one_line_errors(log_format):
+    asked = OutputOptions(log_format, quiet, report=report)
+    with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
         loaded = load(scenario, overrides, program, pacing, seed, duration)
@@ -194,37 +212,50 @@ def emulator(
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
-        folder = create_folder(out, scenario, loaded, log_format)
-        access = access or folder.path / "access"
-        users = load_or_create_access(loaded, world, access, listen or DEFAULT_LISTEN, connect is not None)
+        emulation = Emulation(loaded, world, prepare_folder(out, scenario, loaded, log_format))
+        folder = emulation.folder
+        place = access or folder.path / "access"
+        users = load_or_create_access(loaded, world, place, listen or DEFAULT_LISTEN, connect is not None)
         listen = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
+
+        def create() -> str:
+            """Make the run's folder, and the users' files if they are new."""
+            folder.open(loaded)
+            place = access or folder.path / "access"
+            if not (place / "access.json").exists():
+                users.save(place, listen, place.resolve())
+            return f"credentials of the agents: {place}/credentials/NODE.json"
+
         options = LiveOptions(users, listen, connect, launch=False, record=sinks)
-        where = f"credentials of the agents: {access}/credentials/NODE.json"
-        _run_live(loaded, world, folder, options, OutputOptions(log_format, quiet, report=report), where)
+        _run_live(emulation, options, asked, output, create)
 
 
 def _run_live(
-    scenario: Scenario,
-    world: World,
-    folder: RunFolder,
+    emulation: Emulation,
     options: LiveOptions,
     asked: OutputOptions,
-    first_of_all: str | None = None,
+    output: StandardOutput,
+    create: Callable[[], str] = lambda: "",
 ) -> None:
-    """A live run from its folder to its summary; exits with the verdict's status."""
+    """A live run to its summary; exits with the verdict's status.
+
+    `create` makes the run's folder, if it is not there yet, once the emulator's endpoint is open; it returns a line
+    for the user, or "".
+    """
     quiet_zenoh()
-    emulation = Emulation(scenario, world, folder)
-    sinks = None if options.record is None else options.record.inside(folder.path)
-    options = replace(options, record=sinks)
     with show_progress(emulation, asked.log_format, asked.quiet) as progress:
-        if first_of_all is not None:
-            progress.state(first_of_all)
-        if sinks is not None and sinks.serve is not None:
-            progress.state(sinks.serve.announcement())
+
+        def on_open() -> None:
+            if line := create():
+                progress.state(line)
+            output.keep_in(emulation.folder.logs)
+
+        if options.record is not None and options.record.serve is not None:
+            progress.state(options.record.serve.announcement())
         with signals_ignored():  # a second Ctrl-C must not lose the records
-            running = run_live(emulation, options, progress.state, on_missing=progress.awaits)
+            running = run_live(emulation, options, progress.state, on_missing=progress.awaits, on_open=on_open)
             wall_s, interrupted = asyncio.run(running)
-            _finish(emulation, progress, wall_s, interrupted, "run", asked)
+            _finish(emulation, progress, wall_s, interrupted, "run", asked, output)
 
 
 def _check_vehicle(sinks: Sinks | None, world: World) -> None:
@@ -241,22 +272,28 @@ def _check_restarts(scenario: Scenario, own_router: bool) -> None:
 
 
 def _finish(
-    emulation: Emulation, progress: Progress, wall_s: float, interrupted: bool, command: str, asked: OutputOptions
+    emulation: Emulation,
+    progress: Progress,
+    wall_s: float,
+    interrupted: bool,
+    command: str,
+    asked: OutputOptions,
+    output: StandardOutput,
 ) -> None:
     """Judge a run and print its summary; exits with the verdict's status."""
     progress.judging()
     judgement, verdict = conclude(emulation, wall_s, command)
     progress.close()
     if asked.check_determinism and not interrupted:
-        again = ["--quiet"] if asked.quiet or asked.log_format is LogFormat.JSON else []
+        again = ["--quiet"] if asked.only_the_result else []
         verdict = run_again(emulation, judgement, verdict, command, again)
     status = 130 if interrupted else judgement.exit_status
     folder = emulation.folder.path
     progress.ended(verdict, str(folder), status)
     if asked.log_format is LogFormat.JSON:
-        print(json.dumps(verdict))
+        output.print(json.dumps(verdict))
     elif asked.quiet:
-        print(f"verdict: {judgement.verdict}  {folder}")
+        output.print(f"verdict: {judgement.verdict}  {folder}")
     else:
         print_summary(judgement, verdict, folder, Console(), asked.report)
     if asked.report:

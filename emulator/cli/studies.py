@@ -19,6 +19,7 @@ from emulator.cli.options import (
     load,
 )
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.standard_output import result_only
 
 
 def analyze(
@@ -60,7 +61,7 @@ def campaign(
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
     from emulator.testing.campaign import Plan, run_campaign
 
-    with one_line_errors():
+    with one_line_errors(), result_only(True):
         sys.path.append(str(Path.cwd()))
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
         options = {"jobs": jobs} if jobs else {}

@@ -25,7 +25,8 @@ class LiveOptions:
     """Options of a live run's attachment.
 
     `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the
-    run); `launch` starts the agents; `record` is where a recorder process writes its recording, or None.
+    run); `launch` starts the agents; `record` is where a recorder process writes its recording (a file in the run's
+    folder, unless its path is absolute), or None.
     """
 
     access: Access

@@ -54,10 +54,13 @@ class Exit:
 
 
 class Launcher:
-    """The processes that a run has started. `stop` ends all that are left, whatever happened before."""
+    """The processes that a run has started, which log to `logs`.
+
+    `stop` ends all that are left, whatever happened before.
+    """
 
     def __init__(self, logs: Path) -> None:
-        self._logs = logs
+        self.logs = logs
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._services: set[str] = set()
 
@@ -94,7 +97,7 @@ class Launcher:
         os.close(write_end)
         try:
             inherit = nullcontext() if name in self._services else default_time_slice()
-            with (self._logs / f"{name}.log").open("ab") as log, inherit:
+            with (self.logs / f"{name}.log").open("ab") as log, inherit:
                 self._processes[name] = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -128,7 +131,7 @@ class Launcher:
     def log_tail(self, name: str) -> str:
         """The last lines of a process's log."""
         try:
-            text = (self._logs / f"{name}.log").read_text(errors="replace")
+            text = (self.logs / f"{name}.log").read_text(errors="replace")
         except OSError:
             return ""
         return "\n".join(text.splitlines()[-LOG_TAIL_LINES:])

@@ -34,6 +34,8 @@ WORLD_FILE = "world.npz"
 VERDICT_FILE = "verdict.json"
 REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
 """Names of a run's report and recording, and of the list of the runs in a folder."""
+PROGRAMS_LOG = "programs.log"
+"""File in `logs` of what programs print where standard output is for the result alone."""
 AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
 FORMAT = 2
@@ -51,35 +53,56 @@ class Event:
 
 
 class RunFolder:
-    """A run's folder; see the module's text. All methods raise VnetError where the disk does not play along."""
+    """A run's folder; see the module's text. All methods raise VnetError where the disk does not play along.
+
+    `prepare` touches nothing on the disk; until `open` has made the folder, events are kept for it. `out` is where
+    it is wanted, or None for `runs/{name}-{seed}`.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.logs = path / "logs"
         self.events: list[Event] = []
         self.scenario_text = ""
         """`scenario.toml` as it is now."""
         self._digests: dict[str, dict[str, str]] = {}
+        self._is_open = self._has_own_number = False
 
     @classmethod
-    def create(cls, path: Path | None, scenario: Scenario) -> RunFolder:
-        """Make the folder, at `path` or as `runs/{name}-{seed}` with a number where that exists already.
-
-        Never touches another run's files: a `path` that is not empty is refused.
-        """
-        default = RUNS / f"{scenario.run.name}-{scenario.run.seed}"
-        with disk_errors(path or default):
-            if path is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
+    def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
+        """Return the folder that `open` will make. Raises VnetError for an `out` that is not empty."""
+        path = out or RUNS / f"{scenario.run.name}-{scenario.run.seed}"
+        with disk_errors(path):
+            if out is not None and path.exists() and (not path.is_dir() or any(path.iterdir())):
                 raise VnetError(f"--out {path}: exists and is not an empty folder")
-            folder = cls(path or _claim(default))
-            folder.logs.mkdir(parents=True)
-            # Digests are those of the start: what is edited while the run is on has not been read.
-            folder._digests = {"inputs": input_digests(scenario), "code": code_digests(scenario)}
-            folder.put_scenario(scenario)
-            (folder.path / EVENTS_FILE).touch()
-            if path is None:
-                _point_latest_to(folder.path)
+        folder = cls(path)
+        folder._has_own_number = out is None
+        # Digests are those of the start: what is edited while the run is on has not been read.
+        folder._digests = {"inputs": input_digests(scenario), "code": code_digests(scenario)}
         return folder
+
+    @classmethod
+    def create(cls, out: Path | None, scenario: Scenario) -> RunFolder:
+        """Prepare and make the folder."""
+        folder = cls.prepare(out, scenario)
+        folder.open(scenario)
+        return folder
+
+    def open(self, scenario: Scenario) -> None:
+        """Make the folder, with a number where `runs/{name}-{seed}` exists already."""
+        with disk_errors(self.path):
+            if self._has_own_number:
+                self.path = _claim(self.path)
+            self.logs.mkdir(parents=True)
+            self.put_scenario(scenario)
+            (self.path / EVENTS_FILE).write_text("".join(map(_line, self.events)))
+            self._is_open = True
+            if self._has_own_number:
+                _point_latest_to(self.path)
+
+    @property
+    def logs(self) -> Path:
+        """The folder of the logs of the run's processes."""
+        return self.path / "logs"
 
     @property
     def code(self) -> dict[str, str]:
@@ -104,9 +127,9 @@ class RunFolder:
         """Write down what happened at an emulated instant."""
         event = Event(time_ns, kind, node, details)
         self.events.append(event)
-        line = json.dumps({"time_ns": time_ns, "kind": kind, "node": node, **details})
-        with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:
-            file.write(line + "\n")
+        if self._is_open:
+            with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:
+                file.write(_line(event))
 
     def put(self, name: str, write: Callable[[Path], None]) -> None:
         """Have `write` make a file beside its place, then move it there in one step."""
@@ -116,6 +139,12 @@ class RunFolder:
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
         self.put(name, lambda path: write_text(path, json.dumps(data, indent=2) + "\n"))
+
+
+def _line(event: Event) -> str:
+    """Return an event as a line of `events.jsonl`."""
+    named = {"time_ns": event.time_ns, "kind": event.kind, "node": event.node, **event.details}
+    return json.dumps(named) + "\n"
 
 
 def write_text(path: Path, text: str) -> None:

@@ -36,7 +36,7 @@ from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_ki
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
 from vnet.errors import ScenarioError, VnetError
-from vnet.runtime.host import load_program
+from vnet.runtime.programs import load_program
 
 FORMAT = 1
 LONGEST_S = 20.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import multiprocessing
+import os
 import signal
 import time
 import traceback
@@ -19,7 +20,7 @@ from emulator.checks.judge import Verdict
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 
@@ -33,6 +34,8 @@ PRELOADED = (
     "emulator.terminal.progress",
 )
 POLL_S = 0.1
+STDOUT = 1
+"""Descriptor of standard output."""
 STACKS_AT = 0.9
 """At this share of its time limit a trial writes down where it stands."""
 
@@ -144,6 +147,8 @@ def _apart(scenario: Scenario, folder: Path, sender: Connection, limit_s: float)
     for number in (signal.SIGINT, signal.SIGTERM):  # they are the campaign's, which kills this process if it must
         signal.signal(number, signal.SIG_IGN)
     run_folder = RunFolder.create(folder, scenario)
+    with (run_folder.logs / PROGRAMS_LOG).open("ab") as log:
+        os.dup2(log.fileno(), STDOUT)
     with (run_folder.logs / "stacks.txt").open("w") as stacks:
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:

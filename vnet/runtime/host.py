@@ -9,56 +9,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import contextvars
-import importlib
 import inspect
 import traceback
 import weakref
-from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from vnet.errors import ProgramError
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
-from vnet.runtime.own_packages import name_clash
+from vnet.runtime.programs import Program, Programs, error_line, load_program
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
-Program = Callable[[Node], Awaitable[None]]
-Programs = Mapping[str, Program]
-"""Program of each node, by id."""
-
 _current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
 """On whose behalf code runs: a node, in one of its incarnations."""
-
-
-RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
-"""New names of modules with a program, by the old."""
-
-
-def load_program(entry: str) -> Program:
-    """Import `package.module:function`. Raises ProgramError with the reason in one line."""
-    module_name, _, name = entry.partition(":")
-    if module_name in RENAMED_MODULES:
-        raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
-    try:
-        module = importlib.import_module(module_name)
-    except Exception as error:
-        raise _load_error(entry, f"cannot import: {_one_line(error)}") from error
-    program = getattr(module, name, None)
-    if program is None:
-        raise _load_error(entry, f"module {module_name} has no {name!r}")
-    if not asyncio.iscoroutinefunction(program):
-        raise ProgramError(f"program.entry = {entry!r}: is not an async function: async def {name}(node)")
-    return program  # type: ignore[no-any-return]
-
-
-def _load_error(entry: str, reason: str) -> ProgramError:
-    """Error of a program that is not found; it names a file that bears the name of one of vnet's own packages."""
-    clash = name_clash(entry.partition(":")[0], Path.cwd())
-    return ProgramError(f"program.entry = {entry!r}: {reason}" + (f"; {clash}" if clash else ""))
 
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
@@ -294,7 +260,7 @@ class Host:
             if isinstance(error, SystemExit) and not error.code:
                 self._over(node, "finished")
                 return
-            self._over(node, "crashed", _one_line(error), "".join(traceback.format_exception(error)[-30:]))
+            self._over(node, "crashed", error_line(error), "".join(traceback.format_exception(error)[-30:]))
         else:
             self._over(node, "finished")
 
@@ -335,8 +301,3 @@ def _owner(handle: asyncio.Handle) -> Node | None:
 
 async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__

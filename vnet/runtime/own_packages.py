@@ -1,11 +1,12 @@
-"""vnet's own top-level packages, and files of a user's that bear the same names.
+"""vnet's own top-level packages, and files of a user's that bear the names of others.
 
-Both cannot be imported in one process: whichever is found hides the other. These functions name the file for the
-one line of an error.
+Of two modules of one name a process imports one: whichever is found first hides the other. These functions name the
+file for the one line of an error.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
@@ -34,16 +35,29 @@ def _file_of(spec: ModuleSpec | None) -> Path | None:
 
 
 def name_clash(module: str, folder: Path) -> str:
-    """Name the file that shares its name with the package of `module`, of which one cannot be imported; "" if none.
+    """Name the file in `folder` that is not imported because another of its name is found first; "" if none.
 
-    Either something else has been found in place of vnet's own package, or vnet's own hides the one in `folder`.
+    Either something else has been found in place of vnet's own package, or vnet's own, Python's or an installed
+    module hides the one in `folder`.
     """
     package = module.partition(".")[0]
-    if package not in OWN:
-        return ""
     if foreign := foreign_on_path(package):
         return foreign
     for file in (folder / f"{package}.py", folder / package / "__init__.py"):
-        if file.exists() and file.resolve().parent != ROOT / package:
-            return f"{package} is a package of vnet's own: rename {file}"
+        if not file.exists():
+            continue
+        hider = _hider(package, file)
+        return f"{hider}: rename {file}" if hider else ""
     return ""
+
+
+def _hider(package: str, file: Path) -> str:
+    """Say what `import package` finds in place of `file`; "" if it finds the file."""
+    if package in OWN:
+        return "" if file.resolve().parent == ROOT / package else f"{package} is a package of vnet's own"
+    if package in sys.builtin_module_names:
+        return f"{package} is a module of Python's own"
+    found = _file_of(PathFinder.find_spec(package))
+    if found is None or found == file.resolve():
+        return ""
+    return f"{package} is found at {found}"

@@ -92,7 +92,7 @@ class Joining:
         groups = split_into_processes(node_ids, self._emulation.scenario.run.nodes_per_process)
         groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
         if self._options.record is not None:
-            self._start_recorder(endpoint, self._options.record)
+            self._start_recorder(endpoint, self._options.record.inside(self._emulation.folder.path))
         if self._options.launch:
             on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
             for nodes in groups:

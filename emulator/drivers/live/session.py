@@ -57,12 +57,14 @@ async def run_live(
     on_state: Callable[[str], None] = lambda text: None,
     before_horizon: HorizonCallback = no_horizon,
     on_missing: Callable[[Sequence[str]], None] = lambda nodes: None,
+    on_open: Callable[[], None] = lambda: None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end over Zenoh; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C and SIGTERM end the run early, with the event `interrupted`; afterwards both are handled as before.
     Raises VnetError if it cannot start. `before_horizon` holds a run in lockstep. `on_missing` is called with the
-    nodes that have not joined, whenever they change.
+    nodes that have not joined, whenever they change; `on_open` once the emulator's endpoint is open, and may make
+    the run's folder.
     """
     with ExitStack() as stack:
         launcher = Launcher(emulation.folder.logs)
@@ -75,6 +77,8 @@ async def run_live(
                 options.router.start(launcher)
             session = LiveSession(emulation, options, launcher, before_horizon)
             stack.callback(session.close)
+            on_open()
+            launcher.logs = emulation.folder.logs
             stack.enter_context(
                 control_endpoint(emulation.folder.path, session.endpoint, options.access, options.record)
             )

@@ -15,7 +15,8 @@ from emulator.scenario.faults import parse_fault
 from emulator.world.gnss_faults import clock_of
 from tests.vnet.runtime.test_host import Over, welcome
 from vnet import Node
-from vnet.runtime.host import Host, Program
+from vnet.runtime.host import Host
+from vnet.runtime.programs import Program
 from vnet.runtime.virtual_time import VirtualTimeLoop
 from vnet.transport import wire
 

@@ -9,7 +9,8 @@ import pytest
 from vnet import Node
 from vnet.errors import PayloadTooLargeError, ProgramError
 from vnet.roads.lanes import LaneMap
-from vnet.runtime.host import Host, Program, load_program
+from vnet.runtime.host import Host
+from vnet.runtime.programs import Program, load_program
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 

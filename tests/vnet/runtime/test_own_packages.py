@@ -1,5 +1,6 @@
 """A file of a user's that bears the name of one of vnet's packages is named in the one line of the error."""
 
+import colorsys
 import os
 import subprocess
 import sys
@@ -9,8 +10,8 @@ import pytest
 
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError
-from vnet.runtime.host import load_program
 from vnet.runtime.own_packages import foreign_on_path, name_clash
+from vnet.runtime.programs import load_program
 
 PROGRAM = "async def main(node):\n    pass\n"
 
@@ -25,9 +26,36 @@ def test_a_program_in_a_file_that_vnet_s_own_package_hides(
     with pytest.raises(ProgramError) as caught:
         load_program(f"{package}:main")
     assert str(caught.value) == (
-        f"program.entry = '{package}:main': module {package} has no 'main'; "
+        f"program.entry = '{package}:main': module {package} ({ROOT}/{package}/__init__.py) has no 'main'; "
         f"{package} is a package of vnet's own: rename {file}"
     )
+
+
+@pytest.mark.parametrize(
+    ("module", "found"), [("colorsys", "colorsys is found at "), ("time", "time is a module of Python's own")]
+)
+def test_a_program_in_a_file_that_a_module_of_python_s_hides(
+    module: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"{module}.py").write_text(PROGRAM)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ProgramError) as caught:
+        load_program(f"{module}:main")
+    where = "built into Python" if module == "time" else colorsys.__file__
+    assert f"module {module} ({where}) has no 'main'" in str(caught.value)
+    assert found in str(caught.value)
+    assert str(caught.value).endswith(f": rename {tmp_path}/{module}.py")
+
+
+def test_a_module_that_the_program_imports_and_another_hides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "random.py").touch()
+    (tmp_path / "imports_random.py").write_text("from random import my_own\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    with pytest.raises(ProgramError, match=rf"random is found at .*random\.py: rename {tmp_path}/random\.py$"):
+        load_program("imports_random:main")
 
 
 def test_a_module_of_a_package_that_vnet_s_own_hides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

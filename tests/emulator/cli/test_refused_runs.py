@@ -1,0 +1,101 @@
+"""A run that is refused leaves nothing: no folder, no number used up, and `runs/latest` where it was."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from tests.support.paths import ROOT
+
+BEACON = str(ROOT / "scenarios" / "beacon.toml")
+SHORT = ["--duration", "0.5", "--set", "network.vehicles=2", "--quiet", "--no-report"]
+UNKNOWN = 3
+"""Exit status of a run in which nobody sends, so that there is nothing to judge."""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A current folder with programs, one of which is good; this process forgets them."""
+    programs = {
+        "good": "async def main(node):\n    pass\n",
+        "wrong_syntax": "async def main(node:\n",
+        "lacks_module": "import none_such\n",
+        "raises_early": "raise ValueError('no key')\n",
+        "leaves_early": "import os\nos._exit(7)\n",
+        "no_coroutine": "def main(node):\n    pass\n",
+    }
+    for name, code in programs.items():
+        (tmp_path / f"{name}.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    for name in programs:
+        sys.modules.pop(name, None)
+
+
+def vnet(*arguments: str) -> tuple[int, str]:
+    """Run `vnet ARGUMENTS` in this process; returns the exit status and stderr."""
+    done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, list(arguments))
+    return done.exit_code, done.stderr
+
+
+WRONG = [
+    (["--program", "godo:main"], "No module named 'godo'"),
+    (["--program", "good:mainn"], "module good (good.py) has no 'mainn' (did you mean main?)"),
+    (["--program", "wrong_syntax:main"], "SyntaxError"),
+    (["--program", "lacks_module:main"], "No module named 'none_such'"),
+    (["--program", "raises_early:main"], "cannot import: ValueError: no key"),
+    (["--program", "no_coroutine:main"], "is not an async function"),
+    (["--rerun", "save", "--rerun-vehicle", "v99"], "--rerun-vehicle v99: no such vehicle"),
+    (["--rerun", "sve"], "--rerun sve"),
+    (["--set", 'fault=[{kind="kill", at_s=0.1, duration_s=0.1, nodes={ids=["v99"]}}]'], "v99"),
+]
+
+
+@pytest.mark.parametrize("command", ["simulate", "run"])
+@pytest.mark.parametrize(("options", "message"), WRONG, ids=lambda value: str(value)[:30])
+def test_what_is_refused_leaves_nothing(command: str, options: list[str], message: str) -> None:
+    status, stderr = vnet(command, BEACON, *SHORT, *options)
+    assert (status, stderr.count("\n")) == (2, 1), stderr
+    assert message in stderr
+    assert not Path("runs").exists()
+
+
+def test_the_number_is_not_used_up_and_latest_stays() -> None:
+    assert vnet("simulate", BEACON, *SHORT, "--program", "good:main")[0] == UNKNOWN
+    assert vnet("simulate", BEACON, *SHORT, "--program", "good:mainn")[0] == 2
+    assert vnet("run", BEACON, *SHORT, "--program", "leaves_early:main") == (
+        2,
+        "vnet: program.entry = 'leaves_early:main': importing it ended the process (exit status 7)\n",
+    )
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["beacon-1", "latest"]
+    assert vnet("simulate", BEACON, *SHORT, "--program", "good:main")[0] == UNKNOWN
+    assert Path("runs/latest").readlink() == Path("beacon-1-2")
+
+
+def test_out_is_not_made() -> None:
+    for out in ("run", "there"):
+        Path("there").mkdir(exist_ok=True)
+        assert vnet("simulate", BEACON, *SHORT, "--out", out, "--program", "godo:main")[0] == 2
+    assert list(Path("there").iterdir()) == []
+    assert not Path("run").exists()
+
+
+def test_an_import_that_does_not_end_is_ended(here: Path) -> None:
+    (here / "waits_for_ever.py").write_text("import threading\nthreading.Event().wait()\n")
+    options = ["--program", "waits_for_ever:main", "--set", "run.join_timeout_s=0.1"]
+    assert vnet("run", BEACON, *SHORT, *options) == (
+        2,
+        "vnet: program.entry = 'waits_for_ever:main': not imported within run.join_timeout_s = 0.1\n",
+    )
+    assert not Path("runs").exists()
+
+
+def test_an_endpoint_that_cannot_be_listened_at_leaves_nothing() -> None:
+    status, stderr = vnet("emulator", BEACON, *SHORT, "--listen", "tcp/192.0.2.1:7447")
+    assert status == 2
+    assert "cannot listen on tcp/192.0.2.1:7447: no such address on this machine" in stderr
+    assert not Path("runs").exists()

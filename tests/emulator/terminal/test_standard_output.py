@@ -1,0 +1,75 @@
+"""Standard output is for the result alone where that is asked for, whatever prints."""
+
+import ctypes
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from emulator.records.run_folder import PROGRAMS_LOG
+from emulator.terminal.standard_output import result_only
+from tests.support.paths import ROOT
+
+TALKATIVE = """
+import atexit, ctypes, os, subprocess, sys
+c = ctypes.CDLL(None)
+print("from an import")
+atexit.register(print, "at the end")
+async def main(node):
+    print("from Python")
+    c.puts(b"from C")
+    os.write(1, b"from a descriptor\\n")
+    subprocess.run(["echo", "from a child"])
+    await node.sleep(0.1)
+"""
+SAID = ["from Python", "from C", "from a descriptor", "from a child"]
+
+
+def test_what_prints_is_kept_and_the_result_is_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with result_only(True) as output:
+        print("early")
+        output.keep_in(tmp_path)
+        print("from Python")
+        ctypes.CDLL(None).puts(b"from C")
+        os.write(1, b"from a descriptor\n")
+        output.print("the result")
+        print("late")
+    print("afterwards")
+    assert capfd.readouterr().out == "the result\nafterwards\n"
+    kept = (tmp_path / PROGRAMS_LOG).read_text().splitlines()
+    assert kept[0] == "early"
+    assert sorted(kept[1:]) == ["from C", "from Python", "from a descriptor", "late"]
+
+
+def test_a_caller_with_another_standard_output_gets_the_result_alone(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with result_only(True) as output:
+        print("noise")
+        output.print("the result")
+    assert capsys.readouterr().out == "the result\n"
+
+
+def test_else_everything_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    with result_only(False) as output:
+        print("noise")
+        output.print("the result")
+    assert capsys.readouterr().out == "noise\nthe result\n"
+
+
+@pytest.mark.slow
+def test_a_simulation_in_json_is_one_object(tmp_path: Path) -> None:
+    (tmp_path / "talkative.py").write_text(TALKATIVE)
+    scenario = str(ROOT / "scenarios" / "beacon.toml")
+    command = ["simulate", scenario, "--program", "talkative:main", "--duration", "0.5", "--out", "run"]
+    command += ["--log-format", "json", "--no-report", "--set", "network.vehicles=2"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    words = [sys.executable, "-P", "-m", "emulator.cli", *command]
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert json.loads(done.stdout)["vehicles"] == 2, done.stderr
+    assert done.stdout.count("\n") == 1
+    log = (tmp_path / "run" / "logs" / PROGRAMS_LOG).read_text()
+    assert sorted(log.splitlines()) == sorted(["from an import", "at the end", *2 * SAID])

@@ -1,0 +1,70 @@
+"""Loading of vehicle programs by their entry, `package.module:function`."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vnet.errors import ProgramError, did_you_mean
+from vnet.runtime.own_packages import name_clash
+
+if TYPE_CHECKING:  # the check of a program before a run loads no more than the program itself needs
+    from types import ModuleType
+
+    from vnet.node import Node
+
+Program = Callable[["Node"], Awaitable[None]]
+Programs = Mapping[str, Program]
+"""Program of each node, by id."""
+
+RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
+"""New names of modules with a program, by the old."""
+
+
+def load_program(entry: str) -> Program:
+    """Import `package.module:function`. Raises ProgramError with the reason in one line."""
+    module_name, _, name = entry.partition(":")
+    if module_name in RENAMED_MODULES:
+        raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        missed = getattr(error, "name", None) if isinstance(error, ImportError) else None
+        raise _load_error(entry, f"cannot import: {error_line(error)}", missed or module_name) from error
+    program = getattr(module, name, None)
+    if program is None:
+        found = f"module {module_name} ({_origin(module)})"
+        raise _load_error(entry, f"{found} has no {name!r}{did_you_mean(name, _programs_of(module))}", module_name)
+    if not inspect.iscoroutinefunction(program):
+        raise _load_error(entry, f"is not an async function: async def {name}(node)", module_name)
+    return program  # type: ignore[no-any-return]
+
+
+def _load_error(entry: str, reason: str, module: str) -> ProgramError:
+    """Error of a program that is not found; it names the file of `module` that another of its name hides."""
+    clash = name_clash(module, Path.cwd())
+    return ProgramError(f"program.entry = {entry!r}: {reason}" + (f"; {clash}" if clash else ""))
+
+
+def _origin(module: ModuleType) -> str:
+    """File of a module, relative to the current folder if it is inside."""
+    file = getattr(module, "__file__", None)
+    if file is None:
+        return "built into Python" if module.__name__ in sys.builtin_module_names else "a folder without code"
+    return os.path.relpath(file) if Path(file).is_relative_to(Path.cwd()) else str(file)
+
+
+def _programs_of(module: ModuleType) -> list[str]:
+    """Names of the functions of a module that could be programs."""
+    return [name for name, value in vars(module).items() if inspect.iscoroutinefunction(value)]
+
+
+def error_line(error: BaseException) -> str:
+    """Return the type and the message of an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
