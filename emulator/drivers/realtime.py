@@ -90,9 +90,9 @@ class RealTime:
             self._emulation.take(now_ns, [message.traffic])
 
     @property
-    def all_final(self) -> bool:
-        """Return whether every living process has sent its last message."""
-        return not self._awaited
+    def awaited(self) -> frozenset[str]:
+        """The processes that have not sent their last message, and are neither dead nor taken by a fault."""
+        return frozenset(self._awaited)
 
     def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
         waiting = self._unacknowledged[process_id]

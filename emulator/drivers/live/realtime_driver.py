@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 
 from emulator.drivers.live.driver import Driver, Parts
+from emulator.drivers.live.supervisor import ProcessState
 from emulator.drivers.realtime import RealTime
 from vnet.transport import wire
 
@@ -62,7 +63,10 @@ class RealTimeDriver(Driver):
 
     async def finish(self, deadline_s: float) -> None:
         """Wait for the last acknowledgements, and decide what nobody has acknowledged."""
-        while not self._realtime.all_final and await self._changes.wait(deadline_s - time.monotonic()):
+        while self._is_final_missing() and await self._changes.wait(deadline_s - time.monotonic()):
             pass
         self._realtime.finish()
         await self._supervisor.all_ended()
+
+    def _is_final_missing(self) -> bool:
+        return not self._realtime.awaited <= set(self._supervisor.processes_in(ProcessState.AWAY))

@@ -39,9 +39,7 @@ from vnet.transport import wire
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
 
 LEASE_MS = 60_000
-"""Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
-REALTIME_LEASE_MS = 2_000
-"""Short, because in real time a process that says nothing is of no use to anybody."""
+"""Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
 PATIENCE_S = 0.5
 """Seconds for which a run that did not come to its end waits for its processes to end by themselves."""
 FULL_PATIENCE_S = 5.0
@@ -87,10 +85,8 @@ async def run_live(
 
 def _lease_ms(scenario: Scenario) -> int:
     """Milliseconds without a message after which a connection ends; a planned pause must not end it."""
-    if scenario.run.pacing == "lockstep":
-        return LEASE_MS
     pauses_s = [fault.duration_s for fault in scenario.fault if fault.kind == "pause"]
-    return REALTIME_LEASE_MS + round(1000 * max(pauses_s, default=0.0))
+    return LEASE_MS + round(1000 * max(pauses_s, default=0.0))
 
 
 class LiveSession:
@@ -236,7 +232,8 @@ class LiveSession:
         self._supervisor.pause(())
         for node in self._members.joined:
             self._attachment.send(node, wire.End(None, "the run is over"))
-        deadline_s = time.monotonic() + SHUT_DOWN_S
+        self._supervisor.all_told_to_end()
+        deadline_s = time.monotonic() + (FULL_PATIENCE_S if completed else SHUT_DOWN_S)
         if self._driver is not None:
             await self._driver.finish(deadline_s)
         if not self._options.launch:  # whoever closes at once may take the last messages along

@@ -99,6 +99,7 @@ class Supervisor:
         self.on_death: Callable[[], None] = changes.set
         self.reconnecting = False
         """True while the emulator itself is disconnected: lost connections then mean nothing."""
+        self._all_told_to_end = False
 
     def begin(self, processes: Iterable[Sequence[str]]) -> None:
         """Give each process (its nodes, its id first) a state, now that every node that must be there is ready."""
@@ -197,6 +198,10 @@ class Supervisor:
             self._pause_if_planned(process_id)
         return returned
 
+    def all_told_to_end(self) -> None:
+        """Take note that every process has been told to end: one that ends from now on has not died."""
+        self._all_told_to_end = True
+
     async def all_ended(self) -> None:
         """Wait for those that have been told to end."""
         await asyncio.gather(*self._ending)
@@ -225,14 +230,14 @@ class Supervisor:
     def _children_ended(self) -> None:
         loop = asyncio.get_running_loop()
         for name, how in self._launcher.ended().items():
-            loop.call_later(DEATH_GRACE_S, self.child_ended, name, how)
+            loop.call_later(DEATH_GRACE_S, self.child_ended, name, how, self._all_told_to_end)
 
-    def child_ended(self, name: str, how: Exit) -> None:
-        """Take note that a process that the run has started has ended by itself."""
+    def child_ended(self, name: str, how: Exit, told_to_end: bool = False) -> None:
+        """Take note that a process that the run has started has ended, `told_to_end` or by itself."""
         if not self._attachment.knows(name):
             self._folder.event(self._time_ns(), "observer_ended", name, how=how.how)
         elif self._processes:
-            self._died(name, how=how.how, log_tail=how.log_tail)
+            self._ended(name, told_to_end, how=how.how, log_tail=how.log_tail)
         else:
             last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
             if "No module named" in last and (foreign := foreign_on_path("agents")):
@@ -250,23 +255,27 @@ class Supervisor:
             self._members.leave(node)
         elif not self._options.launch and self._is_there(node):
             process = self._members.describe(node)
-            asyncio.get_running_loop().call_later(DEATH_GRACE_S, self._connection_closed, node, process)
+            loop, told_to_end = asyncio.get_running_loop(), self._all_told_to_end
+            loop.call_later(DEATH_GRACE_S, self._connection_closed, node, process, told_to_end)
 
     def _is_there(self, node: str) -> bool:
         there = (ProcessState.RUNNING, ProcessState.PAUSED)
         return node in self._processes and self.state(node) in there
 
-    def _connection_closed(self, process_id: str, process: str) -> None:
+    def _connection_closed(self, process_id: str, process: str, told_to_end: bool) -> None:
         if self._is_there(process_id):
-            self._died(process_id, how="its connection closed", process=process)
+            self._ended(process_id, told_to_end, how="its connection closed", process=process)
 
-    def _died(self, process_id: str, **details: Any) -> None:
+    def _ended(self, process_id: str, told_to_end: bool, **details: Any) -> None:
         over = (ProcessState.AWAY, ProcessState.DEAD)
         if self.state(process_id) in over or process_id in self._launcher.pids:
             return  # a fault was faster, and may have started the next process of this name since
-        self._change(process_id, ProcessState.DEAD)
-        self._processes[process_id].death = details
-        self.on_death()
+        if told_to_end:
+            self._change(process_id, ProcessState.AWAY)
+        else:
+            self._change(process_id, ProcessState.DEAD)
+            self._processes[process_id].death = details
+            self.on_death()
         self._changes.set()
 
     def take_deaths(self, among: Collection[str] | None = None) -> dict[str, dict[str, Any]]:

@@ -80,6 +80,11 @@ class FakeLauncher:
         self.pids.pop(name, None)
         supervisor.child_ended(name, Exit(status, "its last line"))
 
+    def ends_as_told(self, supervisor: Supervisor, name: str) -> None:
+        """A process has ended because it was told to, and the news of it comes."""
+        self.pids.pop(name, None)
+        supervisor.child_ended(name, Exit(0, ""), told_to_end=True)
+
 
 class FakeAttachment:
     """An attachment that keeps what is sent."""

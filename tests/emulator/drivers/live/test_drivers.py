@@ -1,5 +1,6 @@
 """The drivers of both pacings, against processes that only answer."""
 
+import asyncio
 from collections.abc import Callable
 from typing import Any
 
@@ -251,5 +252,32 @@ def test_in_real_time_a_process_that_says_no_last_words_is_waited_for_until_the_
         before_ns = play.driver.time_ns
         await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 1.0)
         assert play.driver.time_ns - before_ns == 1000 * MS
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_real_time_processes_that_end_when_they_are_told_to_have_not_died_however_late_the_last_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        play = Play(RealTimeDriver, frames)
+        await play.driver.run()
+        supervisor, loop = play.stage.supervisor, asyncio.get_running_loop()
+        supervisor.all_told_to_end()
+
+        def final(node: str) -> None:
+            seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
+            last = wire.Frames(b"1", seq, seq, [], wire.Traffic(), None, final=True)
+            play.inbox.put_message(node, wire.encode(last))
+
+        for node in IDS[:2]:
+            final(node)
+            play.stage.launcher.ends_as_told(supervisor, node)
+        play.stage.launcher.ends_as_told(supervisor, "v03")  # without a last message
+        loop.call_later(2.0, final, "v04")
+        before_ns = play.driver.time_ns
+        await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 5.0)
+        assert play.stage.events("died") == []
+        assert play.driver.time_ns - before_ns == 2000 * MS, "it waits for v04, and for nobody else"
 
     in_virtual_time(run(), monkeypatch)

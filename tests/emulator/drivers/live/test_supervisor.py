@@ -249,6 +249,34 @@ async def test_the_end_of_a_process_started_by_hand_is_told_by_its_connection() 
     assert stage.supervisor.take_deaths() == {"v03": details}
 
 
+@pytest.mark.parametrize("launch", [True, False])
+def test_who_ends_after_all_were_told_to_has_not_died(launch: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        stage = Stage(launch=launch)
+        stage.join()
+        stage.launcher.pids.clear()
+        ended: dict[str, Exit] = {}
+        monkeypatch.setattr(stage.launcher, "ended", lambda: ended, raising=False)
+
+        def end(name: str) -> None:
+            if not launch:
+                stage.supervisor.disconnected(name)
+                return
+            ended.clear()
+            ended[name] = Exit(0, "")
+            stage.supervisor._children_ended()
+
+        end("v02")
+        stage.supervisor.all_told_to_end()
+        end("v03")
+        while RUNNING in states(stage)[1:3]:
+            await stage.changes.wait(10)
+        assert states(stage) == [RUNNING, DEAD, AWAY, RUNNING]
+        assert list(stage.supervisor.take_deaths()) == ["v02"]
+
+    asyncio.run(run())
+
+
 @on_a_loop
 async def test_a_connection_that_closes_says_nothing_of_a_process_of_the_run_s_own() -> None:
     stage = Stage()
