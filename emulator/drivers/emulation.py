@@ -147,7 +147,12 @@ class Emulation:
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
-        """Take what nodes enqueue at `time_ns`: frames to the engine in node order, reports, endings."""
+        """Take what nodes enqueue at `time_ns`: frames to the engine in node order, reports, endings.
+
+        What comes after the end of the run, as processes still speak when it is interrupted, is no part of it.
+        """
+        if self._finished:
+            return
         frames: dict[str, list[bytes]] = {}
         endings: list[wire.Ending] = []
         for part in traffic:

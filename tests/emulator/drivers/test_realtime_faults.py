@@ -6,6 +6,7 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.realtime import RealTime
+from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import parse_fault
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
@@ -108,3 +109,15 @@ def test_whose_program_has_ended_is_not_up_again_when_its_process_is() -> None:
     assert [(a.stop, a.start) for a in realtime.take_actions()] == [({}, []), ({}, [])]
     assert not emulation.welcome("v02", b"n").runs
     assert emulation.welcome("v01", b"n").runs
+
+
+def test_frames_that_come_after_an_interruption_are_no_part_of_the_run() -> None:
+    realtime, emulation = started()
+    realtime.due(450 * MS)
+    emulation.finish(500 * MS)
+    late = wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v02", b"x")]), None, final=True)
+    realtime.receive(501 * MS, "v02", late)
+    realtime.finish()
+    assert emulation.engine.counts[Outcome.pending] == 0
+    assert len(emulation.engine.trace) == 0
+    assert "v02" not in realtime.awaited
