@@ -1,8 +1,11 @@
 """Whole runs: real routers on ports that the system chooses, real processes, through the commands users type."""
 
 import json
+import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +90,32 @@ def vnet(tmp_path: Path) -> Vnet:
         return Finished(done.returncode, done.stdout, done.stderr, folder)
 
     return run
+
+
+def run_until(enough: Callable[[], bool], folder: Path, scenario: str, *options: str) -> Finished:
+    """`vnet run`, ended by Ctrl-C once it is `enough`: what a run in real time shows in a fixed time depends on the
+    machine. The run must be long."""
+    command = [*VNET, "run", scenario, "--out", str(folder), "--no-report", *options]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            deadline = time.monotonic() + TIMEOUT_S
+            while not enough():
+                assert process.poll() is None, process.communicate()
+                assert time.monotonic() < deadline
+                time.sleep(0.05)
+            process.send_signal(signal.SIGINT)
+            stdout, stderr = process.communicate(timeout=TIMEOUT_S)
+        finally:
+            process.kill()
+    return Finished(process.returncode, stdout, stderr, folder)
+
+
+def heard_by(folder: Path, node: str) -> set[tuple[str, int]]:
+    """Each `vehicle.incarnation` that a vehicle with the program `names_neighbours` has heard, with the second."""
+    log = folder / "logs" / f"{node}.log"
+    lines = log.read_text().splitlines() if log.exists() else []
+    found = (re.fullmatch(r"heard (\S+) in second (\d+)", line) for line in lines)
+    return {(each[1], int(each[2])) for each in found if each}
 
 
 def running_agents(of: Path) -> list[int]:

@@ -89,6 +89,18 @@ async def runs_long(node: Node) -> None:
         await node.radio.broadcast(b"x")
 
 
+async def names_neighbours(node: Node) -> None:
+    """Speaks at every fix, and prints each vehicle and incarnation that it hears, once for each second."""
+    heard = set()
+    async for _ in node.gnss:
+        await node.radio.broadcast(bytes([node.incarnation]))
+        for packet in node.radio.drain():
+            line = f"heard {packet.sender}.{packet.payload[-1]} in second {packet.sent_ns // 1_000_000_000}"
+            if line not in heard:
+                heard.add(line)
+                print(line, flush=True)
+
+
 async def forgetful(node: Node) -> None:
     """Takes its randomness from the machine instead of `node.rng`: it does not replay."""
     async for _ in node.gnss:
