@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.checks.judge import RecordedRun
-from emulator.records.metrics import STATES
 from emulator.records.radio_metrics import radio_metrics
+from emulator.records.states import STATES
 from emulator.scenario.scenario import Scenario
 
 PERIOD_NS = 100_000_000

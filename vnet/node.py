@@ -11,9 +11,10 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Annotated, Any, Generic, Protocol, TypeVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import ArrayLike
 
 from vnet.errors import PayloadTooLargeError
@@ -22,6 +23,11 @@ from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
 T = TypeVar("T")
+
+LONGEST_TEXT = 64
+"""Characters of a reported text: it names a state, and is no log."""
+Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
+"""A reported value besides the estimates."""
 
 INBOX_LIMIT = 4096
 """Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
@@ -58,7 +64,7 @@ class Report:
     node: str
     estimate_m: tuple[float, float] | None
     covariance_m2: tuple[float, float, float, float] | None
-    values: dict[str, float | list[float]] = field(default_factory=dict)
+    values: dict[str, Value] = field(default_factory=dict)
 
 
 class NodeTransport(Protocol):
@@ -237,10 +243,12 @@ class Node:
     ) -> None:
         """Report the present estimates: position (2,) in m, its covariance (2, 2) in m², and further values.
 
-        Each further keyword is a number or an array of numbers. The emulator's metrics know `common_error_m` (2,),
+        Each further keyword is a number, a boolean, a text of at most 64 characters, or an array of numbers. All
+        but arrays are figures of the run: a column of its states, a row of its summary, a curve. A name that ends
+        in a unit is shown with it, as `delay_ms`. vnet's own metrics know `common_error_m` (2,),
         `common_error_covariance_m2` (2, 2), `mean_m` (2,) (of the consensus), `stacked_common_error_m` (2,) (after
         fusion) and `cloud_m` (n, 2); `heard` is the number of packets received since the last report, which is
-        checked against the trace. Raise ValueError for a wrong shape or a value that is not a number.
+        checked against the trace. Raise ValueError for a wrong shape or another kind of value.
         """
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
         covariance = None if covariance_m2 is None else _floats("covariance_m2", covariance_m2, 4)
@@ -284,6 +292,12 @@ def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]
     return flat
 
 
-def _value(name: str, value: ArrayLike) -> float | list[float]:
+def _value(name: str, value: ArrayLike) -> Value:
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, str):
+        if len(value) > LONGEST_TEXT:
+            raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
+        return str(value)
     flat = _floats(name, value)
     return flat[0] if np.ndim(value) == 0 else flat

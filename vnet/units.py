@@ -1,4 +1,56 @@
-"""Units of time. Times are integer nanoseconds from the start of a run, except in files and texts for people."""
+"""Units: of time, and those that the ends of names tell.
+
+Times are integer nanoseconds from the start of a run, except in files and texts for people.
+"""
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
+
+UNITS = {
+    "m_s2": "m/s²",
+    "mps2": "m/s²",
+    "m_s": "m/s",
+    "mps": "m/s",
+    "kmh": "km/h",
+    "mbps": "Mbit/s",
+    "kbps": "kbit/s",
+    "percent": "%",
+    "dbm": "dBm",
+    "ghz": "GHz",
+    "mhz": "MHz",
+    "db": "dB",
+    "bytes": "bytes",
+    "kb": "kB",
+    "mb": "MB",
+    "ppm": "ppm",
+    "rad_s": "rad/s",
+    "rad": "rad",
+    "deg": "°",
+    "hz": "Hz",
+    "ns": "ns",
+    "us": "µs",
+    "ms": "ms",
+    "min": "min",
+    "m2": "m²",
+    "km": "km",
+    "mm": "mm",
+    "m": "m",
+    "s": "s",
+}
+"""Units by the end of a name after an underscore; of two that fit the longer one counts."""
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a name ends in, or "": "ms" for `delay_ms`."""
+    return UNITS.get(_suffix(name), "")
+
+
+def title_of(name: str) -> str:
+    """Return a name as words, without its unit: "warning delay" for `warning_delay_ms`."""
+    suffix = _suffix(name)
+    return (name.removesuffix(f"_{suffix}") if suffix else name).replace("_", " ")
+
+
+def _suffix(name: str) -> str:
+    fitting = [suffix for suffix in UNITS if name.endswith(f"_{suffix}") and len(name) > len(suffix) + 1]
+    return max(fitting, key=len, default="")

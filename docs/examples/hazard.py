@@ -54,12 +54,9 @@ async def main(node: Node) -> None:
                 delay_ms[warning["event"]] = (packet.received_ns - warning["since_ns"]) / 1e6
                 if warning["hops"] < MOST_HOPS:
                     await node.radio.broadcast(msgpack.packb(warning))
-        hops = max((warning["hops"] for warning in known.values()), default=-1)
-        node.report(
-            fix.position_m,
-            fix.covariance_m2,
-            warned=len(known),
-            hops=hops,
-            delay_ms=max(delay_ms.values(), default=0.0),
-            malformed=malformed,
-        )
+        figures: dict[str, float] = {"warned": bool(known), "malformed": malformed}
+        if known:
+            figures["hops"] = max(warning["hops"] for warning in known.values())
+        if delay_ms:
+            figures["delay_ms"] = max(delay_ms.values())
+        node.report(fix.position_m, fix.covariance_m2, **figures)

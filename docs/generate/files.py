@@ -7,14 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 import pyarrow as pa
 
-from docs.generate.keys import unit
 from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
-from emulator.records.metrics import METRICS, STATES, PeriodFigures
+from emulator.records.metrics import METRICS, PeriodFigures
 from emulator.records.recorded_world import ARRAYS
+from emulator.records.reported import MOST_COLUMNS
+from emulator.records.states import STATES
+from vnet.units import unit_of
 
 INTRODUCTION = """
 A run leaves one folder: `runs/NAME-SEED` (with a number where that exists), or what `--out` says. `runs/latest`
@@ -109,8 +111,13 @@ STATE = {
     "mean_m": "of its report: what it takes for the mean of all estimates of the common error",
     "stacked_common_error_m": "of its report: the common error right after fusion, before the map",
     "cloud_m": "of its report: some hypotheses of the common error, x and y in turns",
-    "values": "everything else that it reported, by name",
+    "values": "lists, and names such as `weight.v03`, that it reported besides, by name",
 }
+STATES_ABOUT = (
+    "Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report by a name "
+    "of their own, called as they call it: [own figures](../how-to/own-figures.md). Those after the first "
+    f"{MOST_COLUMNS} names stay in `values`."
+)
 EVENTS = {
     "code_changed": ("", "`what`", "program or vnet have changed since the run whose scenario this one repeats"),
     "started": ("", "`start_up_s`", "all have joined; time 0"),
@@ -159,6 +166,8 @@ VERDICT = {
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
     "figures": "means of some metrics, after the first fifth of the run",
+    "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
+    "`p95`, `last`, `is_share`; of a text `text` and its `share`",
     "reproduce": "the command that has the run again",
     "versions": "of vnet, Python and numpy",
 }
@@ -177,7 +186,7 @@ def page() -> str:
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
     parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
-    parts += ["## `states.parquet`", columns(STATES, STATE)]
+    parts += ["## `states.parquet`", columns(STATES, STATE), STATES_ABOUT]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += [
         "## `metrics.parquet`",
@@ -201,7 +210,8 @@ def world_rows() -> list[list[str]]:
     if wrong := ARRAYS.keys() ^ WORLD.keys():
         raise LookupError(f"arrays without a text, or texts without an array: {', '.join(sorted(wrong))}")
     return [
-        [f"`{name}`", KINDS[kind], f"({shape})", unit(name), WORLD[name]] for name, (kind, shape) in ARRAYS.items()
+        [f"`{name}`", KINDS[kind], f"({shape})", unit_of(name), WORLD[name]]
+        for name, (kind, shape) in ARRAYS.items()
     ]
 
 
@@ -209,7 +219,9 @@ def columns(schema: pa.Schema, said: Mapping[str, str]) -> str:
     """The columns of a table with their types and units. Raises LookupError where the texts do not fit them."""
     if wrong := set(schema.names) ^ said.keys():
         raise LookupError(f"columns without a text, or texts without a column: {', '.join(sorted(wrong))}")
-    rows = ([f"`{field.name}`", f"`{_type(field.type)}`", unit(field.name), said[field.name]] for field in schema)
+    rows = (
+        [f"`{field.name}`", f"`{_type(field.type)}`", unit_of(field.name), said[field.name]] for field in schema
+    )
     return table(["column", "type", "unit", "what"], rows)
 
 

@@ -11,26 +11,9 @@ import msgspec
 from pydantic import BaseModel
 
 from docs.generate.markdown import attribute_docstrings, table
+from vnet.units import unit_of
 
 HEADER = ("key", "type", "default", "unit", "allowed", "what")
-UNITS = {
-    "m_s": "m/s",
-    "mbps": "Mbit/s",
-    "dbm": "dBm",
-    "ghz": "GHz",
-    "db": "dB",
-    "bytes": "bytes",
-    "ppm": "ppm",
-    "rad": "rad",
-    "hz": "Hz",
-    "ns": "ns",
-    "us": "µs",
-    "ms": "ms",
-    "m2": "m²",
-    "m": "m",
-    "s": "s",
-}
-"""By the end of a name; of two that fit the longer one."""
 _TYPES = {
     "integer": "whole number",
     "number": "number",
@@ -72,7 +55,7 @@ def option_table(options: type[msgspec.Struct]) -> str:
 
 def _row(name: str, key: dict[str, Any], required: bool) -> list[str]:
     default = "required" if required else _default(key)
-    return [f"`{name}`", _type(key), default, unit(name), _allowed(key), key["description"]]
+    return [f"`{name}`", _type(key), default, unit_of(name), _allowed(key), key["description"]]
 
 
 def subsections(model: type[BaseModel]) -> dict[str, list[type[BaseModel]]]:
@@ -89,12 +72,6 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
     elif get_origin(annotation) in (Annotated, Union, UnionType):
         for part in get_args(annotation):
             yield from _models(part)
-
-
-def unit(name: str) -> str:
-    """The unit that a name ends in, or nothing."""
-    fitting = [suffix for suffix in UNITS if name.endswith(f"_{suffix}")]
-    return UNITS[max(fitting, key=len)] if fitting else ""
 
 
 def _type(key: dict[str, Any], many: bool = False) -> str:

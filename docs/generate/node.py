@@ -8,13 +8,13 @@ import re
 from collections.abc import Iterator
 
 import vnet
-from docs.generate.keys import unit
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
 from vnet.errors import PayloadTooLargeError
 from vnet.node import INBOX_LIMIT, GnssReceiver, Radio
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
+from vnet.units import unit_of
 
 INTRODUCTION = """
 A program is one async function of one argument. It needs `from vnet import Node`, and nothing else of vnet; `Fix`
@@ -66,7 +66,7 @@ def _part(title: str, thing: type) -> Iterator[str]:
     yield said
     yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
     if dataclasses.is_dataclass(thing):
-        rows = ([f"`{each.name}`", _plain(each.type), unit(each.name)] for each in dataclasses.fields(thing))
+        rows = ([f"`{each.name}`", _plain(each.type), unit_of(each.name)] for each in dataclasses.fields(thing))
         yield table(["attribute", "type", "unit"], rows)
     for name, member in _members(thing):
         yield f"**`{name}`**: {docstring(member)}"

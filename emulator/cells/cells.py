@@ -34,6 +34,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.atomic import atomically, write_atomically
 from emulator.records.code_digest import digests_of, entries_of
 from emulator.records.divergence import first_divergences
+from emulator.records.reported import reported_figures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.world import build_world
@@ -221,6 +222,5 @@ def _divergent(states: pa.Table, vehicles: int, period_ns: int) -> int:
 
 
 def _mean_value(states: pa.Table, name: str) -> float | None:
-    values = [dict(row).get(name) for row in states["values"].to_pylist() if row]
-    found = [value[0] for value in values if value]
-    return float(np.mean(found)) if found else None
+    figure = reported_figures(states).get(name)
+    return None if figure is None else figure.mean

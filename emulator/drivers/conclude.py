@@ -21,6 +21,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
 from emulator.records.metrics import summarize
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reported import reported_figures
 from emulator.records.run_folder import (
     AGAIN,
     BUSY_FILE,
@@ -73,6 +74,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
+        "reported": {name: asdict(figure) for name, figure in reported_figures(states).items()},
         "reproduce": f"vnet {command} {shlex.quote(str(folder.scenario_path))}",
         "versions": {
             "vnet": version("vnet-emulator"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import heapq
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -110,7 +110,7 @@ def _streams(recorded: RecordedRun) -> list[Iterator[Message]]:
 
 
 def _periods(recorded: RecordedRun) -> Iterator[Message]:
-    count = len(recorded.node_ids)
+    count, names = len(recorded.node_ids), recorded.value_names
     for start in range(0, len(recorded.states), max(count, 1)):
         rows = recorded.states.slice(start, count).to_pylist()
         time_ns = rows[0]["time_ns"]
@@ -124,14 +124,16 @@ def _periods(recorded: RecordedRun) -> Iterator[Message]:
             {
                 "period": rows[0]["period"],
                 "common_error_m": _finite(rows[0]["common_error_m"]),
-                "vehicles": [_state(row) for row in rows if _is_point(row["position_m"])],
+                "vehicles": [_state(row, names) for row in rows if _is_point(row["position_m"])],
             },
         )
 
 
-def _state(row: dict[str, Any]) -> dict[str, Any]:
+def _state(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the state of a vehicle; `names` are those of its reported values that have columns."""
     columns = {name: _finite(row[name]) for name in _STATE_COLUMNS}
     values = {name: _finite(value) for name, value in row["values"] or ()}
+    values |= {name: _finite(row[name]) for name in names if row[name] is not None}
     return {
         "node": row["node"],
         **{name: value for name, value in columns.items() if value is not None},

@@ -17,7 +17,8 @@ WEIGHT = "weight."
 class Beliefs:
     """Reports of one period: arrays (n, 2) and (n, 4), NaN where a node reported nothing.
 
-    By node, also the numbers of its cloud, point by point, and the weights (n,) of its fusion.
+    By node, also the numbers of its cloud, point by point, and the weights (n,) of its fusion. By name, the figures
+    (n,) of programs' own, true as 1, and texts (n) with "" where a node reported none.
     """
 
     estimate_m: Array
@@ -26,6 +27,8 @@ class Beliefs:
     common_error_covariance_m2: Array
     clouds: Mapping[str, ArrayLike]
     weights: Mapping[str, Array]
+    values: Mapping[str, Array]
+    texts: Mapping[str, list[str]]
 
 
 def is_cloud(count: int) -> bool:

@@ -17,41 +17,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from emulator.records.reported import ValueColumns
+from emulator.records.states import COMMON_VALUES, STATES
 from emulator.world.world import Instant
-from vnet.node import Report
+from vnet.node import Report, Value
 from vnet.types import Array
 
-POINT = pa.list_(pa.float64(), 2)
-MATRIX = pa.list_(pa.float64(), 4)
-
-STATES = pa.schema(
-    {
-        "period": pa.int32(),
-        "time_ns": pa.int64(),
-        "node": pa.dictionary(pa.int32(), pa.string()),
-        "position_m": POINT,
-        "heading_rad": pa.float64(),
-        "fix_m": POINT,
-        "common_error_m": POINT,
-        "estimate_m": POINT,
-        "covariance_m2": MATRIX,
-        "common_error_estimate_m": POINT,
-        "common_error_covariance_m2": MATRIX,
-        "mean_m": POINT,
-        "stacked_common_error_m": POINT,
-        "cloud_m": pa.list_(pa.float64()),
-        "values": pa.map_(pa.string(), pa.list_(pa.float64())),
-    }
-)
 ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""
-_COMMON_VALUES = {
-    "common_error_m": "common_error_estimate_m",
-    "common_error_covariance_m2": "common_error_covariance_m2",
-    "mean_m": "mean_m",
-    "stacked_common_error_m": "stacked_common_error_m",
-    "cloud_m": "cloud_m",
-}
 _SIZES = {"common_error_m": 2, "common_error_covariance_m2": 4, "mean_m": 2, "stacked_common_error_m": 2}
 
 
@@ -107,6 +80,7 @@ class Metrics:
         self._period_ns = period_ns
         self.rows: list[PeriodFigures] = []
         self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
+        self._values = ValueColumns()
         self._packed: list[pa.Table] = []
 
     def record(
@@ -181,13 +155,21 @@ class Metrics:
             states["common_error_m"].append(instant.common_error_m.tolist())
             states["estimate_m"].append(None if report is None else report.estimate_m)
             states["covariance_m2"].append(None if report is None else report.covariance_m2)
-            for name, column in _COMMON_VALUES.items():
+            for name, column in COMMON_VALUES.items():
                 value = values.pop(name, None)
                 fits = isinstance(value, list) and len(value) == _SIZES.get(name, len(value))
                 states[column].append(value if fits else None)
-            states["values"].append([(k, v if isinstance(v, list) else [v]) for k, v in sorted(values.items())])
+            states["values"].append(self._other_values(len(self.rows) * len(self._node_ids) + number, values))
         if len(states["period"]) >= ROWS_A_PIECE:
             self._pack()
+
+    def _other_values(self, row: int, values: dict[str, Value]) -> list[tuple[str, list[float]]]:
+        """Put the values of a row of the states into columns; returns those that have none."""
+        others = []
+        for name, value in sorted(values.items()):
+            if not self._values.put(row, name, value) and not isinstance(value, str):
+                others.append((name, value if isinstance(value, list) else [value]))
+        return others
 
     def _pack(self) -> None:
         """Put the rows so far into a table: as Python's numbers they take up many times the room."""
@@ -195,9 +177,9 @@ class Metrics:
         self._states = {name: [] for name in STATES.names}
 
     def states_table(self) -> pa.Table:
-        """A row for each node and period; schema `STATES`."""
+        """A row for each node and period; the columns of `STATES`, then those of reported values."""
         self._pack()
-        return pa.concat_tables(self._packed).unify_dictionaries()
+        return self._values.add_to(pa.concat_tables(self._packed).unify_dictionaries())
 
     def metrics_table(self) -> pa.Table:
         """A row for each period; columns are the fields of `PeriodFigures`."""
@@ -281,7 +263,8 @@ def _is_not_finite(report: Report) -> bool:
     """Return whether any number of a report is NaN or infinite."""
     numbers = [*(report.estimate_m or ()), *(report.covariance_m2 or ())]
     for value in report.values.values():
-        numbers += value if isinstance(value, list) else [value]
+        if not isinstance(value, str):
+            numbers += value if isinstance(value, list) else [value]
     return not all(map(math.isfinite, numbers))
 
 

@@ -19,6 +19,7 @@ from emulator.radio.outcomes import Stage, decided_at
 from emulator.records.busy import busy_windows
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reported import numbers_of, value_columns
 from emulator.records.run_folder import Event
 from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.verdicts import MOST_ROWS
@@ -230,8 +231,17 @@ class RecordedTables:
         spread[period[there], node[there]] = flat.reshape(-1, size)
         return spread
 
+    @cached_property
+    def value_names(self) -> list[str]:
+        """Names of the values that have a column of the states, in the order in which they were first reported."""
+        return value_columns(self.states.schema)
+
     def value(self, name: str) -> Array:
-        """A number that programs report by this name (periods, N); NaN where there is none."""
+        """A number or boolean that programs report by this name (periods, N); NaN where there is none."""
+        if name in self.value_names:
+            spread = np.full((self.periods, len(self.node_ids)), np.nan)
+            spread[self._place] = numbers_of(self.states[name])
+            return spread
         lists = pc.map_lookup(self.states["values"].combine_chunks(), name, "first")
         return self._spread(pc.if_else(pc.equal(pc.list_value_length(lists), 1), lists, None), 1)[..., 0]
 
@@ -241,6 +251,8 @@ class RecordedTables:
         values = self.states["values"].combine_chunks().cast(VALUES_AS_LIST)
         something = np.asarray(pc.fill_null(pc.list_value_length(values), 0)) > 0
         for name in ("estimate_m", "common_error_estimate_m", "mean_m", "stacked_common_error_m", "cloud_m"):
+            something |= np.asarray(self.states[name].combine_chunks().is_valid())
+        for name in self.value_names:
             something |= np.asarray(self.states[name].combine_chunks().is_valid())
         reported = np.zeros((self.periods, len(self.node_ids)), dtype=bool)
         reported[self._place] = something

@@ -20,8 +20,9 @@ import pyarrow.parquet as pq
 
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
-from emulator.records.metrics import METRICS, STATES, PeriodFigures
+from emulator.records.metrics import METRICS, PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
     BUSY_FILE,
     EVENTS_FILE,
@@ -35,6 +36,7 @@ from emulator.records.run_folder import (
     Event,
 )
 from emulator.records.run_tables import StatesReader, TableFile, TraceReader
+from emulator.records.states import STATES
 from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.scenario.scenario import Scenario, load_scenario
@@ -201,12 +203,19 @@ class RunFiles:
             check_is_run(self.folder)
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
-        table: pa.Table = self._read(path, lambda: pq.read_table(path, columns=wanted and list(wanted)))
+        names = None if wanted is None else [*wanted, *self._values_beside(path, wanted)]
+        table: pa.Table = self._read(path, lambda: pq.read_table(path, columns=names))
         for column in wanted or schema.names:
             found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
             if not found and column not in left_out:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
         return table.unify_dictionaries()
+
+    def _values_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
+        """The columns of reported values, for those who want `values` of the states."""
+        if path.name != STATES_FILE or "values" not in wanted:
+            return []
+        return self._read(path, lambda: value_columns(pq.read_schema(path)))
 
 
 def _from_here(command: str, folder: Path) -> str:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import NOT_ARRIVING, ROW, decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
+from emulator.records.reported import is_text, numbers_of, value_columns
 from emulator.world.world import Instant
 from vnet.errors import VnetError
 from vnet.types import Array
@@ -43,6 +44,15 @@ class TableFile:
         if missing:
             raise self.error(f"has no column {missing[0]!r}")
         self._columns = [*columns, *(name for name in perhaps if name in self._file.schema_arrow.names)]
+
+    @property
+    def schema(self) -> pa.Schema:
+        """All columns of the file, with their types."""
+        return self._file.schema_arrow
+
+    def want(self, columns: Sequence[str]) -> None:
+        """Read these columns, which the file has, as well."""
+        self._columns += columns
 
     def error(self, text: str) -> VnetError:
         """Make the error that says what is wrong with the file."""
@@ -146,6 +156,8 @@ class StatesReader:
     def __init__(self, path: Path, number: Mapping[str, int], period_ns: int) -> None:
         columns = ("period", "node", "heading_rad", *self._VECTORS, "cloud_m", "values")
         self._file = TableFile(path, columns)
+        self._value_names = value_columns(self._file.schema)
+        self._file.want(self._value_names)
         self._number = number
         self._period_ns = period_ns
         self._next_period = 0
@@ -203,6 +215,7 @@ class StatesReader:
         }
         clouds = _clouds(table["cloud_m"].combine_chunks())
         weights = _weights(table["values"].combine_chunks(), self._number)
+        values, texts = self._values(table)
         first = table["period"][0].as_py()
         for place in range(len(heading)):
             here = {name: array[place] for name, array in vectors.items()}
@@ -225,8 +238,23 @@ class StatesReader:
                     here["common_error_covariance_m2"],
                     {node: clouds[row] for node, row in row_of.items() if row in clouds},
                     {node: weights[row] for node, row in row_of.items() if row in weights},
+                    {name: each[place] for name, each in values.items() if np.isfinite(each[place]).any()},
+                    {name: each[place] for name, each in texts.items() if any(each[place])},
                 ),
             )
+
+    def _values(self, table: pa.Table) -> tuple[dict[str, Array], dict[str, list[list[str]]]]:
+        """The figures (periods, n) of programs' own by name, and their texts, period by period."""
+        count = len(self._number)
+        values: dict[str, Array] = {}
+        texts: dict[str, list[list[str]]] = {}
+        for name in self._value_names:
+            if is_text(table[name].type):
+                flat = [text or "" for text in table[name].to_pylist()]
+                texts[name] = [flat[first : first + count] for first in range(0, len(flat), count)]
+            else:
+                values[name] = numbers_of(table[name]).reshape(-1, count)
+        return values, texts
 
 
 def _vectors(column: pa.Array, size: int) -> Array:

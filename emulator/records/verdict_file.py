@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from emulator.records.reported import ReportedFigure
 from emulator.records.verdicts import CheckResult, Judgement, NotExercised, Verdict
 from emulator.scenario.sections import first_problem
 from vnet.bounded import read_bounded
@@ -37,6 +38,7 @@ class Record:
     real_time_factor: float | None = None
     start_up_s: float | None = None
     metrics_sha256: str = ""
+    reported: dict[str, ReportedFigure] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
 
     @property

@@ -21,6 +21,7 @@ from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
 from emulator.records.metrics import PeriodFigures, collect
 from emulator.records.recorded_world import RecordedWorld
+from emulator.records.reported import is_figure
 from emulator.records.run_folder import Event
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
@@ -97,7 +98,29 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
             n: c for n, r in last.items() if isinstance(c := r.values.get("cloud_m"), list) and is_cloud(len(c))
         },
         weights={n: w for n, r in last.items() if (w := _weights(weight_index, r)) is not None},
+        values=_values(number, last),
+        texts=_texts(number, last),
     )
+
+
+def _values(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, Array]:
+    """Return the numbers and booleans that programs report by names of their own, by name, as arrays (n,)."""
+    values: dict[str, Array] = {}
+    for node, report in last.items():
+        for name, value in report.values.items():
+            if is_figure(name, value) and not isinstance(value, (str, list)):
+                values.setdefault(name, np.full(len(number), np.nan))[number[node]] = value
+    return {name: each for name, each in values.items() if np.isfinite(each).any()}
+
+
+def _texts(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, list[str]]:
+    """Return the texts that programs report by names of their own, by name, one for each node."""
+    texts: dict[str, list[str]] = {}
+    for node, report in last.items():
+        for name, value in report.values.items():
+            if is_figure(name, value) and isinstance(value, str):
+                texts.setdefault(name, [""] * len(number))[number[node]] = value
+    return {name: each for name, each in texts.items() if any(each)}
 
 
 def _weights(index: Mapping[str, int], report: Report) -> Array | None:
@@ -109,7 +132,7 @@ def _weights(index: Mapping[str, int], report: Report) -> Array | None:
     for name in report.values.keys() & index.keys():
         value = report.values[name]
         one = value if isinstance(value, list) else [value]
-        if len(one) == 1:
+        if len(one) == 1 and not isinstance(one[0], str):
             weights = np.zeros(len(index)) if weights is None else weights
             weights[index[name]] = one[0]
     return weights
@@ -146,6 +169,8 @@ def period_message(
         "common_error_covariance_m2": pack(beliefs.common_error_covariance_m2),
         "clouds": {node: pack(cloud) for node, cloud in beliefs.clouds.items()},
         "weights": {node: pack(weights) for node, weights in beliefs.weights.items()},
+        "values": {name: pack(values) for name, values in beliefs.values.items()},
+        "texts": {name: list(texts) for name, texts in beliefs.texts.items()},
         "figures": dict(vars(figures)),
         "up": np.asarray(up, dtype=np.uint8).tobytes(),
         "faults": list(faults),

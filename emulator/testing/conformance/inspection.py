@@ -69,4 +69,5 @@ def _numbers(report: Report) -> Iterator[float]:
     yield from report.estimate_m or ()
     yield from report.covariance_m2 or ()
     for value in report.values.values():
-        yield from value if isinstance(value, list) else [value]
+        if not isinstance(value, str):
+            yield from value if isinstance(value, list) else [value]

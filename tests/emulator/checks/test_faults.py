@@ -12,8 +12,8 @@ import pyarrow as pa
 import pytest
 
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
-from emulator.records.metrics import STATES
 from emulator.records.run_folder import Event
+from emulator.records.states import STATES
 from emulator.scenario.faults import KINDS, DataReplay, parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import checked, damaged, result, run_scenario, timely, verdict
@@ -103,11 +103,12 @@ def with_cells(table: pa.Table, column: str, rows: Any, value: Any) -> pa.Table:
 def without_reports(recorded: RecordedRun, node: str, from_s: float) -> RecordedRun:
     """The states as if a node had reported nothing any more."""
     empty = {name: None for name in STATES.names if name.endswith(("estimate_m", "covariance_m2"))}
+    empty |= dict.fromkeys(recorded.value_names)
     rows = [
         {**row, **empty, "values": []} if row["node"] == node and row["time_ns"] >= from_s * 1e9 else row
         for row in recorded.states.to_pylist()
     ]
-    return replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
+    return replace(recorded, states=pa.Table.from_pylist(rows, schema=recorded.states.schema))
 
 
 def some(recorded: RecordedRun, *outcomes: str, cause: str = "", copies: bool = False) -> np.ndarray:
@@ -321,8 +322,8 @@ def test_a_stale_frame_of_another_age_is_found() -> None:
 def test_a_program_that_heard_more_than_arrived_is_found() -> None:
     recorded = with_fault("partition")
     rows = recorded.states.to_pylist()
-    rows[-1]["values"] = [("heard", [2000.0])]
-    found = not_valid(replace(recorded, states=pa.Table.from_pylist(rows, schema=STATES)))
+    rows[-1]["heard"] = 2000.0
+    found = not_valid(replace(recorded, states=pa.Table.from_pylist(rows, schema=recorded.states.schema)))
     assert found == {"isolation": Verdict.INVALID}
 
 

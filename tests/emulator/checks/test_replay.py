@@ -14,7 +14,7 @@ from rich.console import Console
 
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.checks.replay import compare
-from emulator.records.metrics import STATES
+from emulator.records.states import STATES
 from emulator.terminal.summary import print_checks
 from tests.emulator.checks.test_faults import with_cells
 from tests.emulator.checks.test_judge import first, four, result, with_names
@@ -71,7 +71,7 @@ def test_a_row_that_only_one_run_has_is_a_difference(recorded: RecordedRun) -> N
 def test_a_state_that_differs_is_found_where_the_traces_agree(recorded: RecordedRun) -> None:
     rows = recorded.states.to_pylist()
     rows[7]["estimate_m"] = [0.0, 0.0]
-    found = compared(recorded, states=pa.Table.from_pylist(rows, schema=STATES))
+    found = compared(recorded, states=pa.Table.from_pylist(rows, schema=recorded.states.schema))
     assert (found.figures["table"], found.figures["row"]) == ("states", 7)
     assert found.figures["differing"] == ["estimate_m"]
 

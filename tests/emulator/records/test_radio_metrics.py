@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.checks.judge import RecordedRun
-from emulator.records.metrics import STATES
 from emulator.records.radio_metrics import radio_metrics
+from emulator.records.states import STATES
 from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips

@@ -226,7 +226,9 @@ def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
     [
         lambda node: node.report(estimate_m=[1.0]),
         lambda node: node.report(covariance_m2=[1.0, 2.0]),
-        lambda node: node.report(note="far"),
+        lambda node: node.report(note={"far": 1}),
+        lambda node: node.report(note=["far", "near"]),
+        lambda node: node.report(note=65 * "x"),
     ],
 )
 def test_a_wrong_report_is_refused_where_it_is_made(wrong: Callable[[Node], None]) -> None:

@@ -1,0 +1,206 @@
+"""Values that programs report by names of their own: columns of the states, and a run's figures of them.
+
+Numbers, booleans and texts have a column each. Lists, and names that are no identifiers (`weight.v03`), stay in the
+column `values`, as do further names once there are `MOST_COLUMNS`.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from emulator.records.states import TAKEN
+from vnet.node import Value
+from vnet.types import Array
+from vnet.units import title_of, unit_of
+
+MOST_COLUMNS = 64
+"""Names that have a column: a table of thousands of columns would help nobody."""
+TEXT = pa.dictionary(pa.int32(), pa.string())
+"""Type of a column of texts."""
+_BOOLEAN, _NUMBER, _TEXT = range(3)
+
+
+def is_figure(name: str, value: Value) -> bool:
+    """Return whether a value is a figure of its vehicle: one number, boolean or text with a name of its own."""
+    return not isinstance(value, list) and name.isidentifier() and name not in TAKEN
+
+
+@dataclass
+class _Column:
+    """The values of one name: their rows, their kinds, and numbers; of a text the number is its index."""
+
+    row: array[int] = field(default_factory=lambda: array("q"))
+    kind: array[int] = field(default_factory=lambda: array("b"))
+    number: array[float] = field(default_factory=lambda: array("d"))
+
+
+class ValueColumns:
+    """Collects the values of the states' rows."""
+
+    def __init__(self) -> None:
+        self._columns: dict[str, _Column] = {}
+        self._text_index: dict[str, int] = {}
+
+    def put(self, row: int, name: str, value: Value) -> bool:
+        """Take the value of a row; returns false for a value that has no column."""
+        if isinstance(value, list) or not is_figure(name, value):
+            return False
+        column = self._columns.get(name)
+        if column is None:
+            if len(self._columns) == MOST_COLUMNS:
+                return False
+            column = self._columns[name] = _Column()
+        column.row.append(row)
+        if isinstance(value, str):
+            column.kind.append(_TEXT)
+            column.number.append(self._text_index.setdefault(value, len(self._text_index)))
+        else:
+            column.kind.append(_BOOLEAN if isinstance(value, bool) else _NUMBER)
+            column.number.append(value)
+        return True
+
+    def add_to(self, states: pa.Table) -> pa.Table:
+        """Return the states with a column for each name, in the order in which names were first reported."""
+        for name, column in self._columns.items():
+            states = states.append_column(name, self._spread(column, len(states)))
+        return states
+
+    def _spread(self, column: _Column, rows: int) -> pa.Array:
+        row = np.frombuffer(column.row, dtype=np.int64)
+        kind = np.frombuffer(column.kind, dtype=np.int8)
+        number = np.frombuffer(column.number, dtype=float)
+        missing = np.ones(rows, dtype=bool)
+        missing[row] = False
+        if (kind == _TEXT).any():
+            return self._texts(row, kind, number, rows)
+        spread = np.zeros(rows)
+        spread[row] = number
+        if (kind == _BOOLEAN).all():
+            return pa.array(spread.astype(bool), mask=missing)
+        return pa.array(spread, mask=missing)
+
+    def _texts(self, row: NDArray[Any], kind: NDArray[Any], number: NDArray[Any], rows: int) -> pa.Array:
+        """Return a column of texts; numbers and booleans among them as Python writes them."""
+        known = list(self._text_index)
+        texts: list[str | None] = [None] * rows
+        for i, of, value in zip(row.tolist(), kind.tolist(), number.tolist(), strict=True):
+            if of == _TEXT:
+                texts[i] = known[int(value)]
+            else:
+                texts[i] = str(bool(value)) if of == _BOOLEAN else f"{value:g}"
+        return pa.array(texts, pa.string()).dictionary_encode()
+
+
+def value_columns(schema: pa.Schema) -> list[str]:
+    """Return the names of the columns of reported values in the states' schema."""
+    names = [each.name for each in schema if each.name not in TAKEN and each.name.isidentifier()]
+    return [name for name in names if _is_value(schema.field(name).type)][:MOST_COLUMNS]
+
+
+def _is_value(kind: pa.DataType) -> bool:
+    return bool(kind == pa.float64() or kind == pa.bool_() or kind == TEXT or kind == pa.string())
+
+
+def numbers_of(column: pa.ChunkedArray) -> Array:
+    """Return a column of numbers or booleans as floats (rows,); NaN where nothing, or a text, was reported."""
+    if is_text(column.type):
+        return np.full(len(column), np.nan)
+    return np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
+
+
+@dataclass(frozen=True)
+class ReportedFigure:
+    """A value that programs report, over the run: all reports of all vehicles count alike.
+
+    Of a boolean the numbers are shares of those that are true; of a text there is the most frequent one instead.
+    """
+
+    reports: int
+    """Number of reports with a finite number, or with a text."""
+    mean: float | None = None
+    p05: float | None = None
+    """5th percentile."""
+    p95: float | None = None
+    """95th percentile."""
+    last: float | None = None
+    """Mean over the vehicles of each one's last report: of a counter, how far it came."""
+    is_share: bool = False
+    """True for a boolean."""
+    text: str | None = None
+    """The most frequent text."""
+    share: float | None = None
+    """Share of the reports that have this text."""
+
+    def words(self, name: str) -> tuple[str, str, str, str]:
+        """Return its title with the unit, mean, 5 to 95 %, and the end of the run, for people."""
+        unit = unit_of(name)
+        title = f"{title_of(name)} ({unit})" if unit else title_of(name)
+        if self.text is not None:
+            return title, f"{self.text} ({self.share or 0:.0%})", "", ""
+        if self.is_share:
+            return title, _percent(self.mean), "", _percent(self.last)
+        spread = "" if self.p05 is None else f"{figure_text(self.p05)} – {figure_text(self.p95)}"
+        return title, figure_text(self.mean), spread, figure_text(self.last)
+
+
+def figure_text(value: float | None) -> str:
+    """Return a number with four significant digits, or all of an integer's."""
+    if value is None:
+        return "–"
+    if abs(value) >= 1000 or value.is_integer():
+        return f"{value:,.0f}"
+    return f"{value:.4g}"
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{share:.1%}"
+
+
+def reported_figures(states: pa.Table) -> dict[str, ReportedFigure]:
+    """Return the figures of the reported values in the states, by name; the states are in the order of time."""
+    found = {}
+    node = states["node"].combine_chunks().dictionary_encode().indices.to_numpy() if len(states) else np.zeros(0)
+    for name in value_columns(states.schema):
+        column = states[name]
+        figure = _of_texts(column) if is_text(column.type) else _of_numbers(column, node)
+        if figure.reports:
+            found[name] = figure
+    return found
+
+
+def is_text(kind: pa.DataType) -> bool:
+    """Return whether a column of the states has texts."""
+    return bool(kind == TEXT or kind == pa.string())
+
+
+def _of_numbers(column: pa.ChunkedArray, node: Array) -> ReportedFigure:
+    number = numbers_of(column)
+    known = np.flatnonzero(np.isfinite(number))
+    if not len(known):
+        return ReportedFigure(0)
+    low, high = np.percentile(number[known], [5, 95])
+    of_node = np.full(int(node.max()) + 1, np.nan)
+    of_node[node[known]] = number[known]  # rows are in the order of time: the last one stays
+    return ReportedFigure(
+        reports=len(known),
+        mean=float(number[known].mean()),
+        p05=float(low),
+        p95=float(high),
+        last=float(np.nanmean(of_node)),
+        is_share=pa.types.is_boolean(column.type),
+    )
+
+
+def _of_texts(column: pa.ChunkedArray) -> ReportedFigure:
+    texts = column.drop_null().cast(pa.string())
+    if not len(texts):
+        return ReportedFigure(0)
+    counts = sorted(pc.value_counts(texts).to_pylist(), key=lambda each: (-each["counts"], each["values"]))
+    return ReportedFigure(len(texts), text=counts[0]["values"], share=counts[0]["counts"] / len(texts))

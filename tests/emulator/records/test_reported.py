@@ -1,0 +1,96 @@
+"""Values that programs report by names of their own: columns of the states, and figures of the run."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from emulator.records.metrics import Metrics
+from emulator.records.reported import (
+    MOST_COLUMNS,
+    ReportedFigure,
+    ValueColumns,
+    figure_text,
+    reported_figures,
+    value_columns,
+)
+from emulator.world.world import Instant
+from vnet.node import Report, Value
+
+NODES = ["a", "b"]
+
+
+def states(*periods: dict[str, dict[str, Value]]) -> pa.Table:
+    """States of two vehicles; each period has the values of those who report in it."""
+    kept = Metrics(NODES, np.zeros(2, np.intp), 100)
+    for period, values in enumerate(periods):
+        nowhere = np.zeros((2, 2))
+        instant = Instant(period, 100 * period, nowhere, np.zeros(2), np.zeros(2), nowhere, np.zeros(2))
+        kept.record(instant, [Report(0, node, None, None, said) for node, said in values.items()])
+    return kept.states_table()
+
+
+def test_each_value_is_a_column_of_its_kind(tmp_path: Path) -> None:
+    table = states(
+        {"a": {"delay_ms": 4.0, "warned": True, "state": "idle"}},
+        {"a": {"delay_ms": 5.0, "warned": False}, "b": {"state": "busy"}},
+    )
+    assert table["delay_ms"].to_pylist() == [4.0, None, 5.0, None]
+    assert table["warned"].to_pylist() == [True, None, False, None]
+    assert table["state"].to_pylist() == ["idle", None, None, "busy"]
+    assert [str(table.schema.field(name).type) for name in ("delay_ms", "warned")] == ["double", "bool"]
+    pq.write_table(table, tmp_path / "states.parquet")
+    assert value_columns(pq.read_schema(tmp_path / "states.parquet")) == ["delay_ms", "state", "warned"]
+
+
+def test_kinds_that_change_become_the_wider_one() -> None:
+    table = states({"a": {"x": True, "y": 1.5}, "b": {"x": 2.5, "y": "far"}}, {"a": {"y": True}})
+    assert table["x"].to_pylist() == [1.0, 2.5, None, None]
+    assert table["y"].to_pylist() == ["1.5", "far", "True", None]
+
+
+def test_lists_odd_names_and_names_of_vnets_own_have_no_column() -> None:
+    table = states({"a": {"weight.b": 0.5, "many": [1.0, 2.0], "period": 3.0, "mean_m": 4.0, "text.x": "lost"}})
+    assert value_columns(table.schema) == []
+    assert dict(table["values"][0].as_py()) == {"many": [1.0, 2.0], "period": [3.0], "weight.b": [0.5]}
+
+
+def test_a_program_that_makes_up_names_has_only_so_many_columns() -> None:
+    columns = ValueColumns()
+    assert all(columns.put(0, f"x{i}", 1.0) for i in range(MOST_COLUMNS))
+    assert not columns.put(0, "one_more", 1.0)
+    assert columns.put(0, "x0", 1.0)
+
+
+def test_figures_count_all_reports_and_each_vehicles_last() -> None:
+    periods: list[dict[str, dict[str, Value]]] = [
+        {"a": {"n": float(i), "on": i > 5}, "b": {"n": 2.0 * i}} for i in range(11)
+    ]
+    figures = reported_figures(states(*periods, {"a": {"n": float("nan")}}))
+    number = figures["n"]
+    assert number.reports == 22 and number.last == pytest.approx(15.0)
+    assert number.mean == pytest.approx(7.5)
+    assert number.p05 == pytest.approx(np.percentile([*range(11), *range(0, 22, 2)], 5))
+    on = figures["on"]
+    assert on.is_share and on.mean == pytest.approx(5 / 11) and on.last == 1.0
+    assert on.words("on") == ("on", "45.5%", "", "100.0%")
+
+
+def test_the_figure_of_a_text_is_the_most_frequent_one() -> None:
+    figures = reported_figures(states({"a": {"s": "go"}, "b": {"s": "stop"}}, {"a": {"s": "go"}}))
+    assert figures["s"] == ReportedFigure(3, text="go", share=2 / 3)
+    assert figures["s"].words("light_s")[:2] == ("light (s)", "go (67%)")
+
+
+def test_nothing_reported_is_no_figure() -> None:
+    assert reported_figures(states()) == {}
+    assert reported_figures(states({"a": {"x": float("nan")}})) == {}
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.123456, "0.1235"), (12.0, "12"), (12345.6, "12,346"), (None, "–"), (float("inf"), "inf")]
+)
+def test_numbers_are_short(value: float | None, text: str) -> None:
+    assert figure_text(value) == text
