@@ -227,6 +227,13 @@ def test_an_agent_imports_nothing_heavy(modules: str) -> None:
     assert done.stdout.strip() == "[]"
 
 
+def test_a_run_on_the_disc_radio_imports_no_scipy_before_it_is_judged() -> None:
+    """scipy is slow to import, and most of it serves maps, fading and tests of significance."""
+    code = "import sys, emulator.cli.runs; print('scipy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_every_file_opens_with_what_it_is_for() -> None:
     silent = [
         str(path.relative_to(ROOT))

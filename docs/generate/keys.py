@@ -35,13 +35,23 @@ def key_table(model: type[BaseModel], without: Collection[str] = ()) -> str:
     """The keys of `model`, but for those that are sections themselves or that are named; "" if none is left."""
     schema = model.model_json_schema()
     required = schema.get("required", ())
+    said = key_docstrings(model)
     rows = []
     for name, key in schema.get("properties", {}).items():
         if name not in without and name not in subsections(model):
-            if "description" not in key:
+            if name not in said:
                 raise LookupError(f"{model.__name__}.{name} has no docstring")
-            rows.append(_row(name, key, name in required))
+            rows.append(_row(name, {**key, "description": said[name]}, name in required))
     return table(HEADER, rows)
+
+
+def key_docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """The docstrings below the keys of a section, and of the sections that it derives from."""
+    said: dict[str, str] = {}
+    for of in reversed(model.__mro__):
+        if issubclass(of, BaseModel) and of is not BaseModel:
+            said |= attribute_docstrings(of)
+    return said
 
 
 def option_table(options: type[msgspec.Struct]) -> str:

@@ -8,7 +8,7 @@ from typing import get_args
 from pydantic import BaseModel
 
 from agents.cooperative.options import Options
-from docs.generate.keys import key_table, option_table, subsections
+from docs.generate.keys import key_docstrings, key_table, option_table, subsections
 from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.scenario import ProgramException, Scenario
@@ -39,7 +39,7 @@ def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
         if len(kinds) == 1:
             yield from _sections(below, kinds[0])
         else:
-            yield from _choice(below, model.model_fields[name].description or "", kinds)
+            yield from _choice(below, key_docstrings(model).get(name, ""), kinds)
     if path == "program":
         yield from _section("[[program.exceptions]]", ProgramException)
     if not path:

@@ -6,9 +6,9 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom
 
 from emulator.radio.outcomes import Outcome
+from emulator.records.distributions import binomial_interval
 from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
@@ -224,8 +224,7 @@ def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, 
     """Return the least and the most of `drawn` that are in the binomial band of this share."""
     if not 0 < probability < 1:
         return (probability * drawn,) * 2
-    low, high = (int(edge) for edge in binom.interval(share, drawn, probability))
-    return low, high
+    return binomial_interval(share, drawn, probability)
 
 
 def check_isolation(recorded: RecordedRun) -> Finding:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 
 from emulator.checks.channel import admitted_by_cap
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, first_divergences
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
+from emulator.world.graph import weak_components
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
@@ -42,8 +42,8 @@ def _components(recorded: RecordedRun, among: Mask, time_ns: int) -> list[Mask]:
     """The connected components by links in both directions among some nodes (N,), of two nodes or more."""
     linked = admitted_by_cap(recorded, among, time_ns)
     linked &= linked.T & among[:, None]
-    count, label = connected_components(linked, directed=False)
-    parts = [np.asarray((label == number) & among) for number in range(count)]
+    label = weak_components(linked)
+    parts = [np.asarray((label == number) & among) for number in range(int(label.max(initial=-1)) + 1)]
     return [part for part in parts if part.sum() > 1]
 
 

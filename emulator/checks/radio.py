@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainccinv
-from scipy.stats import chi2
 
 from emulator.checks.channel import nothing_seen, received_twice
 from emulator.radio.csma import edca_parameters
@@ -18,6 +16,7 @@ from emulator.radio.dot11p import DETECTION_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.reception import Threshold, milliwatts
+from emulator.records.distributions import chi2_sf
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
 from emulator.scenario.faults import Throttle
@@ -72,7 +71,7 @@ def _unlike_their_law(
     variance, differs = np.bincount(link, survives * (1 - survives)), np.bincount(link, faded - (1 - survives))
     telling = variance >= TELLING_VARIANCE
     squares = float((differs[telling] ** 2 / variance[telling]).sum())
-    return bool(chi2.sf(squares, max(1, int(telling.sum()))) < CERTAIN), int(telling.sum())
+    return bool(chi2_sf(squares, max(1, int(telling.sum()))) < CERTAIN), int(telling.sum())
 
 
 def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Array:
@@ -108,6 +107,8 @@ def _arrives(radio: Radio, m: float, airtime_ns: int, power_db: Array) -> Array:
 
     if np.isinf(m):
         return of(10 ** (power_db / 10))
+    from scipy.special import gammainccinv  # slow to import, and only fading needs it
+
     grid_db = np.arange(power_db.min() - GRID_DB, power_db.max() + GRID_DB, GRID_DB)
     # Steps of the factor's distribution that are finest where it is greatest, which is what weak signals live on.
     step = (np.arange(FACTORS) + 0.5) / FACTORS

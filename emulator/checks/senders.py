@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from emulator.checks.channel import received_twice
 from emulator.faults.plan import PlannedFault
+from emulator.records.distributions import chi2_cdf, chi2_sf
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
@@ -146,8 +146,8 @@ def is_noise(error_m: Array, sigma_m: float) -> bool:
     if sigma_m == 0:
         return bool(np.abs(error_m).max() < 1e-6)
     squares, mean = float(np.sum(error_m**2)) / sigma_m**2, error_m.mean(axis=0) / sigma_m
-    tails = (chi2.sf(squares, error_m.size), chi2.cdf(squares, error_m.size))
-    return bool(min(*tails, chi2.sf(float(len(error_m) * mean @ mean), 2)) > CERTAIN)
+    tails = (chi2_sf(squares, error_m.size), chi2_cdf(squares, error_m.size))
+    return bool(min(*tails, chi2_sf(float(len(error_m) * mean @ mean), 2)) > CERTAIN)
 
 
 def _described(label: str, error_m: Array) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
 
 from emulator.scenario.scenario import Radio
 from vnet.types import Array
@@ -109,6 +108,8 @@ def _cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:
 
 def _raw_error_rate(snr: Array, bits: int) -> Array:
     """Bit error rate before decoding: BPSK, QPSK or square QAM of `bits` a subcarrier."""
+    from scipy.special import erfc  # slow to import, and the disc radio does without
+
     if bits <= 2:
         return np.asarray(0.5 * erfc(np.sqrt(snr / bits)))
     side = 2 ** (bits // 2)

@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv, ndtri
 
 from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay
 from emulator.scenario.random_streams import Draws
@@ -75,6 +74,8 @@ class ShadowField:
 
     def _wave_vectors(self, uniform: Array) -> Array:
         """Return wave vectors (2, WAVES) in rad/m from uniform draws (3, WAVES)."""
+        from scipy.special import ndtri  # slow to import, and only shadowing needs it
+
         normal = ndtri(np.maximum(uniform, 1e-300))
         return np.asarray(normal[:2] / np.maximum(np.abs(normal[2]) * self._decorrelation_m, 1e-9))
 
@@ -112,6 +113,8 @@ class MeanPower:
 @lru_cache(maxsize=16)
 def _quantiles(m: float) -> Array:
     """Quantiles (QUANTILES,) of the gamma distribution of shape m and mean 1, at the middles of equal steps."""
+    from scipy.special import gammaincinv  # slow to import, and only fading needs it
+
     return np.asarray(gammaincinv(m, (np.arange(QUANTILES) + 0.5) / QUANTILES) / m)
 
 

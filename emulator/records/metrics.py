@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from emulator.records.distributions import chi2_quantiles
 from emulator.records.reported import ValueColumns
 from emulator.records.states import COMMON_VALUES, STATES
 from emulator.world.world import Instant
@@ -255,7 +255,7 @@ def _anees(error: Array, covariance: Array) -> float | None:
 
 def anees_band(samples: int) -> tuple[float, float]:
     """The 95 % band of the mean of so many independent samples of two degrees of freedom, 1 being consistent."""
-    low, high = chi2.ppf([0.025, 0.975], 2 * samples) / (2 * samples)
+    low, high = chi2_quantiles([0.025, 0.975], 2 * samples) / (2 * samples)
     return float(low), float(high)
 
 

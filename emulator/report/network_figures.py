@@ -11,10 +11,10 @@ import pyarrow.compute as pc
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
-from scipy.stats import binom
 
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
 from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.drawing import DASHES, Drawing
 from emulator.report.source import Source
@@ -73,7 +73,7 @@ def links(source: Source) -> Drawing:
 
 def _draw_expected(made: Canvas, loss: float, frames: int) -> tuple[float, str]:
     """Draw the expected ratio of links that all lose alike; returns its lower bound in percent, and a caption."""
-    low, high = (100 * edge / frames for edge in binom.interval(LINK_BAND, frames, 1 - loss))
+    low, high = (100 * edge / frames for edge in binomial_interval(LINK_BAND, frames, 1 - loss))
     label = f"expected: {100 * (1 - loss):g} %"
     made.axes.axhline(100 * (1 - loss), color=RED, linestyle=DASHES[1], label=label, zorder=2.5)
     if low == high:

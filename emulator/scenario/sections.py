@@ -13,13 +13,14 @@ from vnet.errors import did_you_mean, printable, shown
 class Section(BaseModel):
     """Common behaviour of all sections: immutable, and no key is ignored silently.
 
-    The docstring below a key is its description, from which docs/reference is made.
+    The docstring below a key is its description, from which docs/reference is made; pydantic would read the source
+    of every class at every start to know it.
     """
 
     kinds: ClassVar[Mapping[str, type[Section]]] = {}
     """The classes of a section that has several kinds, told apart by the key `kind`."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]) -> str:

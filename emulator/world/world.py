@@ -13,15 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Gnss, Scenario
+from emulator.world.graph import weak_components
 from emulator.world.lateral import lateral_offsets_m
 from emulator.world.links import load_links
-from emulator.world.maps.around import read_lanes
 from emulator.world.networks import Network, generate_network, load_network
-from emulator.world.trips.drive import drive, drive_through_city
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
 from vnet.node import Fix
@@ -178,6 +176,10 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
 
 def _drive(scenario: Scenario) -> World:
     """Return a world in which vehicles drive recorded trips, or generated ones through a city or a map."""
+    # Maps and trips need half of scipy, whose import takes longer than many a run of vehicles that stand.
+    from emulator.world.maps.around import read_lanes
+    from emulator.world.trips.drive import drive, drive_through_city
+
     section, periods = scenario.map, periods_of(scenario)
     lanes: LaneMap | RoadMap = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
     if scenario.network.kind == "city":
@@ -229,5 +231,5 @@ def components(position_m: Array, range_m: float, links: NDArray[np.bool_] | Non
     else:
         linked = links[np.ix_(present, present)]
     label = np.full(len(present), -1, dtype=np.intp)
-    label[present] = connected_components(linked, directed=False)[1]
+    label[present] = weak_components(linked)
     return label

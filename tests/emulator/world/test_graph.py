@@ -1,0 +1,25 @@
+"""Components agree with scipy.sparse.csgraph, numbers included."""
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+
+from emulator.world.graph import weak_components
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_components_of_random_graphs(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 60))
+    linked = rng.random((count, count)) < rng.choice([0.0, 0.5, 1.0, 2.0]) / count
+    assert weak_components(linked).tolist() == connected_components(linked, directed=False)[1].tolist()
+
+
+def test_no_nodes_have_no_components() -> None:
+    assert weak_components(np.zeros((0, 0), dtype=bool)).tolist() == []
+
+
+def test_a_link_in_one_direction_connects() -> None:
+    linked = np.zeros((4, 4), dtype=bool)
+    linked[2, 0] = linked[3, 2] = True
+    assert weak_components(linked).tolist() == [0, 1, 0, 0]
