@@ -18,11 +18,12 @@ import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
+from emulator.scenario.overrides import apply_override
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
-from emulator.scenario.toml import DEEPEST, check_plain, parse_toml, read_toml
+from emulator.scenario.toml import check_plain, read_toml
 from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
@@ -354,8 +355,21 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
+    return scenario_from(data, path, overrides, recorded_digests)
+
+
+def scenario_from(
+    data: dict[str, Any],
+    path: Path,
+    overrides: Sequence[str] = (),
+    digests: Mapping[str, str] | None = None,
+) -> Scenario:
+    """Return the scenario of plain data, which it changes by the overrides; `path` is what messages call it.
+
+    Raises ScenarioError, also for an input file that has not the digest recorded for it.
+    """
     for override in overrides:
-        _apply_override(data, override)
+        apply_override(data, override)
     try:
         check_plain(data)
         scenario = Scenario.model_validate(data)
@@ -364,8 +378,9 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     except ValueError as error:
         raise ScenarioError(f"{path}: {error}") from None
     scenario = _with_absolute_paths(scenario, path)
+    recorded = digests or {}
     for name, digest in input_digests(scenario).items():
-        if recorded_digests.get(name, digest) != digest:
+        if recorded.get(name, digest) != digest:
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
     return scenario
 
@@ -428,22 +443,3 @@ def _absolute(given: Path, key: str, scenario_path: Path) -> Path:
     if not os.access(path, os.R_OK):
         raise ScenarioError(f"{problem}: not readable: {path}")
     return path
-
-
-def _apply_override(data: dict[str, Any], override: str) -> None:
-    key, equals, text = override.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not 2 <= len(parts) <= DEEPEST or not all(parts):
-        raise ScenarioError(
-            f"--set {printable(override)}: write it as section.key=value, for example radio.loss=0.3"
-        )
-    try:
-        value = parse_toml(f"value = {text}")["value"]
-    except ValueError:
-        value = text.strip()
-    table = data
-    for part in parts[:-1]:
-        table = table.setdefault(part, {})
-        if not isinstance(table, dict):
-            raise ScenarioError(f"--set {printable(override)}: {printable(part)} is not a section")
-    table[parts[-1]] = value

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cells import cells as cells_module
-from emulator.cells.cells import Cell, read_series, run_cell, run_cells
+from emulator.cells.cells import Cell, CellResult, compute, read_series, run_cells
 from emulator.cli.commands import app
 from emulator.experiments import paper, reports
 from emulator.records.paper_values import PAPER_RANGE_M
@@ -36,17 +36,23 @@ def test_a_finished_cell_is_not_run_again_and_a_changed_one_is(
     assert [row["seed"] for row in first] == [1, 2]
     assert first[0]["metrics_sha256"] != first[1]["metrics_sha256"]
     assert read_series(tiny_cell(1), tmp_path).num_rows == 20
-    monkeypatch.setattr(cells_module, "_run_all", lambda missing, *_: iter(missing))
-    assert run_cells([tiny_cell(1), tiny_cell(2)], tmp_path) == first, "nothing was missing"
-    with pytest.raises(FileNotFoundError):
-        run_cells([tiny_cell(1, fusion="none")], tmp_path)
+    asked: list[Cell] = []
+
+    def ask(missing: list[Cell], *_: object) -> list[tuple[Cell, CellResult]]:
+        asked.extend(missing)
+        return []
+
+    monkeypatch.setattr(cells_module, "each_done", ask)
+    assert run_cells([tiny_cell(1), tiny_cell(2)], tmp_path) == first
+    assert asked == [], "nothing was missing"
+    with pytest.raises(VnetError, match="not the result of a cell"):
+        run_cells([tiny_cell(1), tiny_cell(1, fusion="none")], tmp_path)
+    assert asked == [tiny_cell(1, fusion="none")]
 
 
 def test_a_cell_comes_out_the_same_whichever_process_runs_it(tmp_path: Path) -> None:
     in_pool = run_cells([tiny_cell(3)], tmp_path)[0]
-    (tmp_path / "here").mkdir()
-    run_cell(tiny_cell(3), tmp_path / "here")
-    assert in_pool["metrics_sha256"] in (tmp_path / "here" / f"{tiny_cell(3).digest}.json").read_text()
+    assert in_pool == {"seed": 3} | compute(tiny_cell(3)).figures
 
 
 def test_a_program_that_raises_ends_the_experiment_and_names_the_cell(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
     assert rows["optimized"]["position_rmse_m"] > 0
     for name in ("city_against_time.png", "city_errors.png"):
         assert (files / "out" / name).read_bytes().startswith(b"\x89PNG")
-    monkeypatch.setattr("emulator.cells.cells._run_all", lambda missing, *_: iter([1 / 0] if missing else []))
+    monkeypatch.setattr("emulator.cells.cells.each_done", lambda missing, *_: iter([1 / 0] if missing else []))
     assert run_small(monkeypatch, files) == text, "what is finished is not run again"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from emulator.cells.cells import Cell, run_cell
+from emulator.cells.cells import Cell, compute, keep
 from emulator.experiments import consensus as subject
 from emulator.experiments.analyze import FASTEST, is_connected, mutual
 from emulator.experiments.consensus import (
@@ -42,7 +42,7 @@ def cell(rule: str, loss: float, rounds: int, seed: int = 1) -> Cell:
 def relative_error(one: Cell, folder: Path) -> np.ndarray:
     """Run a cell here, without a process of its own."""
     (folder / "cells").mkdir(exist_ok=True)
-    run_cell(one, folder / "cells")
+    keep(one, compute(one), folder / "cells")
     return subject._relative_error(one, folder)
 
 

@@ -34,7 +34,7 @@ def refuse_to_run(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not missing, "this has been run already"
         return []
 
-    monkeypatch.setattr(cells_module, "_run_all", refuse)
+    monkeypatch.setattr(cells_module, "each_done", refuse)
 
 
 def test_the_tempering_is_swept_once_and_leaves_a_table_its_numbers_and_a_picture(

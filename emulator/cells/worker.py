@@ -1,0 +1,243 @@
+"""Processes that are fit to run programs: hash seed 0, one thread of linear algebra, each serving many jobs.
+
+A job is a function of vnet's and its arguments. `call_fitly` runs it in this process if that is fit, else in a
+worker that it starts once for each thread and keeps. So any executor's workers will do: threads, processes, Dask's.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import threading
+import traceback
+import weakref
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from queue import SimpleQueue
+from typing import IO, Any, TypeVar
+
+from emulator.records.code_digest import digests_of
+from vnet.errors import VnetError
+from vnet.runtime.environment import ONE_BLAS_THREAD
+
+T = TypeVar("T")
+LONGEST_TAIL_BYTES = 1000
+"""Bytes of a process's standard error in which its last line is looked for."""
+PATIENCE_S = 10.0
+"""Seconds for which an interrupted job may write down what it has."""
+
+
+class WorkerDiedError(VnetError):
+    """A worker process ended before it had answered."""
+
+
+class WorkerTimeoutError(VnetError):
+    """A job took longer than it may."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Place where a job's programs are found: current folder and path of modules; and the code that is expected."""
+
+    folder: str
+    path: tuple[str, ...]
+    entries: tuple[str, ...]
+    code: tuple[tuple[str, str], ...]
+    """Digests of vnet and of the programs with these entries."""
+
+    @classmethod
+    def here(cls, entries: tuple[str, ...]) -> Place:
+        """Return the place of this process, for programs with these entries."""
+        folder = str(Path.cwd())
+        path = tuple(str(Path(entry or folder).absolute()) for entry in sys.path)
+        return cls(folder, path, entries, tuple(sorted(digests_of(entries).items())))
+
+    def enter(self) -> None:
+        """Make the programs importable in this process. Raises VnetError if their code, or vnet's, is another."""
+        known = set(sys.path)
+        sys.path += [entry for entry in dict.fromkeys((*self.path, self.folder)) if entry not in known]
+        if tuple(sorted(digests_of(self.entries).items())) != self.code:
+            raise VnetError(
+                f"{socket.gethostname()}: vnet, or {', '.join(self.entries)}, is not the code that was to be run: "
+                "install the same there"
+            )
+
+
+def is_fit() -> bool:
+    """Return whether this process has hash seed 0 and one thread of linear algebra."""
+    return sys.flags.hash_randomization == 0 and all(os.environ.get(n) == v for n, v in ONE_BLAS_THREAD.items())
+
+
+def call_fitly(place: Place, function: Callable[..., T], *arguments: Any) -> T:
+    """Return what a function returns in a fit process, whose programs are found as in `place`.
+
+    Raises what the function raises, and WorkerDiedError if the process ends before.
+    """
+    if is_fit() and threading.current_thread() is threading.main_thread() and _entered in ([], [place]):
+        _entered[:] = [place]
+        place.enter()
+        return function(*arguments)
+    if (worker := getattr(_kept, "worker", None)) is None or worker.place != place or not worker.is_alive:
+        if worker is not None:
+            worker.close()
+        worker = _kept.worker = Worker(place)
+    return worker.call(function, *arguments)
+
+
+_kept = threading.local()
+"""The worker of each thread; it ends with the thread."""
+_entered: list[Place] = []
+"""The place of the jobs that this process itself has done: it has imported their programs."""
+
+
+class Worker:
+    """A fit process, which does one job after the other. It ends with the process that has started it."""
+
+    def __init__(self, place: Place) -> None:
+        self.place = place
+        mine, its = socket.socketpair()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed with the process
+        with its:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "emulator.cells.worker", str(its.fileno())],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=self._errors,
+                pass_fds=[its.fileno()],
+                process_group=0,  # Ctrl-C is for whoever has started it
+                cwd=place.folder if Path(place.folder).is_dir() else None,
+                env={**os.environ, **_with_vnet(os.environ), **ONE_BLAS_THREAD, "PYTHONHASHSEED": "0"},
+            )
+        self._connection = Connection(mine.detach())
+        self.close = weakref.finalize(self, _end, self._process, self._connection, self._errors)
+        """Ends the process, whatever it does."""
+        self._entered = False
+
+    @property
+    def is_alive(self) -> bool:
+        """Return whether the process is there, and waits for a job."""
+        return self.close.alive and self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        """Id of the process."""
+        return self._process.pid
+
+    def call(self, function: Callable[..., T], *arguments: Any, limit_s: float | None = None) -> T:
+        """Return what the function returns there, or raise what it raises.
+
+        Raises WorkerDiedError, and WorkerTimeoutError after `limit_s` seconds. Ctrl-C interrupts the function.
+        """
+        if not self._entered:
+            self._ask(self.place.enter, (), None)
+            self._entered = True
+        return self._ask(function, arguments, limit_s)
+
+    def _ask(self, function: Callable[..., T], arguments: tuple[Any, ...], limit_s: float | None) -> T:
+        try:
+            self._connection.send_bytes(pickle.dumps((function, arguments)))
+            if not self._connection.poll(limit_s):
+                self.close()
+                raise WorkerTimeoutError(f"not over within {limit_s:g} s of wall clock")
+            succeeded, value = self._connection.recv()
+        except (EOFError, OSError):
+            raise WorkerDiedError(self._last_words()) from None
+        except KeyboardInterrupt:
+            self._interrupt()
+            raise
+        if succeeded:
+            return value  # type: ignore[no-any-return]
+        raise value
+
+    def _interrupt(self) -> None:
+        with suppress(OSError, EOFError):
+            self._process.send_signal(signal.SIGINT)
+            self._connection.poll(PATIENCE_S)
+        self.close()
+
+    def _last_words(self) -> str:
+        """Say how the process ended, with the last line that it wrote."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(PATIENCE_S)
+        status = self._process.poll()
+        with suppress(ValueError):  # closed by another thread
+            if self.close.alive and status is not None:
+                how = signal.Signals(-status).name if status < 0 else f"status {status}"
+                self._errors.seek(max(0, self._errors.seek(0, os.SEEK_END) - LONGEST_TAIL_BYTES))
+                lines = [line.strip() for line in self._errors.read().decode(errors="replace").split("\n")]
+                last = [line for line in lines if line][-1:]
+                self.close()
+                return ": ".join([f"its process ended with {how}", *last])
+        self.close()
+        return "its process was closed"
+
+
+def _end(process: subprocess.Popen[bytes], connection: Connection, errors: IO[bytes]) -> None:
+    process.kill()
+    process.wait()
+    connection.close()  # afterwards: a thread that waits for an answer sees the end of the process
+    errors.close()
+
+
+def _with_vnet(environment: Mapping[str, str]) -> dict[str, str]:
+    """The path on which the worker finds the vnet of this process, where it is not installed."""
+    root = str(Path(__file__).parents[2])
+    if root in (sysconfig.get_path("purelib"), sysconfig.get_path("platlib")):
+        return {}
+    given = environment.get("PYTHONPATH")
+    return {"PYTHONPATH": os.pathsep.join([root, given] if given else [root])}
+
+
+# In the worker.
+
+
+def _serve(descriptor: int) -> None:
+    """Do the jobs that come in on a connection, until it is closed at the other end."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in what a shell starts in the background
+    connection = Connection(descriptor)
+    jobs: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_receive, args=(connection, jobs), daemon=True).start()
+    while True:
+        job = jobs.get()
+        try:
+            function, arguments = pickle.loads(job)
+            answer = True, function(*arguments)
+        except BaseException as error:
+            answer = False, _portable(error)
+        connection.send(answer)
+
+
+def _receive(connection: Connection, jobs: SimpleQueue[bytes]) -> None:
+    """Take jobs; end the process, in the midst of a job too, when there is nobody left to answer."""
+    while True:
+        try:
+            jobs.put(connection.recv_bytes())
+        except (EOFError, OSError):
+            os._exit(0)
+
+
+def _portable(error: BaseException) -> BaseException:
+    """An exception as it can travel: itself, with its traceback as a note, or its text if it cannot be pickled."""
+    if not isinstance(error, VnetError):
+        error.add_note("in a worker process:\n" + "".join(traceback.format_exception(error)))
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        kind = VnetError if isinstance(error, VnetError) else RuntimeError
+        return kind(f"{type(error).__name__}: {error}")
+    return error
+
+
+if __name__ == "__main__":
+    from emulator.cells.worker import _serve as serve  # so that its classes are those that others import
+
+    serve(int(sys.argv[1]))

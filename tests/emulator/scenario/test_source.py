@@ -1,0 +1,78 @@
+"""The scenario of a call from Python: its sources, its changes, and what is wrong with either in one line."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.scenario.overrides import as_overrides, parse_values
+from emulator.scenario.source import scenario_of
+from tests.support.paths import ROOT
+from vnet.errors import ScenarioError
+
+
+def test_a_path_a_name_data_and_a_scenario_are_sources() -> None:
+    path = ROOT / "scenarios" / "twelve.toml"
+    loaded = scenario_of("twelve", {"radio.loss": 0.3})
+    assert loaded == scenario_of(path, {"radio.loss": 0.3}) == scenario_of(str(path), {"radio.loss": 0.3})
+    assert loaded.radio.loss == 0.3
+    assert scenario_of(loaded, {"run.seed": 9}).run.seed == 9
+    data: dict[str, Any] = {"run": {"name": "mine"}}
+    assert scenario_of(data, {"run.seed": 4, "run.duration_s": None}).run.seed == 4
+    assert data == {"run": {"name": "mine"}}, "what the caller gave stays as it was"
+
+
+def test_values_of_all_kinds_reach_the_scenario() -> None:
+    options = {"a b": [1, True, 'x"y\nz'], "none": {}, "path": Path("a/b"), "ratio": np.float32(0.5)}
+    found = scenario_of({}, {"program.options": options, "network.vehicles": np.int64(7)})
+    assert found.program.options == {"a b": [1, True, 'x"y\nz'], "none": {}, "path": "a/b", "ratio": 0.5}
+    assert found.network.vehicles == 7
+
+
+@pytest.mark.parametrize(
+    ("source", "changes", "message"),
+    [
+        ("twelve", {"radio.los": 1}, r"radio\.los: unknown key \(did you mean loss\?\)"),
+        ({}, {"radio.loss": 2}, r"^scenario: radio\.loss = 2"),
+        ({}, {"radio.loss": float("nan")}, r"^radio\.loss = nan: a finite number is needed"),
+        (
+            {},
+            {"radio.loss": object()},
+            r"^radio\.loss = <object .*>: a number, a boolean, a text, a list or a table",
+        ),
+        ({}, {"loss": 1}, r"--set loss=1: write it as section\.key=value"),
+        (3, {}, r"^scenario = 3: a path, a shipped scenario's name, or a dict is needed"),
+        ({"network": {"kind": "file", "path": "no.csv"}}, {}, r"network\.path = 'no\.csv': no such file"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(source: Any, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message) as raised:
+        scenario_of(source, changes)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("0,0.1,0.3", [0, 0.1, 0.3]),
+        ("urban,dense", ["urban", "dense"]),
+        ("urban, 3", ["urban", 3]),
+        ('"a,b",c', ['"a', 'b"', "c"]),
+        ('"a,b","c"', ["a,b", "c"]),
+        ("[1,2],[3]", [[1, 2], [3]]),
+        ("true", [True]),
+    ],
+)
+def test_values_of_a_list_are_toml_or_bare_words(text: str, values: list[Any]) -> None:
+    assert parse_values("key", text) == values
+
+
+@pytest.mark.parametrize("text", ["", "1,,2", ","])
+def test_a_list_without_values_is_refused(text: str) -> None:
+    with pytest.raises(ScenarioError, match="write its values with commas between"):
+        parse_values("radio.loss", text)
+
+
+def test_overrides_are_one_line_each() -> None:
+    assert as_overrides({"run.name": "ü\n", "radio.loss": 1}) == ['run.name="ü\\n"', "radio.loss=1"]
