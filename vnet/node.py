@@ -8,6 +8,7 @@ estimates. The source of the packets (lockstep or real time, one process or fift
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import ArrayLike
 
-from vnet.errors import PayloadTooLargeError
+from vnet.errors import PayloadTooLargeError, shown
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -29,6 +30,8 @@ LONGEST_TEXT = 64
 Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
 """A reported value besides the estimates."""
 
+COVARIANCE_TOLERANCE = 1e-6
+"""Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
 INBOX_LIMIT = 4096
 """Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
 
@@ -148,10 +151,20 @@ class Radio:
         self._transport = transport
 
     async def broadcast(self, payload: bytes) -> None:
-        """Send one frame to all nodes in range. Raise `PayloadTooLargeError` above `max_payload` bytes."""
-        if len(payload) > self.max_payload:
-            raise PayloadTooLargeError(len(payload), self.max_payload)
-        self._transport.send_frame(self._node_id, bytes(payload))
+        """Send one frame to all nodes in range.
+
+        Raise `PayloadTooLargeError` above `max_payload` bytes, and TypeError for what is not bytes.
+        """
+        try:
+            content = bytes(memoryview(payload))
+        except TypeError:
+            raise TypeError(
+                f"broadcast({shown(payload)}): bytes are expected, not {type(payload).__name__}; encode it first, "
+                "as with msgpack.packb(…) or text.encode()"
+            ) from None
+        if len(content) > self.max_payload:
+            raise PayloadTooLargeError(len(content), self.max_payload)
+        self._transport.send_frame(self._node_id, content)
 
     def drain(self) -> list[Packet]:
         """Return all packets received since the last call, oldest first, without waiting."""
@@ -248,10 +261,11 @@ class Node:
         in a unit is shown with it, as `delay_ms`. vnet's own metrics know `common_error_m` (2,),
         `common_error_covariance_m2` (2, 2), `mean_m` (2,) (of the consensus), `stacked_common_error_m` (2,) (after
         fusion) and `cloud_m` (n, 2); `heard` is the number of packets received since the last report, which is
-        checked against the trace. Raise ValueError for a wrong shape or another kind of value.
+        checked against the trace. Raise ValueError for a wrong shape, for another kind of value, and for a
+        covariance that is none: not finite, not symmetric, or not positive semidefinite.
         """
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
-        covariance = None if covariance_m2 is None else _floats("covariance_m2", covariance_m2, 4)
+        covariance = None if covariance_m2 is None else _covariance("covariance_m2", covariance_m2)
         named = {name: _value(name, value) for name, value in values.items()}
         self._transport.send_report(
             Report(
@@ -292,7 +306,24 @@ def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]
     return flat
 
 
+def _covariance(name: str, value: ArrayLike) -> list[float]:
+    """Return a covariance matrix (2, 2) in row-major order; errors of rounding are allowed."""
+    flat = _floats(name, value, 4)
+    (a, b, c, d), margin = flat, COVARIANCE_TOLERANCE * max(map(abs, flat))
+    if not all(map(math.isfinite, flat)):
+        reason = "not finite"
+    elif abs(b - c) > margin:
+        reason = "not symmetric"
+    elif min(a, d) < -margin or a * d - b * c < -margin * max(map(abs, flat)):
+        reason = "not positive semidefinite"
+    else:
+        return flat
+    raise ValueError(f"report({name}=[[{a:g}, {b:g}], [{c:g}, {d:g}]]): {reason}, so no covariance")
+
+
 def _value(name: str, value: ArrayLike) -> Value:
+    if name == "common_error_covariance_m2":
+        return _covariance(name, value)
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, str):

@@ -106,8 +106,11 @@ def _cell(value: Any, share: bool = False) -> str:
 def export(
     run: RunArgument = LATEST,
     to: Annotated[
-        Format, typer.Option(help="pcapng for Wireshark, mcap for Foxglove and Rerun, csv.")
-    ] = Format.CSV,
+        Format | None,
+        typer.Option(
+            help="pcapng for Wireshark, mcap for Foxglove and Rerun, csv. Default: as --out ends, else csv."
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="File, or for csv folder, that does not exist yet; by default in the run's folder."),
@@ -115,8 +118,9 @@ def export(
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
+        chosen = _format(to, out)
         recorded = RecordedRun.open(run)
-        match to:
+        match chosen:
             case Format.PCAPNG:
                 path = out or run / "frames.pcapng"
                 print(f"{_write(path, recorded, write_pcapng):,} packets in {path}")
@@ -126,6 +130,17 @@ def export(
             case Format.CSV:
                 path = out or run / "csv"
                 print(f"{', '.join(_write_folder(path, recorded))} in {path}")
+
+
+def _format(to: Format | None, out: Path | None) -> Format:
+    """Return the format that was asked for by name or by the end of the file's name; refuse two at once."""
+    suffix = "" if out is None else out.suffix.lower().removeprefix(".")
+    of_suffix = Format(suffix) if suffix in list(Format) else None
+    if to is not None and of_suffix not in (to, None):
+        raise VnetError(f"--out {out}: ends like a file of {suffix}, and --to is {to.value}")
+    if suffix in ("pcap", "cap"):
+        raise VnetError(f"--out {out}: of captures pcapng is written; let it end with .pcapng")
+    return to or of_suffix or Format.CSV
 
 
 def _write(path: Path, recorded: OpenedRun, writer: Callable[[OpenedRun, BinaryIO], int]) -> int:

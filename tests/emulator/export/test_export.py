@@ -247,6 +247,29 @@ def test_csv_has_every_row_of_every_table_in_plain_columns(recorded: OpenedRun, 
 RUNNER = CliRunner()
 
 
+@pytest.mark.parametrize(
+    ("name", "begins"), [("x.pcapng", b"\x0a\x0d\x0d\x0a"), ("X.MCAP", b"\x89MCAP"), ("x", None)]
+)
+def test_without_to_the_file_s_name_says_the_format(
+    folder: Path, tmp_path: Path, name: str, begins: bytes | None
+) -> None:
+    out = tmp_path / name
+    assert RUNNER.invoke(app, ["export", str(folder), "--out", str(out)]).exit_code == 0
+    assert out.is_dir() if begins is None else out.read_bytes().startswith(begins)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--to", "mcap", "--out", "x.pcapng"], "--out x.pcapng: ends like a file of pcapng, and --to is mcap"),
+        (["--out", "x.pcap"], "--out x.pcap: of captures pcapng is written; let it end with .pcapng"),
+    ],
+)
+def test_a_name_of_another_format_is_refused(folder: Path, options: list[str], message: str) -> None:
+    done = RUNNER.invoke(app, ["export", str(folder), *options])
+    assert (done.exit_code, done.stderr) == (2, f"vnet: {message}\n")
+
+
 @pytest.mark.parametrize("to", ["pcapng", "mcap", "csv"])
 def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     folder: Path, tmp_path: Path, to: str

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -222,25 +223,74 @@ def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "message"),
     [
-        lambda node: node.report(estimate_m=[1.0]),
-        lambda node: node.report(covariance_m2=[1.0, 2.0]),
-        lambda node: node.report(note={"far": 1}),
-        lambda node: node.report(note=["far", "near"]),
-        lambda node: node.report(note=65 * "x"),
+        (lambda node: node.report(estimate_m=[1.0]), "1 numbers given, 2 expected"),
+        (lambda node: node.report(covariance_m2=[1.0, 2.0]), "2 numbers given, 4 expected"),
+        (lambda node: node.report(note={"far": 1}), "note"),
+        (lambda node: node.report(note=["far", "near"]), "note"),
+        (lambda node: node.report(note=65 * "x"), "note"),
+        (lambda node: node.report(covariance_m2=[[1, 0.5], [0.4, 1]]), "not symmetric, so no covariance"),
+        (
+            lambda node: node.report(covariance_m2=[[1, 2], [2, 1]]),
+            r"\[2, 1\]\]\): not positive semidefinite",
+        ),
+        (lambda node: node.report(covariance_m2=-np.eye(2)), "not positive semidefinite"),
+        (lambda node: node.report(covariance_m2=[[np.nan, 0], [0, 1]]), "not finite, so no covariance"),
+        (lambda node: node.report(common_error_covariance_m2=[[1, 0], [0, np.inf]]), "common_.*not finite"),
     ],
 )
-def test_a_wrong_report_is_refused_where_it_is_made(wrong: Callable[[Node], None]) -> None:
+def test_a_wrong_report_is_refused_where_it_is_made(wrong: Callable[[Node], None], message: str) -> None:
     refused = []
 
     async def program(node: Node) -> None:
-        with pytest.raises(ValueError, match="report"):
+        with pytest.raises(ValueError, match=rf"report\(.*{message}"):
             wrong(node)
         refused.append(node.id)
 
     World("v1").run(program)
     assert refused == ["v1"]
+
+
+@pytest.mark.parametrize("factor", [1e-12, 1.0, 1e12])
+def test_a_covariance_with_errors_of_rounding_is_one(factor: float) -> None:
+    long_and_thin = factor * np.array([[1.0, 1.0 - 1e-9], [1.0 + 1e-9, 1.0]])
+
+    async def program(node: Node) -> None:
+        node.report(covariance_m2=long_and_thin, common_error_covariance_m2=np.zeros((2, 2)))
+
+    world = World("v1")
+    world.run(program)
+    assert world.yields[0].traffic.reports[0].covariance_m2 == tuple(long_and_thin.ravel())
+
+
+@pytest.mark.parametrize("payload", ["text", 5, None, [1, 2], {"a": 1}])
+def test_a_payload_that_is_not_bytes_is_refused(payload: Any) -> None:
+    refused = []
+
+    async def program(node: Node) -> None:
+        with pytest.raises(TypeError) as caught:
+            await node.radio.broadcast(payload)
+        refused.append(str(caught.value))
+
+    World("v1").run(program)
+    kind = type(payload).__name__
+    assert refused == [
+        f"broadcast({payload!r}): bytes are expected, not {kind}; encode it first, as with msgpack.packb(…) or "
+        "text.encode()"
+    ]
+
+
+@pytest.mark.parametrize(
+    "payload", [b"ab", bytearray(b"ab"), memoryview(b"ab"), np.array([97, 98], dtype=np.uint8)]
+)
+def test_whatever_holds_bytes_is_a_payload(payload: Any) -> None:
+    async def program(node: Node) -> None:
+        await node.radio.broadcast(payload)
+
+    world = World("v1")
+    world.run(program)
+    assert world.yields[0].traffic.frames[0].payload == b"ab"
 
 
 def test_a_payload_above_the_limit_is_refused() -> None:
