@@ -17,6 +17,7 @@ import typer
 from vnet.errors import ProgramError, VnetError
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
+from vnet.runtime.program_path import search_programs_in
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -36,6 +37,12 @@ def agent(
     join_timeout_s: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for the emulator's welcome.")
     ] = 60.0,
+    path: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FOLDER", help="Look for the program here, before the current folder. May be repeated."
+        ),
+    ] = None,
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
@@ -48,7 +55,7 @@ def agent(
     # are orphans, and end.
     signal_at_parent_death(signal.SIGCONT)
     _leave_terminal()
-    sys.path.append(str(Path.cwd()))  # where users keep their programs; last, so that it shadows nothing
+    search_programs_in(path or ())
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quiet_zenoh()
     try:

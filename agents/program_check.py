@@ -1,6 +1,6 @@
-"""Import programs as an agent does, before any is started: `python -P -m agents.program_check DESCRIPTOR ENTRY …`.
+"""Import programs as an agent does, before any is started.
 
-The reason why one cannot be loaded goes to the file descriptor; the exit status is then 2.
+`python -P -m agents.program_check DESCRIPTOR [--path FOLDER …] ENTRY …` looks for them in the folders too. The reason why one cannot be loaded goes to the file descriptor; the exit status is then 2.
 """
 
 from __future__ import annotations
@@ -13,13 +13,18 @@ from pathlib import Path
 
 from vnet.errors import ProgramError
 from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
 
 
 def main(arguments: Sequence[str]) -> int:
     """Import the programs with these entries; returns the exit status."""
     descriptor, *entries = arguments
-    sys.path.append(str(Path.cwd()))
+    folders = []
+    while entries[0] == "--path":
+        _, folder, *entries = entries
+        folders.append(Path(folder))
+    search_programs_in(folders)
     try:
         for entry in entries:
             load_program(entry)

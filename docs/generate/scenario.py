@@ -11,7 +11,8 @@ from agents.cooperative.options import Options
 from docs.generate.keys import key_docstrings, key_table, option_table, subsections
 from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
-from emulator.scenario.scenario import ProgramException, Scenario
+from emulator.scenario.program import ProgramException
+from emulator.scenario.scenario import Scenario
 
 INTRODUCTION = """
 A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is

@@ -60,7 +60,7 @@ class Cell:
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        code = _code_digests(entries_of(self.scenario))
+        code = _code_digests(entries_of(self.scenario), self.scenario.program.folders)
         text = json.dumps([FORMAT, code, self.from_s, self.is_judged, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

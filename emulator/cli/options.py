@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from emulator.scenario.program import split_file
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat
+from vnet.errors import ScenarioError, printable
 
 
 class Pacing(StrEnum):
@@ -23,7 +26,20 @@ ScenarioArgument = Annotated[
     Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML), or the name of one that is shipped.")
 ]
 ProgramOption = Annotated[
-    str | None, typer.Option(metavar="MODULE:FUNCTION", help="Program of every vehicle, as hello:main.")
+    str | None,
+    typer.Option(
+        metavar="PROGRAM", help="Program of every vehicle: hello.py, hello.py:main or package.hello:main."
+    ),
+]
+ProgramOptionsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option", metavar="KEY=VALUE", help="Option of the program: short for --set program.options.KEY=VALUE."
+    ),
+]
+ChecksOption = Annotated[
+    list[str] | None,
+    typer.Option("--check", metavar="CHECK", help="Check of your own, as my_checks.py:check. May be repeated."),
 ]
 PacingOption = Annotated[
     Pacing | None,
@@ -67,12 +83,31 @@ def load(
     pacing: Pacing | None = None,
     seed: int | None = None,
     duration: float | None = None,
+    program_options: list[str] | None = None,
+    checks: list[str] | None = None,
 ) -> Scenario:
+    """Load a scenario as the options of a command change it. Raises VnetError."""
     options = {
-        "program.entry": program and f'"{program}"',
+        "program.entry": program and json.dumps(from_here(program)),
         "run.pacing": pacing and f'"{pacing.value}"',
         "run.seed": seed,
         "run.duration_s": duration,
     }
     given = [f"{key}={value}" for key, value in options.items() if value is not None]
-    return load_scenario(path, [*(overrides or []), *given])
+    own = [_program_option(option) for option in program_options or ()]
+    return load_scenario(path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()])
+
+
+def _program_option(option: str) -> str:
+    key, equals, _ = option.partition("=")
+    if not equals or not key.strip():
+        raise ScenarioError(f"--option {printable(option)}: write it as KEY=VALUE, for example period_s=2")
+    return f"program.options.{option}"
+
+
+def from_here(entry: str) -> str:
+    """An entry of the command line; a file that is there is meant from the current folder."""
+    name, function = split_file(entry) or ("", "")
+    if not name or not Path(name).is_file():
+        return entry
+    return f"{Path(name).resolve()}:{function}" if function else str(Path(name).resolve())

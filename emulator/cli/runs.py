@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from rich.console import Console
 from emulator.cli.access import DEFAULT_ADDRESS, DEFAULT_LISTEN, create_access, load_or_create_access
 from emulator.cli.new_run import prepare_folder
 from emulator.cli.options import (
+    ChecksOption,
     DeterminismOption,
     DurationOption,
     LogFormatOption,
@@ -26,6 +26,7 @@ from emulator.cli.options import (
     Pacing,
     PacingOption,
     ProgramOption,
+    ProgramOptionsOption,
     QuietOption,
     RerunOption,
     ScenarioArgument,
@@ -53,6 +54,7 @@ from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks, choose_sinks
 from emulator.world.world import World, build_world
 from vnet.errors import ScenarioError, VnetError
+from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
 from vnet.transport.session import quiet_zenoh
 
@@ -87,6 +89,8 @@ def run(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
+    option: ProgramOptionsOption = None,
+    checks: ChecksOption = None,
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
@@ -102,7 +106,7 @@ def run(
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
     asked = OutputOptions(log_format, quiet, check_determinism, report)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        loaded = load(scenario, overrides, program, pacing, seed, duration)
+        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
@@ -130,6 +134,8 @@ def simulate(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
+    option: ProgramOptionsOption = None,
+    checks: ChecksOption = None,
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
@@ -140,12 +146,12 @@ def simulate(
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
     asked = OutputOptions(log_format, quiet, check_determinism, report)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
         world = build_world(loaded)
         _check_vehicle(sinks, world)
         emulation = Emulation(loaded, world, prepare_folder(out, scenario, loaded, log_format))
-        sys.path.append(str(Path.cwd()))
+        search_programs_in(loaded.program.folders)
         for entry in entries_of(loaded):
             load_program(entry)
         emulation.folder.open(loaded)
@@ -194,6 +200,8 @@ def emulator(
     duration: DurationOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
+    option: ProgramOptionsOption = None,
+    checks: ChecksOption = None,
     rerun: RerunOption = None,
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
@@ -207,7 +215,7 @@ def emulator(
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
-        loaded = load(scenario, overrides, program, pacing, seed, duration)
+        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks)
         _check_restarts(loaded, own_router=False)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         world = build_world(loaded)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,9 +9,11 @@ import typer
 from rich.console import Console
 
 from emulator.cli.options import (
+    ChecksOption,
     DurationOption,
     Pacing,
     ProgramOption,
+    ProgramOptionsOption,
     ScenarioArgument,
     SeedOption,
     SetOption,
@@ -48,6 +49,8 @@ def campaign(
     duration: DurationOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the campaign's files.")] = None,
     overrides: SetOption = None,
+    option: ProgramOptionsOption = None,
+    checks: ChecksOption = None,
     jobs: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
     ] = None,
@@ -62,10 +65,7 @@ def campaign(
     from emulator.testing.campaign import Plan, run_campaign
 
     with one_line_errors(), result_only(True):
-        sys.path.append(str(Path.cwd()))
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration)
-        options = {"jobs": jobs} if jobs else {}
-        plan = Plan.of(
-            loaded, faults, runs, loaded.run.seed, limit_s=time_limit, shrink_steps=shrink_steps, **options
-        )
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
+        limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
+        plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)
         raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))

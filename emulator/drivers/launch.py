@@ -59,8 +59,10 @@ class Launcher:
     `stop` ends all that are left, whatever happened before.
     """
 
-    def __init__(self, logs: Path) -> None:
+    def __init__(self, logs: Path, folders: Sequence[Path] = ()) -> None:
+        """Processes with logs in `logs`; agents look for their programs in `folders` too."""
         self.logs = logs
+        self._folders = folders
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._services: set[str] = set()
 
@@ -72,6 +74,8 @@ class Launcher:
         arguments = ["-P", "-m", "agents.cli", "--connect", endpoint, "--run", access.run]
         for node in nodes:
             arguments += ["--node", node]
+        for folder in self._folders:
+            arguments += ["--path", str(folder)]
         self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
         if nice:
             nice = min(os.getpriority(os.PRIO_PROCESS, 0) + nice, LOWEST_PRIORITY)

@@ -30,7 +30,8 @@ class ProgramCheck:
         self._entries = entries_of(scenario)
         self._limit_s = scenario.run.join_timeout_s
         self._reason, write_end = os.pipe()
-        arguments = ["-P", "-m", "agents.program_check", str(write_end), *self._entries]
+        folders = [word for folder in scenario.program.folders for word in ("--path", str(folder))]
+        arguments = ["-P", "-m", "agents.program_check", str(write_end), *folders, *self._entries]
         try:
             self._process = subprocess.Popen(
                 [sys.executable, *arguments],

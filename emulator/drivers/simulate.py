@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
 from vnet.runtime.host import Host, load_programs
+from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -81,6 +82,7 @@ class _Simulation:
         self.interrupted = False
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
         welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
+        search_programs_in(emulation.scenario.program.folders)
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._host = Host(welcomes, lambda: self.loop.now_ns)

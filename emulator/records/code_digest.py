@@ -33,12 +33,12 @@ def code_digests(scenario: Scenario) -> dict[str, str]:
 
     A program that cannot be found has none.
     """
-    return digests_of(entries_of(scenario))
+    return digests_of(entries_of(scenario), scenario.program.folders)
 
 
-def digests_of(entries: tuple[str, ...]) -> dict[str, str]:
-    """Return the same for the entries of a scenario's programs."""
-    digest = program_digest(entries)
+def digests_of(entries: tuple[str, ...], folders: tuple[Path, ...] = ()) -> dict[str, str]:
+    """Return the same for the entries of a scenario's programs, looked for in its folders too."""
+    digest = program_digest(entries, folders)
     return {"entries": " ".join(entries), **({"program": digest} if digest else {}), "vnet": vnet_digest()}
 
 
@@ -59,12 +59,16 @@ def entries_of(scenario: Scenario) -> tuple[str, ...]:
     return tuple(sorted({program.entry, *(exception.entry for exception in program.exceptions)}))
 
 
-def program_digest(entries: Iterable[str]) -> str | None:
-    """One digest of the programs with these entries, `package.module:function`; None if one cannot be found."""
+def program_digest(entries: Iterable[str], folders: Iterable[Path] = ()) -> str | None:
+    """One digest of the programs with these entries, `package.module:function`; None if one cannot be found.
+
+    They are looked for among what is installed, in `folders`, and in the current folder.
+    """
     modules: dict[str, Path | None] = {}
+    searched = [*map(str, folders), str(Path.cwd())]
     for entry in entries:
         name = entry.partition(":")[0]
-        _collect(name, name.partition(".")[0], modules)
+        _collect(name, name.partition(".")[0], modules, searched)
         if modules.get(name) is None:
             return None
     digest = hashlib.sha256()
@@ -89,10 +93,10 @@ def vnet_digest() -> str:
     return digest.hexdigest()
 
 
-def _collect(name: str, own: str, modules: dict[str, Path | None]) -> None:
+def _collect(name: str, own: str, modules: dict[str, Path | None], searched: list[str]) -> None:
     """Add a module, its packages, and all that they import, to `modules`: the source of each, or None if foreign.
 
-    `own` is the package of the entry.
+    `own` is the package of the entry; `searched` are folders beside what is installed.
     """
     waiting = [name]
     while waiting:
@@ -101,31 +105,30 @@ def _collect(name: str, own: str, modules: dict[str, Path | None]) -> None:
             module = ".".join(parts[:length])
             if module in modules:
                 continue
-            modules[module] = path = _source(module, own)
+            modules[module] = path = _source(module, own, searched)
             if path is not None:
                 waiting += _imported(module, path)
 
 
-def _source(module: str, own: str) -> Path | None:
+def _source(module: str, own: str, searched: list[str]) -> Path | None:
     """The source of a module of the program; None if it is another's, or no source."""
     top = module.partition(".")[0]
     if top in OWN or top in sys.stdlib_module_names:
         return None
-    spec = _find(module)
+    spec = _find(module, searched)
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return None
     path = Path(spec.origin)
     return path if top == own or not _is_installed(path) else None
 
 
-def _find(module: str) -> ModuleSpec | None:
-    """Find a module without importing it or its packages; the current folder counts, as it does for programs."""
+def _find(module: str, searched: list[str]) -> ModuleSpec | None:
+    """Find a module without importing it or its packages."""
     parent, _, _ = module.rpartition(".")
     try:
         if not parent:
-            here = [str(Path.cwd())]
-            return importlib.util.find_spec(module) or PathFinder.find_spec(module, here)
-        package = _find(parent)
+            return importlib.util.find_spec(module) or PathFinder.find_spec(module, searched)
+        package = _find(parent, searched)
         locations = None if package is None else package.submodule_search_locations
         return None if locations is None else PathFinder.find_spec(module, list(locations))
     except (ImportError, ValueError):

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,7 +16,9 @@ import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
+from emulator.scenario.modules import with_modules
 from emulator.scenario.overrides import apply_override
+from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
@@ -253,47 +253,6 @@ class Radio(Section):
         return links
 
 
-class OneProgram(Section):
-    """A program as `package.module:function`, and the options it is given."""
-
-    entry: str = "agents.beacon:main"
-    """An async function of one argument, the `Node`."""
-    options: dict[str, Any] = Field(default_factory=dict)
-    """Given to the program as `node.options`; what is allowed is its own business."""
-
-    @field_validator("entry")
-    @classmethod
-    def _entry_is_module_and_function(cls, entry: str) -> str:
-        if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", entry):
-            raise ValueError("write it as package.module:function")
-        return entry
-
-
-class ProgramException(OneProgram):
-    """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
-
-    nodes: tuple[str, ...] = Field(min_length=1)
-    """Ids of the vehicles."""
-
-
-class Program(OneProgram):
-    """`[program]`: the program of every vehicle, except the `exceptions`."""
-
-    exceptions: tuple[ProgramException, ...] = ()
-    """Vehicles that run another program."""
-
-    @model_validator(mode="after")
-    def _one_program_a_node(self) -> Program:
-        named = Counter(node for exception in self.exceptions for node in exception.nodes)
-        if twice := sorted(node for node, count in named.items() if count > 1):
-            raise ValueError(f"node {shown(twice[0])} is in two exceptions")
-        return self
-
-    def of(self, node: str) -> OneProgram:
-        """Return the program of `node`."""
-        return next((exception for exception in self.exceptions if node in exception.nodes), self)
-
-
 class Scenario(Section):
     """A whole scenario. All sections have defaults, so that an empty file is a valid run."""
 
@@ -339,11 +298,12 @@ class Scenario(Section):
         return round(NS_PER_S / self.world.gnss.rate_hz)
 
 
-def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[str] = ()) -> Scenario:
     """Read a scenario, from its path or by its name if it is shipped, and apply `section.key=value` overrides.
 
     Values are in TOML syntax; bare words are strings. A relative `network.path` or `radio.links` is taken from
-    the scenario's own folder. Raises `ScenarioError`.
+    the scenario's own folder; programs and checks are looked for there, and then in the current folder. `checks`
+    come after those of the file. Raises `ScenarioError`.
     """
     path = find_scenario(path)
     try:
@@ -355,7 +315,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")
-    return scenario_from(data, path, overrides, recorded_digests)
+    return scenario_from(data, path, overrides, recorded_digests, checks)
 
 
 def scenario_from(
@@ -363,10 +323,12 @@ def scenario_from(
     path: Path,
     overrides: Sequence[str] = (),
     digests: Mapping[str, str] | None = None,
+    checks: Sequence[str] = (),
 ) -> Scenario:
     """Return the scenario of plain data, which it changes by the overrides; `path` is what messages call it.
 
-    Raises ScenarioError, also for an input file that has not the digest recorded for it.
+    `checks` come after those of the data. Raises ScenarioError, also for an input file that has not the digest
+    recorded for it.
     """
     for override in overrides:
         apply_override(data, override)
@@ -378,6 +340,8 @@ def scenario_from(
     except ValueError as error:
         raise ScenarioError(f"{path}: {error}") from None
     scenario = _with_absolute_paths(scenario, path)
+    program = with_modules(scenario.program, path.parent, checks, str(path))
+    scenario = scenario.model_copy(update={"program": program})
     recorded = digests or {}
     for name, digest in input_digests(scenario).items():
         if recorded.get(name, digest) != digest:

@@ -26,6 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from emulator.checks.own import load_checks
 from emulator.records.atomic import write_atomically
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.scenario.faults import KINDS
@@ -36,6 +37,7 @@ from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_ki
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
 from vnet.errors import ScenarioError, VnetError
+from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
 
 FORMAT = 1
@@ -69,7 +71,9 @@ class Plan:
         kinds = known_kinds(None if faults == "random" else faults.split(","))
         plain = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()})
         ScheduleConstraints.of(plain)
+        search_programs_in(plain.program.folders)
         load_program(plain.program.entry)
+        load_checks(plain.program)
         return cls(plain, runs, seed, kinds, **options)
 
     def draw(self, number: int) -> Scenario:

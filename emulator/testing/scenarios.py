@@ -8,8 +8,10 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from emulator.scenario.modules import with_modules
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.sections import first_problem
+from emulator.scenario.shipped import find_scenario
 from vnet.errors import ScenarioError
 
 Source = str | Path | Mapping[str, Any] | Scenario
@@ -18,6 +20,7 @@ NAMES = {
     "vehicles": "network.vehicles",
     "program": "program.entry",
     "options": "program.options",
+    "checks": "program.checks",
     "seed": "run.seed",
     "duration": "run.duration_s",
     "settle": "run.settle_s",
@@ -29,9 +32,10 @@ NAMES = {
 def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[Path] = ()) -> Scenario:
     """A scenario with `changes`, by short name or as "section.key". None changes nothing.
 
-    A file is looked for here, and then in `folders`. Raises ScenarioError.
+    A file is looked for here, and then in `folders`; programs and checks beside it, and then here. Raises
+    ScenarioError.
     """
-    scenario = _loaded(source, folders)
+    scenario, base = _loaded(source, folders)
     given = {name: value for name, value in changes.items() if value is not None}
     if "vehicles" in given and scenario.network.kind == "file":
         raise ScenarioError(f"vehicles = {given['vehicles']}: the network's file says how many there are")
@@ -44,16 +48,20 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
         for section in sections:
             table = table.setdefault(section, {})
         table[key] = _plain(value)
-    return _validated(data)
+    changed = _validated(data)
+    program = with_modules(changed.program, base)
+    return changed.model_copy(update={"program": program})
 
 
-def _loaded(source: Source, folders: Iterable[Path]) -> Scenario:
+def _loaded(source: Source, folders: Iterable[Path]) -> tuple[Scenario, Path | None]:
+    """The scenario, and the folder of its file."""
     if isinstance(source, Scenario):
-        return source
+        return source, None
     if isinstance(source, Mapping):
-        return _validated(source)
+        return _validated(source), None
     found = [path for path in (Path(source), *(folder / source for folder in folders)) if path.is_file()]
-    return load_scenario(found[0] if found else Path(source))
+    path = found[0] if found else find_scenario(source)
+    return load_scenario(path), path.parent
 
 
 def _validated(data: Mapping[str, Any]) -> Scenario:

@@ -65,7 +65,7 @@ async def run_live(
     the run's folder.
     """
     with ExitStack() as stack:
-        launcher = Launcher(emulation.folder.logs)
+        launcher = Launcher(emulation.folder.logs, emulation.scenario.program.folders)
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
             set_time_slice(PROMPT_SLICE_NS)

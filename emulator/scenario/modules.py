@@ -1,0 +1,95 @@
+"""The modules that a scenario names, programs and checks: found beside the scenario, or in the current folder.
+
+Nothing is imported here. What a scenario names as a file becomes a module and its folder, so that whoever imports
+it needs only the names and `program.folders`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from emulator.scenario.program import Program, split_file
+from vnet.errors import ScenarioError, shown
+from vnet.runtime.own_packages import OWN
+
+DEFAULT_FUNCTIONS = {"program.entry": "main", "program.checks": "check"}
+"""Functions of a file that is named without one, by key."""
+
+
+def with_modules(program: Program, base: Path | None, checks: Sequence[str] = (), source: str = "") -> Program:
+    """Return `[program]` with every file as a module, with `checks` after its own, and with absolute `folders`.
+
+    Modules are looked for in `program.folders`, in `base`, the folder of the scenario, and in the current one.
+    `source` is what messages call the scenario. Raises ScenarioError for a file or folder that is not there.
+    """
+    found = _Modules(program.folders, base, f"{source}: " if source else "")
+    exceptions = [
+        each.model_copy(update={"entry": found.entry("program.entry", each.entry)}) for each in program.exceptions
+    ]
+    data = {
+        "entry": found.entry("program.entry", program.entry),
+        "exceptions": tuple(exceptions),
+        "checks": tuple(dict.fromkeys(found.entry("program.checks", each) for each in [*program.checks, *checks])),
+    }
+    return program.model_copy(update={**data, "folders": found.folders})
+
+
+class _Modules:
+    """The folders of a scenario's modules, as they are found."""
+
+    def __init__(self, given: Iterable[Path], base: Path | None, source: str) -> None:
+        self._source = source
+        self._given = [self._folder(path, base) for path in given]
+        self._searched = list(dict.fromkeys([*self._given, *filter(None, [base]), Path.cwd()]))
+        self._of_files: dict[str, Path] = {}
+        self._holding: set[Path] = set()
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Folders of the files; then those that were given or hold a module, in the order of the search."""
+        held = [path for path in self._searched if path in self._given or path in self._holding]
+        return tuple(dict.fromkeys(path.resolve() for path in [*self._of_files.values(), *held]))
+
+    def entry(self, key: str, entry: str) -> str:
+        """Return an entry as `module:function`."""
+        if (file := split_file(entry)) is not None:
+            return self._file(key, entry, *file)
+        parts = entry.partition(":")[0].split(".")
+        if parts[0] not in OWN:
+            self._holding.update(path for path in self._searched if _holds(path, parts))
+        return entry
+
+    def _file(self, key: str, entry: str, name: str, function: str) -> str:
+        problem = f"{self._source}{key} = {shown(entry)}"
+        try:
+            found = next((path for folder in self._searched if (path := folder / name).is_file()), None)
+        except (OSError, ValueError):
+            found = None
+        if found is None:
+            where = " or in ".join(str(folder) for folder in self._searched)
+            raise ScenarioError(f"{problem}: no such file in {where}")
+        if not found.stem.isidentifier():
+            raise ScenarioError(f"{problem}: not importable: name the file with letters, digits and _ only")
+        folder = self._of_files.setdefault(found.stem, found.parent)
+        if folder.resolve() != found.parent.resolve():
+            raise ScenarioError(f"{problem}: there is another {found.name} in {folder}: rename one of them")
+        return f"{found.stem}:{function or DEFAULT_FUNCTIONS[key]}"
+
+    def _folder(self, path: Path, base: Path | None) -> Path:
+        folder = (base or Path()) / path
+        try:
+            if folder.is_dir():
+                return folder.resolve()
+        except (OSError, ValueError, RuntimeError):
+            pass
+        raise ScenarioError(f"{self._source}program.folders: {shown(str(path))}: no such folder")
+
+
+def _holds(folder: Path, parts: Sequence[str]) -> bool:
+    """Return whether a folder holds a module, which is a file or a package."""
+    path = folder.joinpath(*parts)
+    try:
+        return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+    except (OSError, ValueError):
+        return False

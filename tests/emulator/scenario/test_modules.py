@@ -1,0 +1,212 @@
+"""Programs and checks are found beside the scenario first, then in the current folder, as modules or as files."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from emulator.cli.commands import app
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.testing.scenarios import make_scenario
+from vnet.errors import ScenarioError
+from vnet.runtime.program_path import search_programs_in
+
+SAY = """
+async def main(node):
+    async for fix in node.gnss:
+        await node.radio.broadcast({!r})
+        node.report(size=node.options.get("size", 0))
+
+async def other(node):
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"o")
+"""
+SHORT = '[run]\nname = "own"\nduration_s = 0.5\nsettle_s = 0.0\n[network]\nvehicles = 2\n[radio]\nrange_m = 1e5\n'
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The current folder, with `scenarios/own.toml` in it; what is imported from there is forgotten."""
+    (tmp_path / "scenarios").mkdir()
+    (tmp_path / "scenarios" / "own.toml").write_text(SHORT)
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    yield tmp_path
+    sys.path[:] = before
+    for name in [name for name in sys.modules if name.startswith("pp_")]:
+        del sys.modules[name]
+
+
+def program(path: Path, payload: bytes) -> None:
+    """Write a program whose frames are `payload`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(SAY.format(payload))
+
+
+def load(*overrides: str) -> Scenario:
+    return load_scenario(Path("scenarios/own.toml"), overrides)
+
+
+def simulate(*arguments: object) -> tuple[int, str]:
+    """Run `vnet simulate`; returns status and output."""
+    words = ["simulate", *map(str, arguments), "--quiet", "--no-report"]
+    done = CliRunner(env={"PYTHONHASHSEED": "0"}).invoke(app, words)
+    return done.exit_code, done.output
+
+
+def sizes(folder: str) -> set[int]:
+    return set(RecordedRun.open(Path(folder)).trace["size_bytes"].to_pylist())
+
+
+def test_the_scenarios_own_folder_comes_before_the_current_one(here: Path) -> None:
+    program(here / "pp_hello.py", b"here")
+    program(here / "scenarios" / "pp_hello.py", b"beside")
+    assert load('program.entry="pp_hello:main"').program.folders == (here / "scenarios", here)
+    assert simulate("scenarios/own.toml", "--program", "pp_hello:main", "--out", "first")[0] == 0
+    assert sizes("first") == {len(b"beside")}
+
+
+@pytest.mark.parametrize("folder", [".", "scenarios"])
+@pytest.mark.parametrize("entry", ["pp_one:main", "pp_package.deep:main", "pp_one.py", "pp_one.py:main"])
+def test_a_program_is_found_in_either_folder(here: Path, folder: str, entry: str) -> None:
+    program(here / folder / "pp_one.py", b"1")
+    program(here / folder / "pp_package" / "deep.py", b"1")
+    loaded = load(f'program.entry="{entry}"').program
+    assert loaded.folders == ((here / folder).resolve(),)
+    assert loaded.entry == ("pp_package.deep:main" if "deep" in entry else "pp_one:main")
+
+
+def test_vnets_own_programs_and_what_is_installed_need_no_folder(here: Path) -> None:
+    (here / "agents").mkdir()
+    program(here / "agents" / "beacon.py", b"not this one")
+    assert load().program.folders == ()
+    assert load('program.entry="json:dumps"').program.folders == ()
+
+
+def test_a_file_of_the_command_line_is_one_of_the_current_folder(here: Path) -> None:
+    program(here / "pp_hello.py", b"here")
+    program(here / "scenarios" / "pp_hello.py", b"beside")
+    assert simulate("scenarios/own.toml", "--program", "pp_hello.py", "--out", "first")[0] == 0
+    assert sizes("first") == {len(b"here")}
+
+
+def test_a_file_may_name_its_function_and_lie_anywhere(here: Path) -> None:
+    program(here / "deep" / "er: 2" / "pp_far.py", b"far")
+    assert simulate("scenarios/own.toml", "--program", "deep/er: 2/pp_far.py:other", "--out", "first")[0] == 0
+    assert sizes("first") == {1}
+
+
+def test_a_run_is_repeated_from_any_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program(here / "pp_hello.py", b"here")
+    simulate("scenarios/own.toml", "--program", "pp_hello:main", "--out", "first")
+    (here / "elsewhere").mkdir()
+    monkeypatch.chdir(here / "elsewhere")
+    del sys.modules["pp_hello"]
+    assert simulate("../first/scenario.toml", "--out", "again") == (0, "verdict: valid  again\n")
+    first, again = (RecordedRun.open(Path(name)).record.trace_sha256 for name in ("../first", "again"))
+    assert first == again
+
+
+def test_the_digest_of_a_program_is_that_of_its_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program(here / "scenarios" / "pp_hello.py", b"beside")
+    scenario = load('program.entry="pp_hello:main"')
+    monkeypatch.chdir("/")
+    before = RunFolder.create(here / "one", scenario).code["program"]
+    program(here / "scenarios" / "pp_hello.py", b"changed")
+    assert RunFolder.create(here / "two", scenario).code["program"] != before
+
+
+def test_a_test_finds_programs_beside_its_scenario(here: Path) -> None:
+    program(here / "scenarios" / "pp_hello.py", b"beside")
+    for entry in ("pp_hello:main", "pp_hello.py"):
+        made = make_scenario("scenarios/own.toml", {"program": entry}).program
+        assert (made.entry, made.folders) == ("pp_hello:main", (here / "scenarios",))
+
+
+def test_exceptions_and_checks_are_found_likewise(here: Path) -> None:
+    program(here / "pp_liar.py", b"lie")
+    (here / "scenarios" / "pp_checks.py").write_text("def check(run):\n    return []\n")
+    exceptions = 'program.exceptions=[{entry="pp_liar.py", nodes=["v01"]}]'
+    loaded = load(exceptions, 'program.checks=["pp_checks.py"]').program
+    assert loaded.of("v01").entry == "pp_liar:main"
+    assert loaded.checks == ("pp_checks:check",)
+    assert loaded.folders == (here, here / "scenarios")
+
+
+def test_given_folders_come_first_and_are_relative_to_the_scenario(here: Path) -> None:
+    program(here / "pp_hello.py", b"here")
+    program(here / "src" / "pp_hello.py", b"src")
+    loaded = load('program.entry="pp_hello:main"', 'program.folders=["../src"]').program
+    assert loaded.folders == (here / "src", here)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ('program.entry="pp_no.py"', r"program.entry = 'pp_no.py': no such file in scenarios or in /"),
+        ('program.entry="pp-odd.py:main"', r"program.entry = 'pp-odd.py:main': not importable: name the file with"),
+        ('program.folders=["nowhere"]', r"program.folders: 'nowhere': no such folder"),
+        (
+            'program.entry="main"',
+            r"program.entry = 'main': write it as package.module:function, or as file.py:func",
+        ),
+        (
+            'program.checks=["x"]',
+            r"program.checks.0 = 'x': write it as package.module:function, or as file.py:func",
+        ),
+        (
+            'program={entry="pp_a.py", exceptions=[{entry="src/pp_a.py", nodes=["v01"]}]}',
+            r"there is another pp_a.py in .*src: rename one of them",
+        ),
+    ],
+)
+def test_what_cannot_be_found_is_named_in_one_line(here: Path, override: str, said: str) -> None:
+    for path in ("pp-odd.py", "pp_a.py", "src/pp_a.py"):
+        program(here / path, b"x")
+    key, _, value = override.partition("=")
+    if key == "program":
+        (here / "scenarios" / "own.toml").write_text(f"program = {value}\n")
+    with pytest.raises(ScenarioError, match=said):
+        load(*[] if key == "program" else [override])
+
+
+def test_an_option_is_short_for_a_key_of_the_scenario(here: Path) -> None:
+    program(here / "pp_hello.py", b"x")
+    arguments = ["scenarios/own.toml", "--program", "pp_hello.py", "--out", "one"]
+    assert simulate(*arguments, "--option", "size=7", "--option", "word=far away")[0] == 0
+    run = RecordedRun.open(Path("one"))
+    assert run.scenario.program.options == {"size": 7, "word": "far away"}
+    assert (run.value("size") == 7).all()
+
+
+@pytest.mark.parametrize("option", ["size", "=7"])
+def test_an_option_without_key_or_value_is_refused(here: Path, option: str) -> None:
+    status, text = simulate("scenarios/own.toml", "--option", option)
+    assert (status, text) == (2, f"vnet: --option {option}: write it as KEY=VALUE, for example period_s=2\n")
+
+
+def test_folders_are_searched_last_and_those_of_another_run_no_more(here: Path) -> None:
+    installed = list(sys.path)
+    search_programs_in([here / "a", here / "b"])
+    assert sys.path == [*installed, str(here / "a"), str(here / "b"), str(Path.cwd())]
+    search_programs_in([here / "b"])
+    assert sys.path == [*installed, str(here / "b"), str(Path.cwd())]
+    search_programs_in([])
+    assert sys.path == [*installed, str(Path.cwd())]
+
+
+def test_agents_of_a_live_run_are_told_the_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from emulator.drivers.launch import Launcher
+    from vnet.transport.access import Access
+
+    started: list[Any] = []
+    launcher = Launcher(tmp_path, [tmp_path / "a b", tmp_path])
+    monkeypatch.setattr(launcher, "start", lambda *arguments: started.append(arguments))
+    launcher.start_agent("tcp/127.0.0.1:1", Access.create("run", [["v01"]]), ["v01"])
+    (arguments,) = [words for _, words, *_ in started]
+    assert arguments[-4:] == ["--path", str(tmp_path / "a b"), "--path", str(tmp_path)]
