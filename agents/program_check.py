@@ -1,6 +1,7 @@
 """Import programs as an agent does, before any is started.
 
-`python -P -m agents.program_check DESCRIPTOR [--path FOLDER …] ENTRY …` looks for them in the folders too. The reason why one cannot be loaded goes to the file descriptor; the exit status is then 2.
+`python -P -m agents.program_check DESCRIPTOR [--path FOLDER …] ENTRY …` looks for them in the folders too.
+The reason why one cannot be loaded goes to the file descriptor; the exit status is then 2.
 """
 
 from __future__ import annotations

@@ -10,11 +10,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from emulator.checks.own import Result
     from emulator.records.run import Run
 
-__all__ = ["Run"]
+__all__ = ["Result", "Run"]
 
-_PUBLIC = {"Run": "emulator.records.run"}
+_PUBLIC = {"Result": "emulator.checks.own", "Run": "emulator.records.run"}
 """Modules of the public names."""
 
 

@@ -7,14 +7,18 @@ should have seen something and saw nothing is unknown. `emulator.checks.registry
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from emulator.checks.own import PREFIX, load_checks, own_findings, recorded_findings
 from emulator.checks.registry import CHECKS
 from emulator.checks.replay import ONCE, check_replay
 from emulator.radio.trace import sha256_of_table
-from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.run import Run
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict
+from emulator.scenario.modules import with_modules
 
 __all__ = [
     "CheckResult",
@@ -27,10 +31,10 @@ __all__ = [
 ]
 
 
-def judge(recorded: RecordedRun) -> Judgement:
-    """Judge a run by all checks."""
+def judge(recorded: RecordedRun, own: Iterable[Finding] = ()) -> Judgement:
+    """Judge a run by all checks; `own` are the findings of checks of the user's own."""
     findings: list[Finding] = [finding for check in CHECKS for finding in check.findings(recorded)]
-    findings.append(ONCE)
+    findings += [ONCE, *own]
     checks = [finding for finding in findings if isinstance(finding, CheckResult)]
     skipped = [finding for finding in findings if isinstance(finding, NotExercised)]
     return Judgement(_downgrade_if_overloaded(checks), skipped, sha256_of_table(recorded.trace))
@@ -44,22 +48,37 @@ def _downgrade_if_overloaded(checks: list[CheckResult]) -> list[CheckResult]:
         return checks
     return [
         replace(check, verdict=Verdict.UNKNOWN, text=f"{check.text}; but the machine did not keep up")
-        if check.name in sensitive and check.verdict is Verdict.INVALID
+        if (check.name in sensitive or check.name.startswith(PREFIX)) and check.verdict is Verdict.INVALID
         else check
         for check in checks
     ]
 
 
-def check_run(folder: Path) -> Judgement:
+def check_run(folder: Path, own_checks: bool = False, checks: Sequence[str] = ()) -> Judgement:
     """Judge a run from its folder. Raises VnetError if the folder is not a finished run's.
 
-    A trace that is not the one whose hash the verdict holds makes the run invalid.
+    Checks of the user's own stand as the folder holds them; nothing that it names is imported. With `own_checks`
+    those of its scenario are run again, and so are further `checks`. A trace that is not the one whose hash the
+    verdict holds makes the run invalid.
     """
     recorded = RecordedRun.open(folder)
     trace_sha256 = recorded.record.trace_sha256
-    judgement = judge(recorded)
+    judgement = judge(recorded, _own_findings(recorded, folder, own_checks, checks))
     judgement.put(check_replay(folder))
     if judgement.trace_sha256 != trace_sha256:
         text = f"the trace is not the one that verdict.json speaks of ({trace_sha256[:12]}…)"
         judgement.put(CheckResult("trace_sha256", Verdict.INVALID, text))
     return judgement
+
+
+def _own_findings(recorded: OpenedRun, folder: Path, own_checks: bool, checks: Sequence[str]) -> list[Finding]:
+    """Findings of checks of the user's own: as recorded, or of those that are run again."""
+    program, found = recorded.scenario.program, {}
+    if not own_checks:  # the folder has no say in where modules come from
+        program = program.model_copy(update={"checks": (), "folders": ()})
+        found = {finding.name: finding for finding in recorded_findings(recorded.record)}
+    program = with_modules(program, None, checks)
+    load_checks(program)
+    return list(
+        (found | {finding.name: finding for finding in own_findings(program, Run(recorded, folder))}).values()
+    )

@@ -9,14 +9,21 @@ import typer
 from rich.console import Console
 
 from emulator.checks.judge import check_run
+from emulator.cli.options import ChecksOption, from_here
 from emulator.records.recorded_run import RecordedRun
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.summary import print_checks
 
 
-def check(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]) -> None:
-    """Judge a run again, from its files alone."""
+def check(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")],
+    check: ChecksOption = None,
+    own_checks: Annotated[
+        bool, typer.Option("--own-checks", metavar="", help="Run its own checks again: code that the folder names.")
+    ] = False,
+) -> None:
+    """Judge a run again, from its files alone; its own checks stand as recorded unless asked."""
     with one_line_errors():
-        judgement = check_run(folder)
+        judgement = check_run(folder, own_checks, [from_here(each) for each in check or ()])
         print_checks(judgement, Console(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)

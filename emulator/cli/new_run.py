@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from emulator.checks.own import load_checks
 from emulator.records.code_digest import changed_code
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.recorded import recorded_code
@@ -17,6 +18,7 @@ def prepare_folder(out: Path | None, path: Path, scenario: Scenario, log_format:
     Where `path` is of another run's folder, and program or vnet have changed since, the run goes on: one line says
     so, and the event `code_changed` records it.
     """
+    load_checks(scenario.program)  # a folder appears only once they have proved usable
     folder = RunFolder.prepare(out, scenario)
     if changed := changed_code(recorded_code(path), folder.code):
         tell(f"{path}: {changed}", log_format)

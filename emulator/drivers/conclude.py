@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import platform
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import asdict
 from importlib.metadata import version
+from io import StringIO
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
+from emulator.checks.own import own_findings
 from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
+from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
 from emulator.records.metrics import summarize
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
+from emulator.records.run import Run
 from emulator.records.run_folder import (
     AGAIN,
     BUSY_FILE,
@@ -31,6 +37,8 @@ from emulator.records.run_folder import (
     TRACE_FILE,
     VERDICT_FILE,
     WORLD_FILE,
+    RunFolder,
+    write_text,
 )
 from emulator.records.verdicts import Finding, unknown
 
@@ -58,9 +66,8 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         if table is not None:
             folder.put_table(name, table)
     folder.put(WORLD_FILE, world.write)
-    judgement = judge(
-        RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
-    )
+    recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
+    judgement = judge(recorded, _own_findings(recorded, folder))
     verdict = {
         "format": FORMAT,
         **_judged(judgement),
@@ -84,6 +91,18 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     }
     folder.put_json(VERDICT_FILE, verdict)
     return judgement, verdict
+
+
+def _own_findings(recorded: RecordedRun, folder: RunFolder) -> list[Finding]:
+    """Judge a run by its own checks. What they print goes to logs/checks.log; Ctrl-C ends them, and no more."""
+    program = recorded.scenario.program
+    if not program.checks:
+        return []
+    with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
+        findings = own_findings(program, Run(recorded, folder.path))
+    if printed.getvalue():
+        folder.put("logs/checks.log", lambda path: write_text(path, printed.getvalue()))
+    return findings
 
 
 def _busy(emulation: Emulation) -> pa.Table | None:

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.checks.judge import CheckResult, Judgement, Verdict
+from emulator.checks.own import load_checks
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
@@ -51,6 +52,7 @@ class RunHarness:
             raise ScenarioError("run.pacing = 'realtime': a test steps a run in lockstep; for real time: vnet run")
         if any(fault.kind == "router_restart" for fault in scenario.fault):
             raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+        load_checks(scenario.program)
         self.folder = folder
         self.live = live
         self._emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))

@@ -1,0 +1,213 @@
+"""Checks of a user's own: functions of a `Run` that yield results, which stand in the verdict beside vnet's.
+
+`[program] checks` and `--check` name them. They run in the emulator's process once the tables are written. A
+function that raises, or answers nonsense, makes a check *unknown* that bears its name and says how; it stops
+nothing else.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import re
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from emulator.records.run import Run
+from emulator.records.verdict_file import Record
+from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, unknown
+from emulator.scenario.program import Program
+from vnet.errors import ScenarioError, VnetError, printable, shown
+from vnet.runtime.program_path import search_programs_in
+
+PREFIX = "own:"
+"""Names of own checks begin with it, so that none is taken for one of vnet's."""
+NOT_APPLICABLE = "not applicable"
+VERDICTS = (*(verdict.value for verdict in Verdict), NOT_APPLICABLE)
+MOST_RESULTS = 1000
+"""Results of one function; a generator that yields without end is stopped."""
+LONGEST_TEXT = 2000
+LARGEST_FIGURES_BYTES = 1_000_000
+"""Size of one result's figures in verdict.json."""
+_NAME = re.compile(r"[A-Za-z]\w{0,63}", re.ASCII)
+
+
+class Result(NamedTuple):
+    """One result of a check; a plain tuple of the same values does as well."""
+
+    name: str
+    """Name of the check: letters, digits and _; the verdict calls it `own:NAME`."""
+    verdict: str
+    """Verdict: "valid", "invalid", "unknown" or "not applicable"."""
+    text: str
+    """What was seen, in one line; of a check that is not applicable the reason."""
+    figures: Mapping[str, Any] = {}
+    """Figures by name: finite numbers, booleans, texts, None, and lists and tables of these. `rows`, a list of
+    tables, are the offending rows, of which the first ten are shown."""
+
+
+CheckFunction = Callable[[Run], Any]
+
+
+class _NonsenseError(VnetError):
+    """An answer that is no result."""
+
+
+def load_checks(program: Program) -> dict[str, CheckFunction]:
+    """Import a scenario's own checks, by entry. Raises VnetError for one that cannot be imported."""
+    search_programs_in(program.folders)
+    return {entry: _load(entry, program) for entry in program.checks}
+
+
+def _load(entry: str, program: Program) -> CheckFunction:
+    name, _, function = entry.partition(":")
+    problem = f"program.checks = {entry!r}"
+    if name in {each.entry.partition(":")[0] for each in (program, *program.exceptions)}:
+        raise ScenarioError(f"{problem}: is in the program's module: put it into a module of its own")
+    try:
+        module = importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        raise ScenarioError(f"{problem}: cannot import: {_in_words(error)}") from error
+    check = getattr(module, function, None)
+    if check is None:
+        file = getattr(module, "__file__", None) or "built in"
+        raise ScenarioError(f"{problem}: module {name} ({file}) has no {function!r}")
+    if not callable(check) or inspect.iscoroutinefunction(check):
+        raise ScenarioError(f"{problem}: is not a function of a run: def {function}(run)")
+    return check  # type: ignore[no-any-return]
+
+
+def own_findings(program: Program, run: Run) -> list[Finding]:
+    """Judge a run by its own checks. Ctrl-C ends them; those that are left are unknown."""
+    findings: dict[str, Finding] = {}
+    interrupted = False
+    for entry in program.checks:
+        try:
+            if interrupted:
+                raise KeyboardInterrupt
+            for finding in _findings_of(entry, program, run):
+                if finding.name in findings:
+                    raise _NonsenseError(f"yields {finding.name.removeprefix(PREFIX)!r} twice")
+                findings[finding.name] = finding
+        except KeyboardInterrupt:
+            interrupted = True
+            findings[_broken(entry)] = unknown(_broken(entry), "interrupted")
+        except (Exception, SystemExit) as error:
+            findings[_broken(entry)] = _unknown(entry, error)
+    return list(findings.values())
+
+
+def _broken(entry: str) -> str:
+    """Name of the check that tells of a function that failed; a dot tells it from the name of a result."""
+    return f"{PREFIX}{entry.replace(':', '.')}"
+
+
+def is_broken(name: str) -> bool:
+    """Return whether a check says that a function of the user's own has failed."""
+    return name.startswith(PREFIX) and "." in name
+
+
+def _unknown(entry: str, error: BaseException) -> CheckResult:
+    """Say how a function failed, and where in its own module."""
+    if isinstance(error, VnetError) and not isinstance(error, _NonsenseError):
+        said = str(error)
+    else:
+        said = str(error) if isinstance(error, _NonsenseError) else f"raises {_in_words(error)}"
+    outside = traceback.extract_tb(_outside(error))
+    if not outside or isinstance(error, _NonsenseError):
+        return unknown(_broken(entry), said)
+    last = [frame for frame in outside if frame.filename == outside[0].filename][-1]
+    where = "".join(traceback.format_exception(error.with_traceback(_outside(error))))
+    return unknown(_broken(entry), f"{said} ({Path(last.filename).name}:{last.lineno})", where=where)
+
+
+def _outside(error: BaseException) -> Any:
+    """The traceback from the first line that is not of this module."""
+    frames = error.__traceback__
+    while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
+        frames = frames.tb_next
+    return frames
+
+
+def _in_words(error: BaseException) -> str:
+    return printable(" ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":"), 300)
+
+
+def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
+    check = load_checks(program.model_copy(update={"checks": (entry,)}))[entry]
+    answer = check(run)
+    if isinstance(answer, tuple) and answer and isinstance(answer[0], str):
+        answer = [answer]
+    if not isinstance(answer, Iterable) or isinstance(answer, (str, bytes, Mapping)):
+        raise _NonsenseError(f"answers {shown(answer)}: results are needed, as (name, verdict, text)")
+    count = 0
+    for count, result in enumerate(islice(answer, MOST_RESULTS + 1), start=1):
+        if count > MOST_RESULTS:
+            raise _NonsenseError(f"yields more than {MOST_RESULTS} results")
+        yield _finding(result)
+    if not count:
+        raise _NonsenseError("yields no result")
+
+
+def _finding(answer: Any) -> Finding:
+    """Return a result as a finding. Raises _NonsenseError."""
+    if not isinstance(answer, (tuple, list)) or not 3 <= len(answer) <= 4:
+        raise _NonsenseError(f"yields {shown(answer)}: a result is (name, verdict, text) or has figures besides")
+    result = Result(*answer)
+    if not isinstance(result.name, str) or not _NAME.fullmatch(result.name):
+        raise _NonsenseError(f"yields the name {shown(result.name)}: letters, digits and _, at most 64")
+    if not isinstance(result.verdict, str) or result.verdict not in VERDICTS:
+        raise _NonsenseError(
+            f"{result.name}: yields verdict = {shown(result.verdict)}: must be one of {', '.join(VERDICTS)}"
+        )
+    if not isinstance(result.text, str):
+        raise _NonsenseError(f"{result.name}: yields text = {shown(result.text)}: must be a text")
+    name, text = PREFIX + result.name, printable(result.text, LONGEST_TEXT)
+    if result.verdict == NOT_APPLICABLE:
+        return NotExercised(name, text or "says no reason")
+    return CheckResult(name, Verdict(result.verdict), text, _figures(result))
+
+
+def _figures(result: Result) -> dict[str, Any]:
+    """Return the figures as JSON holds them. Raises _NonsenseError."""
+    if not isinstance(result.figures, Mapping):
+        raise _NonsenseError(f"{result.name}: yields figures = {shown(result.figures)}: a table is needed")
+    figures = {
+        str(name): _plain(f"{result.name}: figures[{name!r}]", each) for name, each in result.figures.items()
+    }
+    if (size := len(json.dumps(figures))) > LARGEST_FIGURES_BYTES:
+        raise _NonsenseError(f"{result.name}: yields {size:,} bytes of figures: {LARGEST_FIGURES_BYTES:,} at most")
+    if isinstance(rows := figures.get("rows"), list):
+        if not all(isinstance(row, dict) for row in rows):
+            raise _NonsenseError(
+                f"{result.name}: figures['rows'] holds what is no table: a list of tables is needed"
+            )
+        figures["rows"] = rows[:MOST_ROWS]
+    return figures
+
+
+def _plain(what: str, value: Any) -> Any:
+    """Return a figure as numbers, booleans, texts, None, and lists and tables of these. Raises _NonsenseError."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(name): _plain(f"{what}[{name!r}]", each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(what, each) for each in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        raise _NonsenseError(f"{what} = {value}: must be finite, or None")
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise _NonsenseError(f"{what} = {shown(value)}: must be a number, a boolean, a text, None, or a list or table")
+
+
+def recorded_findings(record: Record) -> list[Finding]:
+    """Return the findings of own checks that a folder's verdict holds."""
+    findings: list[Finding] = [*record.checks, *record.not_exercised]
+    return [finding for finding in findings if finding.name.startswith(PREFIX)]
