@@ -51,7 +51,8 @@ class Page:
             "json": self._json,
             "yaml": self._yaml,
         }
-        (folder / "scenarios").symlink_to(ROOT / "scenarios")
+        for name in ("scenarios", "docs"):
+            (folder / name).symlink_to(ROOT / name)
 
     def follow(self, text: str, name: str) -> None:
         """Follow all blocks of the page, which is called `name`."""
@@ -121,7 +122,7 @@ class Page:
             if text is not None:
                 printed.append(text)
                 for word in words:
-                    self._programs.pop(f"{word.partition(':')[0]}.py", None)
+                    self._programs.pop(f"{word.partition(':')[0].removesuffix('.py')}.py", None)
                     self._tests.pop(word, None)
         return "".join(printed) if printed else None
 
