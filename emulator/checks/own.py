@@ -46,7 +46,7 @@ class Result(NamedTuple):
     verdict: str
     """Verdict: "valid", "invalid", "unknown" or "not applicable"."""
     text: str
-    """What was seen, in one line; of a check that is not applicable the reason."""
+    """Text in one line: the observation, or the reason of a check that is not applicable."""
     figures: Mapping[str, Any] = {}
     """Figures by name: finite numbers, booleans, texts, None, and lists and tables of these. `rows`, a list of
     tables, are the offending rows, of which the first ten are shown."""
