@@ -22,7 +22,7 @@ from contextlib import ExitStack
 
 import zenoh
 
-from vnet.errors import ProgramError, TransportError, VnetError
+from vnet.errors import ProgramError, TransportError, VnetError, WireError
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.programs import Programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
@@ -65,6 +65,7 @@ def run_agent(
         set_time_slice(PROMPT_SLICE_NS)  # Zenoh's threads keep it
         session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
         attachment = _Attachment(session, run, nodes, stack)
+        stack.callback(attachment.write_total)
         set_time_slice(COMPUTING_SLICE_NS)
         welcomes = attachment.join(join_timeout_s)
         try:
@@ -91,6 +92,7 @@ class _Attachment:
         self.on_message: Callable[[bytes], None] = _no_wake
         self.orphan_timeout_s = 5.0
         self._patience_until = 0.0
+        self._malformed = 0
         self._host = socket.gethostname()
         self._main_thread = threading.main_thread().ident
         self._publishers = {
@@ -200,7 +202,15 @@ class _Attachment:
         """A queued item as a message for this process; raises _RunOverError and TransportError when told to go."""
         if not isinstance(item, tuple):
             return None
-        message = wire.decode_rx(item[0])
+        try:
+            message = wire.decode_rx(item[0])
+        except WireError as error:
+            self._malformed += 1
+            if self._malformed == 1:
+                print(
+                    f"vnet-agent: {self.nodes[0]}: a message of the emulator is dropped: {error}", file=sys.stderr
+                )
+            return None
         if isinstance(message, wire.Await):
             self._patience_until = time.monotonic() + message.within_s
             return None
@@ -209,6 +219,11 @@ class _Attachment:
                 raise TransportError(f"refused: {message.reason}")
             raise _RunOverError(message.reason)
         return message
+
+    def write_total(self) -> None:
+        """Log how many messages were dropped because they did not decode, if any."""
+        if self._malformed:
+            print(f"vnet-agent: {self.nodes[0]}: malformed messages dropped: {self._malformed}", file=sys.stderr)
 
     @property
     def patience_s(self) -> float:

@@ -44,7 +44,7 @@ def conformance(
     with one_line_errors():
         loaded = Scenario() if scenario is None else load_scenario(scenario)
         found = Conformance(command, loaded, scene or list(SCENES), listen, patience).play(_announce)
-        for line in found.lines():
+        for line in found.lines(unreached=not scene):
             print(line)
         print(f"{counted(len(found.made), 'check')}: {len(found.failed)} wrong")
         raise typer.Exit(SOMETHING_WRONG if found.failed else 0)

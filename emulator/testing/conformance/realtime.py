@@ -6,7 +6,7 @@ import time
 
 from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
-from emulator.testing.conformance.lockstep import PACKET_AFTER_NS, survives
+from emulator.testing.conformance.lockstep import PACKET_AFTER_NS, say_malformed
 from emulator.testing.conformance.scene import Scene
 from vnet.transport import wire
 from vnet.units import NS_PER_S
@@ -17,6 +17,8 @@ GAP = (4, 5)
 """Batches that are not sent."""
 HELD = 8
 """The batch with packets that waited for a paused process."""
+LATE = 10
+"""The batch that comes as late, without a reason: lateness shows it."""
 ELSEWHERE = "the boot of another machine"
 RESTARTED_NS = 2_345_000_000
 
@@ -34,6 +36,7 @@ class Clock:
         self._missed: list[tuple[int, int]] = []
         self._timed = 0
         self._lateness: list[int] = []
+        self._late_ns = 0
         self._next_fix = -(-start_ns // scene.world.period_ns)
         self._origin_ns = 0
         self.final = False
@@ -55,15 +58,18 @@ class Clock:
         scene, period_ns = self.scene, self.scene.world.period_ns
         while (due_ns := self._next_fix * period_ns) < until_ns:
             self.listen_until(due_ns)
-            self.send(due_ns, special and self._seq in GAP, special and self._seq == HELD)
+            self.send(due_ns, special)
             self._next_fix += 1
         self.listen_until(until_ns)
         scene.check_stays()
 
-    def send(self, due_ns: int, skipped: bool, held: bool) -> None:
+    def send(self, due_ns: int, special: bool) -> None:
         """Send, or lose, the batch of an instant."""
         scene = self.scene
-        received_ns = due_ns - scene.world.period_ns + PACKET_AFTER_NS if held else due_ns
+        skipped, held, late = (special and self._seq in seqs for seqs in (GAP, (HELD,), (LATE,)))
+        received_ns = due_ns - scene.world.period_ns + PACKET_AFTER_NS if held or late else due_ns
+        if late:
+            self._late_ns = due_ns - received_ns
         packets = [scene.packet(self._seq, received_ns - 1_000_000, received_ns)] if received_ns > 0 else []
         if not skipped:
             scene.bench.say(wire.Batch([scene.fix(self._next_fix)], self._seq, packets, held=held))
@@ -127,6 +133,9 @@ class Clock:
             self.scene.findings.fail("acknowledges", came)
         elif self._missed:
             self.scene.findings.fail("missed", f"nothing of {list(map(list, self._missed))}")
+        if self._late_ns and not sum(self._lateness[wire.lateness_bin(self._late_ns) :]):
+            late_ms = self._late_ns / 1e6
+            self.scene.findings.fail("lateness", f"no packet {late_ms:g} ms late or more, where one was")
 
     def end(self) -> None:
         """The run is over: a final message, then exit status 0."""
@@ -177,9 +186,9 @@ def malformed(scene: Scene) -> None:
     clock = Clock(scene)
     clock.start()
     clock.run(NS_PER_S // 4)
-    if survives(scene):
-        clock.check_acknowledged()
-        clock.end()
+    say_malformed(scene)
+    clock.check_acknowledged()
+    clock.end()
 
 
 def lost(scene: Scene) -> None:

@@ -203,6 +203,25 @@ class TakesGarbageForTheEnd(Agent):
         super().on_rx(sample)
 
 
+class StumblesOverGarbage(Agent):
+    def on_rx(self, sample: Any) -> None:
+        try:
+            msgpack.unpackb(sample.payload.to_bytes())
+        except ValueError:
+            os._exit(1)
+        super().on_rx(sample)
+
+
+class NeverLate(Alters):
+    """Counts each packet as if it had been on time."""
+
+    def alter(self, fields: list[Any]) -> list[Any]:
+        if fields[0] == "Frames":
+            counts = fields[6][0]
+            fields[6] = [[sum(counts), *[0] * (len(counts) - 1)]]
+        return fields
+
+
 class CountsFramesWrongly(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
         return [*fields[:2], 7, *fields[3:]] if fields[0] == "Frames" else fields

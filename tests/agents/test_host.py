@@ -1,0 +1,43 @@
+"""An agent's attachment: what comes from the emulator is taken as it is meant, and anything else is dropped."""
+
+from contextlib import ExitStack, nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from agents.host import _Attachment
+from vnet.transport import wire
+
+
+def attachment() -> _Attachment:
+    """The attachment of v01, to a session that does nothing."""
+    declare = SimpleNamespace(
+        declare_token=lambda *a: nullcontext(), declare_subscriber=lambda *a, **k: nullcontext()
+    )
+    session: Any = SimpleNamespace(
+        declare_publisher=lambda *a, **k: nullcontext(),
+        declare_subscriber=declare.declare_subscriber,
+        liveliness=lambda: declare,
+    )
+    return _Attachment(session, "run", ["v01"], ExitStack())
+
+
+@pytest.mark.parametrize("data", [b"\xc1", b"", b"\x93\xa5Grant\xa1x", b"\x91\xa9Nonsense1", b"\x81\x01\x02"])
+def test_malformed_messages_are_dropped_counted_and_logged_once(
+    data: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    attached = attachment()
+    grant = wire.Grant(0, 7, [], [], [])
+    for message in (data, data, wire.encode(grant)):
+        attached.inbox.put((message, 0))
+    assert attached.next_message() == grant
+    (first,) = capsys.readouterr().err.splitlines()
+    assert first.startswith("vnet-agent: v01: a message of the emulator is dropped: ")
+    attached.write_total()
+    assert capsys.readouterr().err == "vnet-agent: v01: malformed messages dropped: 2\n"
+
+
+def test_where_nothing_was_dropped_nothing_is_said_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    attachment().write_total()
+    assert capsys.readouterr().err == ""
