@@ -11,7 +11,7 @@ COVERAGE := --cov --cov-report=
 # What `make test-all` tests with, each in a virtual environment of its own, if it is installed.
 PYTHONS ?= 3.11 3.12 3.13
 
-.PHONY: demo test test-all quick lint docs bench soak fuzz setup clean
+.PHONY: demo test test-all quick lint docs site bench soak fuzz setup clean
 
 setup: $(READY)
 
@@ -63,6 +63,10 @@ lint: $(READY)
 docs: $(READY)
 	$(BIN)/python -m docs.generate
 
+site: $(READY)
+	$(BIN)/sphinx-build -q -W -c docs/site . site
+	@echo "open site/index.html"
+
 bench: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m benchmarks
@@ -75,4 +79,4 @@ soak: $(READY)
 	$(BIN)/python -m benchmarks.soak
 
 clean:
-	rm -rf .venv .venv-* build *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-* build site *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -18,7 +18,8 @@ INTRODUCTION = """
 A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is
 refused. `--set SECTION.KEY=VALUE` changes one key at the command line, and each run writes all of them, defaults
 included, into its own `scenario.toml`, with [`[inputs]` and `[code]`](files.md#scenariotoml) besides: digests of
-the files that it read and of its code, so that a change is noticed. [scenarios/](../../scenarios) has examples.
+the files that it read and of its code, so that a change is noticed. [scenarios/](../../scenarios/twelve.toml) has
+examples.
 """
 OPTIONS = """
 What `agents.cooperative:main` and `agents.centralized:main` take; [estimator.md](../estimator.md) explains what
