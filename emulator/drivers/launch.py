@@ -1,9 +1,9 @@
 """Starting agent processes, watching them, and ending every one of them.
 
 Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
-fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents stay in the emulator's
-session: Linux shares processors out between sessions first (autogroups, sched(7), where no CPU cgroup does),
-whatever their niceness.
+fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents are forked from a
+zygote, or are interpreters of their own. They stay in the emulator's session: Linux shares processors out between
+sessions first (autogroups, sched(7), where no CPU cgroup does), whatever their niceness.
 """
 
 from __future__ import annotations
@@ -14,25 +14,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
 from vnet.errors import VnetError
+from vnet.runtime import forking
 from vnet.runtime.environment import ONE_BLAS_THREAD
 from vnet.transport.access import Access, node_user
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import default_time_slice
-from vnet.transport.session import AGENT_RUNTIME
 
 LOG_TAIL_LINES = 12
 LOWEST_PRIORITY = 19
-
-AGENT_ENVIRONMENT = {
-    "PYTHONHASHSEED": "0",
-    "ZENOH_RUNTIME": AGENT_RUNTIME,
-    "PYTHONUNBUFFERED": "1",
-}
+MOST_ZYGOTES = 3
+"""Attempts to fork an agent: a zygote that has ended is started again."""
 
 
 @dataclass(frozen=True)
@@ -56,30 +53,88 @@ class Exit:
 class Launcher:
     """The processes that a run has started, which log to `logs`.
 
-    `stop` ends all that are left, whatever happened before.
+    `stop` ends all that are left, whatever happened before. Agents are forked from the `zygote`, if there is one.
     """
 
-    def __init__(self, logs: Path, folders: Sequence[Path] = ()) -> None:
+    def __init__(self, logs: Path, folders: Sequence[Path] = (), zygote: Zygote | None = None) -> None:
         """Processes with logs in `logs`; agents look for their programs in `folders` too."""
         self.logs = logs
         self._folders = folders
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._zygote = zygote
+        self._processes: dict[str, Process] = {}
         self._services: set[str] = set()
 
-    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
-        """Start the process of `nodes`; its name is the id of the first.
+    def prepare(self) -> None:
+        """Make ready for starting agents, in the background. Raises VnetError."""
+        if self._zygote is not None:
+            self._zygote.start()
 
-        `nice` lowers its priority, so that on a full machine the emulator, which all wait for, comes first.
+    def is_prepared(self) -> bool:
+        """Return whether agents can be started without waiting. Raises VnetError if they never can."""
+        return self._zygote is None or self._zygote.is_ready()
+
+    def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
+        """Start the processes of these groups of nodes; the name of each is the id of its first node.
+
+        `nice` lowers their priority, so that on a full machine the emulator, which all wait for, comes first.
         """
-        arguments = ["-P", "-m", "agents.cli", "--connect", endpoint, "--run", access.run]
+        agents = {nodes[0]: self._agent_arguments(endpoint, access.run, nodes) for nodes in groups}
+        if self._zygote is not None:
+            for names in forking.split(agents):
+                self._fork_agents(self._zygote, access, {name: agents[name] for name in names}, nice)
+            return
+        for name, arguments in agents.items():
+            command = ["-P", "-m", "agents.cli", *arguments]
+            self.start(name, command, access.credentials(node_user(name)), AGENT_ENVIRONMENT)
+            self._lower_priority(name, nice)
+
+    def _agent_arguments(self, endpoint: str, run: str, nodes: Sequence[str]) -> list[str]:
+        """Return the arguments of `vnet-agent`, but for its credentials."""
+        arguments = ["--connect", endpoint, "--run", run]
         for node in nodes:
             arguments += ["--node", node]
         for folder in self._folders:
             arguments += ["--path", str(folder)]
-        self.start(nodes[0], arguments, access.credentials(node_user(nodes[0])), AGENT_ENVIRONMENT)
+        return arguments
+
+    def _fork_agents(self, zygote: Zygote, access: Access, agents: Mapping[str, list[str]], nice: int) -> None:
+        """Fork agents (arguments by name), and give each its credentials once its process is known.
+
+        An agent that never gets its credentials ends; so none is there twice if a zygote ends meanwhile.
+        """
+        request = forking.ForkRequest(list(agents.values()))
+        names = list(agents)
+        for _ in range(MOST_ZYGOTES):
+            with ExitStack() as stack:
+                ends = [self._open_ends(name, stack) for name in names]
+                try:
+                    reply = zygote.fork(request, [end for read_end, _, log in ends for end in (read_end, log)])
+                except ZygoteGoneError:
+                    zygote.start()
+                    continue
+                for name, pid, (_, write_end, _) in zip(names, reply.pids, ends, strict=False):
+                    self._processes[name] = ForkedProcess(pid)
+                    self._lower_priority(name, nice)
+                    os.write(write_end, access.credentials(node_user(name)).dumps().encode())
+            if reply.failure:
+                raise _cannot_start(names[len(reply.pids)], reply.failure)
+            return
+        raise _cannot_start(names[0], f"{MOST_ZYGOTES} zygotes in a row have ended")
+
+    def _open_ends(self, name: str, stack: ExitStack) -> tuple[int, int, int]:
+        """Open a pipe for the credentials of an agent (both ends) and its log; `stack` closes them."""
+        try:
+            read_end, write_end = os.pipe()
+            stack.callback(os.close, read_end)
+            stack.callback(os.close, write_end)
+            return read_end, write_end, stack.enter_context((self.logs / f"{name}.log").open("ab")).fileno()
+        except OSError as error:
+            raise _cannot_start(name, error.strerror) from None
+
+    def _lower_priority(self, name: str, nice: int) -> None:
         if nice:
             nice = min(os.getpriority(os.PRIO_PROCESS, 0) + nice, LOWEST_PRIORITY)
-            os.setpriority(os.PRIO_PROCESS, self._processes[nodes[0]].pid, nice)
+            os.setpriority(os.PRIO_PROCESS, self._processes[name].pid, nice)
 
     def start(
         self,
@@ -113,7 +168,7 @@ class Launcher:
                     env={**ONE_BLAS_THREAD, **os.environ, **environment},
                 )
         except OSError as error:
-            raise VnetError(f"cannot start the process of {name}: {error.strerror}") from None
+            raise _cannot_start(name, error.strerror) from None
         finally:
             os.close(read_end)
 
@@ -124,6 +179,8 @@ class Launcher:
 
     def ended(self) -> dict[str, Exit]:
         """The processes that have ended since the last call; they are forgotten."""
+        if self._zygote is not None:
+            self._zygote.start_if_gone()
         done = {}
         for name, process in list(self._processes.items()):
             status = process.poll()
@@ -195,6 +252,8 @@ class Launcher:
         for process in self._processes.values():
             process.wait()
         self._processes.clear()
+        if self._zygote is not None:
+            self._zygote.close()
 
     def _wait(self, timeout_s: float, but: Set[str] = frozenset()) -> None:
         """Wait until all but these have ended."""
@@ -206,3 +265,7 @@ class Launcher:
             if self._processes.keys() <= but:
                 return
             time.sleep(0.01)
+
+
+def _cannot_start(name: str, reason: str | None) -> VnetError:
+    return VnetError(f"cannot start the process of {name}: {reason}")

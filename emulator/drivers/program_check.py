@@ -12,7 +12,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from emulator.drivers.launch import AGENT_ENVIRONMENT, Exit
+from emulator.drivers.launch import Exit
+from emulator.drivers.zygote import AGENT_ENVIRONMENT
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError

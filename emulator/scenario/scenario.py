@@ -1,7 +1,6 @@
 """The scenario file: what a run is made of, read from TOML, checked by pydantic.
 
-One frozen model a section. Whatever is wrong with a file or an override becomes one `ScenarioError` of one
-line that names the file, the key, the value and what is allowed.
+One frozen model a section. What is wrong becomes a `ScenarioError` of one line: file, key, value, what is allowed.
 """
 
 from __future__ import annotations
@@ -56,6 +55,8 @@ class Run(Section):
     """`lockstep` is virtual time, `realtime` the wall clock."""
     nodes_per_process: int = Field(1, ge=1, le=1000)
     """Vehicles that share an agent process; they start, pause and die together."""
+    start: Literal["fork", "spawn"] = "spawn"
+    """Agent processes: `fork` them from one that has imported what they need (on Linux) or `spawn` interpreters."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
     """Time for agents to join, or to come back after a fault (wall clock)."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)

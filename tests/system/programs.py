@@ -1,10 +1,16 @@
 """Vehicle programs that behave and misbehave, for whole runs: entries are `tests.system.programs:NAME`."""
 
 import asyncio
+import json
 import os
+import random
 import signal
+import sys
 import time
 import zlib
+from pathlib import Path
+
+import numpy as np
 
 from vnet import Node
 
@@ -120,3 +126,22 @@ async def answering(node: Node) -> None:
     async for fix in node.gnss:
         await node.radio.broadcast(fix.time_ns.to_bytes(6, "big") + bytes(294))
     await answers
+
+
+async def describes_process(node: Node) -> None:
+    """Prints what a program sees of its process, and random numbers that nobody has seeded."""
+    seen = {
+        "arguments": sys.argv[:-1],  # but for the number of a descriptor
+        "main": Path(str(sys.modules["__main__"].__file__)).name,
+        "environment": {name: value for name, value in os.environ.items() if name != "COLUMNS"},
+        "folder": str(Path.cwd()),
+        "path": sys.path,
+        "flags": list(sys.flags),
+        "signals": {str(number): str(signal.getsignal(number)) for number in signal.valid_signals()},
+        "standard input": str(Path("/proc/self/fd/0").readlink()),
+        "niceness": os.getpriority(os.PRIO_PROCESS, 0),
+        "own group": os.getpgrp() == os.getpid(),
+        "random": [random.random(), np.random.random()],  # noqa: NPY002  # the global generators are what is asked about
+    }
+    print(json.dumps(seen))
+    await node.radio.broadcast(b"x")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Sequence
 
@@ -20,6 +21,10 @@ from vnet.transport.access import OBSERVER
 RECORDER = "recorder"
 RECORDER_POLL_S = 0.05
 """Seconds between two looks whether the recorder listens: nothing tells of it."""
+LAUNCHER_POLL_S = 0.005
+"""Seconds between two looks whether agents can be started."""
+STARTED_AT_ONCE = 20
+"""Processes that are started before messages are taken again."""
 
 
 class Joining:
@@ -71,7 +76,7 @@ class Joining:
         """
         timeout_s = self._emulation.scenario.run.join_timeout_s
         deadline = time.monotonic() + timeout_s
-        self._start_processes(on_state)
+        await self._start_processes(on_state)
         missing: list[str] = []
         while self._members.missing or not self._recorder_listens():
             if missing != self._members.missing:
@@ -86,7 +91,7 @@ class Joining:
         on_missing([])
         return self._members.processes()
 
-    def _start_processes(self, on_state: Callable[[str], None]) -> None:
+    async def _start_processes(self, on_state: Callable[[str], None]) -> None:
         node_ids = self._emulation.world.node_ids
         endpoint = self._attachment.endpoint
         groups = split_into_processes(node_ids, self._emulation.scenario.run.nodes_per_process)
@@ -95,8 +100,11 @@ class Joining:
             self._start_recorder(endpoint, self._options.record.inside(self._emulation.folder.path))
         if self._options.launch:
             on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
-            for nodes in groups:
-                self._supervisor.launch(nodes)
+            while not self._launcher.is_prepared():
+                await asyncio.sleep(LAUNCHER_POLL_S)
+            for first in range(0, len(groups), STARTED_AT_ONCE):
+                self._supervisor.launch(groups[first : first + STARTED_AT_ONCE])
+                await asyncio.sleep(0)  # those that have joined meanwhile are welcomed
         else:
             on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
 

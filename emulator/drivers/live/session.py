@@ -10,6 +10,7 @@ import asyncio
 import gc
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -33,6 +34,8 @@ from emulator.drivers.live.waiting import ChangeSignal, Stalled
 from emulator.drivers.memory import MemoryWatch
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
+from emulator.drivers.zygote import Zygote
+from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.transport import wire
@@ -65,12 +68,14 @@ async def run_live(
     the run's folder.
     """
     with ExitStack() as stack:
-        launcher = Launcher(emulation.folder.logs, emulation.scenario.program.folders)
+        zygote = _zygote(emulation.scenario) if options.launch else None
+        launcher = Launcher(emulation.folder.logs, emulation.scenario.program.folders, zygote)
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
             set_time_slice(PROMPT_SLICE_NS)
             stack.callback(set_time_slice, DEFAULT_SLICE)
         async with cancelled_by_signals():
+            launcher.prepare()
             if options.router is not None:
                 options.router.start(launcher)
             session = LiveSession(emulation, options, launcher, before_horizon)
@@ -81,6 +86,13 @@ async def run_live(
                 control_endpoint(emulation.folder.path, session.endpoint, options.access, options.record)
             )
             return await session.run(on_state, on_missing)
+
+
+def _zygote(scenario: Scenario) -> Zygote | None:
+    """The process from which agents are forked, if they are to be, and this system can."""
+    if scenario.run.start == "spawn" or sys.platform != "linux":
+        return None
+    return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)])
 
 
 def _lease_ms(scenario: Scenario) -> int:

@@ -124,10 +124,10 @@ class Supervisor:
 
     # On the order of the run.
 
-    def launch(self, nodes: Sequence[str]) -> None:
-        """Start the process of these nodes."""
+    def launch(self, groups: Sequence[Sequence[str]]) -> None:
+        """Start a process for each of these groups of nodes."""
         nice = REALTIME_AGENT_NICE if self._realtime else 0
-        self._launcher.start_agent(self._attachment.endpoint, self._options.access, nodes, nice)
+        self._launcher.start_agents(self._attachment.endpoint, self._options.access, groups, nice)
 
     def pause(self, process_ids: Collection[str]) -> None:
         """Pause these processes and no others; one that is returning is paused when it has returned."""
@@ -169,6 +169,7 @@ class Supervisor:
 
     def begin_again(self, process_ids: Iterable[str]) -> None:
         """Start processes that are away; `take_returned` tells when they are ready."""
+        groups = []
         for process_id in process_ids:
             self._change(process_id, ProcessState.RETURNING)
             nodes = self._members.nodes_with(process_id)
@@ -177,8 +178,9 @@ class Supervisor:
                     continue
             else:
                 self._members.expect(nodes)
-            if self._options.launch:
-                self.launch(nodes)
+            groups.append(nodes)
+        if self._options.launch:
+            self.launch(groups)
 
     def returning_nodes(self, process_ids: Iterable[str]) -> list[str]:
         """The nodes of these processes that are not ready yet, and still may be."""

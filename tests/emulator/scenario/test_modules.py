@@ -207,6 +207,6 @@ def test_agents_of_a_live_run_are_told_the_folders(tmp_path: Path, monkeypatch: 
     started: list[Any] = []
     launcher = Launcher(tmp_path, [tmp_path / "a b", tmp_path])
     monkeypatch.setattr(launcher, "start", lambda *arguments: started.append(arguments))
-    launcher.start_agent("tcp/127.0.0.1:1", Access.create("run", [["v01"]]), ["v01"])
+    launcher.start_agents("tcp/127.0.0.1:1", Access.create("run", [["v01"]]), [["v01"]])
     (arguments,) = [words for _, words, *_ in started]
     assert arguments[-4:] == ["--path", str(tmp_path / "a b"), "--path", str(tmp_path)]

@@ -50,10 +50,11 @@ class FakeLauncher:
         self.done: list[tuple[str, ...]] = []
         self._next_pid = 100
 
-    def start_agent(self, endpoint: str, access: Access, nodes: Sequence[str], nice: int = 0) -> None:
-        self._next_pid += 1
-        self.pids[nodes[0]] = self._next_pid
-        self.done.append(("start", *nodes))
+    def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
+        for nodes in groups:
+            self._next_pid += 1
+            self.pids[nodes[0]] = self._next_pid
+            self.done.append(("start", *nodes))
 
     def start(self, name: str, *_: Any, **__: Any) -> None:
         self.done.append(("start", name))
@@ -160,7 +161,7 @@ class Stage:
         for nodes in self.processes:
             if nodes[0] not in self.members.later:
                 if self.options.launch:
-                    self.supervisor.launch(nodes)
+                    self.supervisor.launch([nodes])
                 self.hello(nodes[0], nonce)
         self.launcher.done.clear()
         self.members.closed = True

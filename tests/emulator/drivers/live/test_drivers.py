@@ -111,14 +111,14 @@ def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch
             return yields(node, message, b"2" if node == "v02" and returning else b"1")
 
         play = Play(LockstepDriver, answer, faults=[fault("kill", 0.15, 0.2, "v02")])
-        start = play.stage.launcher.start_agent
+        start = play.stage.launcher.start_agents
 
         def start_and_join(*arguments: Any, **more: Any) -> None:
             start(*arguments, **more)
             returning.append("v02")
             play.stage.members.hello("v02", hello("v02", nonce=b"2"))
 
-        play.stage.launcher.start_agent = start_and_join  # type: ignore[method-assign]
+        play.stage.launcher.start_agents = start_and_join  # type: ignore[method-assign]
         await play.driver.run()
         times = [(grant.seq, grant.time_ns // MS) for node, grant in play.sent(wire.Grant) if node == "v02"]
         assert times == [(0, 0), (1, 100), (0, 350), (1, 450), (2, 550)]
