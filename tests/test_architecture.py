@@ -227,11 +227,19 @@ def test_an_agent_imports_nothing_heavy(modules: str) -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_a_run_on_the_disc_radio_imports_no_scipy_before_it_is_judged() -> None:
-    """scipy is slow to import, and most of it serves maps, fading and tests of significance."""
-    code = "import sys, emulator.cli.runs; print('scipy' in sys.modules)"
+@pytest.mark.parametrize(
+    ("module", "slow_to_import"),
+    [
+        ("emulator.cli.runs", ["pyarrow", "zenoh", "scipy", "matplotlib", "jinja2", "rerun", "asyncio"]),
+        ("emulator.cli.execution", ["scipy", "matplotlib", "jinja2", "rerun"]),
+    ],
+    ids=["until a run is announced", "until it is judged"],
+)
+def test_a_run_on_the_disc_radio_imports_little(module: str, slow_to_import: list[str]) -> None:
+    """scipy, for one, serves maps, fading and tests of significance."""
+    code = f"import sys, {module}; print([m for m in {slow_to_import} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    assert done.stdout.strip() == "[]"
 
 
 def test_every_file_opens_with_what_it_is_for() -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.options import ScenarioArgument, SetOption, load
+from emulator.cli.options import DEFAULT_LISTEN, ScenarioArgument, SetOption, load
 from emulator.drivers.join import split_into_processes
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
@@ -17,9 +17,6 @@ from emulator.world.world import World, build_world
 from vnet.errors import TransportError
 from vnet.transport.access import Access, is_tls
 from vnet.transport.certificates import certifier
-
-DEFAULT_ADDRESS = "127.0.0.1:7447"
-DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 
 TlsNameOption = Annotated[
     list[str] | None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -14,12 +15,31 @@ from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat
 from vnet.errors import ScenarioError, printable
 
+DEFAULT_ADDRESS = "127.0.0.1:7447"
+DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
+LATEST = Path("runs/latest")
+
 
 class Pacing(StrEnum):
     """The pacings of a run."""
 
     LOCKSTEP = "lockstep"
     REALTIME = "realtime"
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Output that was asked for beside the run itself."""
+
+    log_format: LogFormat
+    quiet: bool
+    check_determinism: bool = False
+    report: bool = True
+
+    @property
+    def only_the_result(self) -> bool:
+        """True if standard output is for the result alone, and not for what programs print."""
+        return self.quiet or self.log_format is LogFormat.JSON
 
 
 ScenarioArgument = Annotated[
@@ -74,6 +94,19 @@ LogFormatOption = Annotated[
     LogFormat, typer.Option(help="json: an object a line on stderr, and verdict.json in one line on stdout.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only errors, and the verdict in one line.")]
+ReportOption = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
+]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
+RerunBindOption = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Where to serve; the default is 127.0.0.1, this machine only.")
+]
+RerunPortOption = Annotated[
+    int | None, typer.Option(help="Viewers connect here, browsers to the next port; by default 9876, if free.")
+]
+RerunVehicleOption = Annotated[
+    str | None, typer.Option(metavar="ID", help="The vehicle that has a tab of its own; by default the first.")
+]
 
 
 def load(

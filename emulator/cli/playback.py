@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
-from emulator.cli.viewing import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
+from emulator.cli.options import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
 from emulator.records.run_folder import RECORDING, RunFolder
 from emulator.stream.pace import play as play_scheduled
 from emulator.stream.pace import schedule

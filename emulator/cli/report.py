@@ -10,13 +10,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from emulator.cli.viewing import LATEST, RunArgument
+from emulator.cli.options import LATEST, RunArgument
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
-
-ReportOption = Annotated[
-    bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
-]
 
 
 def report(

@@ -12,7 +12,14 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.options import RerunOption
+from emulator.cli.options import (
+    LATEST,
+    RerunBindOption,
+    RerunOption,
+    RerunPortOption,
+    RerunVehicleOption,
+    RunArgument,
+)
 from emulator.drivers.control import read_control_file
 from emulator.records.run_files import check_is_run
 from emulator.records.run_folder import RECORDING
@@ -28,18 +35,6 @@ from emulator.viewer.sinks import (
 )
 from vnet.errors import VnetError
 from vnet.transport.credentials import Credentials
-
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
-RerunBindOption = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Where to serve; the default is 127.0.0.1, this machine only.")
-]
-RerunPortOption = Annotated[
-    int | None, typer.Option(help="Viewers connect here, browsers to the next port; by default 9876, if free.")
-]
-RerunVehicleOption = Annotated[
-    str | None, typer.Option(metavar="ID", help="The vehicle that has a tab of its own; by default the first.")
-]
-LATEST = Path("runs/latest")
 
 
 def view(

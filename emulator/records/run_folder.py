@@ -13,15 +13,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
+from typing import TYPE_CHECKING, Any
 
 from emulator.records.atomic import atomically, disk_errors
 from emulator.records.code_digest import code_digests
 from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
 from vnet.errors import VnetError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 RUNS = Path("runs")
 SCENARIO_FILE = "scenario.toml"
@@ -121,6 +121,8 @@ class RunFolder:
 
     def put_table(self, name: str, table: pa.Table) -> None:
         """Write a table as Parquet in one step."""
+        import pyarrow.parquet as pq  # slow to import, and a command's first line comes before any table
+
         self.put(name, lambda path: pq.write_table(table, path, compression="zstd"))
 
     def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:

@@ -6,7 +6,7 @@ import io
 import json
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from itertools import pairwise
 
@@ -40,6 +40,12 @@ def tell(message: str, log_format: LogFormat = LogFormat.TEXT) -> None:
         print(json.dumps({"kind": "note", "message": message}), file=sys.stderr)
     else:
         print(f"vnet: note: {message}", file=sys.stderr)
+
+
+def say_first(line: str) -> None:
+    """Print a first line on stderr at once, whatever becomes of stderr."""
+    with suppress(OSError, ValueError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def _say(message: str, log_format: LogFormat) -> None:
