@@ -10,12 +10,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from emulator.api import run, simulate
     from emulator.checks.own import Result
-    from emulator.records.run import Run
+    from emulator.report.notebook import Run
 
-__all__ = ["Result", "Run"]
+__all__ = ["Result", "Run", "run", "simulate"]
 
-_PUBLIC = {"Result": "emulator.checks.own", "Run": "emulator.records.run"}
+_PUBLIC = {
+    "Result": "emulator.checks.own",
+    "Run": "emulator.report.notebook",
+    "run": "emulator.api",
+    "simulate": "emulator.api",
+}
 """Modules of the public names."""
 
 

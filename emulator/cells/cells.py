@@ -24,6 +24,7 @@ import pyarrow.parquet as pq
 
 from emulator.cells.executors import each_done, progress_bar
 from emulator.cells.measure import judged_figures, measure
+from emulator.cells.worker import modules_of
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
@@ -31,7 +32,7 @@ from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.simulate import simulate
 from emulator.records.atomic import atomically, disk_errors, write_atomically
-from emulator.records.code_digest import digests_of, entries_of
+from emulator.records.code_digest import digests_of
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.world.world import build_world
@@ -60,7 +61,7 @@ class Cell:
     @property
     def digest(self) -> str:
         """Names the cell's files: everything that its result depends on."""
-        code = _code_digests(entries_of(self.scenario), self.scenario.program.folders)
+        code = _code_digests(modules_of(self.scenario), self.scenario.program.folders)
         text = json.dumps([FORMAT, code, self.from_s, self.is_judged, dump_scenario(self.scenario)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -12,8 +12,7 @@ from typing import Any, Protocol, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly
-from emulator.records.code_digest import entries_of
+from emulator.cells.worker import Place, Worker, WorkerDiedError, call_fitly, modules_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 
@@ -103,12 +102,13 @@ def each_done(
     own = WorkerPool(min(most or os.cpu_count() or 1, len(jobs))) if executor is None else None
     pool = executor or own
     assert pool is not None
-    places: dict[tuple[str, ...], Place] = {}
+    places: dict[object, Place] = {}
 
     def submit(job: J) -> Future[R]:
-        entries = entries_of(job.scenario)
-        place = places.setdefault(entries, places.get(entries) or Place.here(entries))
-        return pool.submit(call_fitly, place, function, job)
+        key = modules_of(job.scenario), job.scenario.program.folders
+        if key not in places:
+            places[key] = Place.here(job.scenario)
+        return pool.submit(call_fitly, places[key], function, job)
 
     waiting: dict[Future[R], tuple[J, int]] = {}
     try:
@@ -164,10 +164,8 @@ def open_executor(address: str | None) -> Iterator[Executor | None]:
     except ImportError:
         raise VnetError(f"--executor {address}: needs the extra dask: pip install 'vnet-emulator[dask]'") from None
     try:
-        client = Client(  # type: ignore[no-untyped-call]
-            f"tcp://{host}", timeout=f"{DASK_PATIENCE_S}s", set_as_default=False
-        )
+        client = Client(f"tcp://{host}", timeout=f"{DASK_PATIENCE_S}s", set_as_default=False)
     except (OSError, TimeoutError) as error:
         raise VnetError(f"--executor {address}: no Dask scheduler answers: {error}") from None
     with client:
-        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]
+        yield client.get_executor(pure=False)

@@ -25,7 +25,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, TypeVar
 
-from emulator.records.code_digest import digests_of
+from emulator.records.code_digest import digests_of, entries_of
+from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.runtime.environment import ONE_BLAS_THREAD
 
@@ -50,26 +51,33 @@ class Place:
 
     folder: str
     path: tuple[str, ...]
+    folders: tuple[Path, ...]
     entries: tuple[str, ...]
     code: tuple[tuple[str, str], ...]
     """Digests of vnet and of the programs with these entries."""
 
     @classmethod
-    def here(cls, entries: tuple[str, ...]) -> Place:
-        """Return the place of this process, for programs with these entries."""
+    def here(cls, scenario: Scenario) -> Place:
+        """Return the place of this process, for the programs and own checks of a scenario."""
+        entries, folders = modules_of(scenario), scenario.program.folders
         folder = str(Path.cwd())
         path = tuple(str(Path(entry or folder).absolute()) for entry in sys.path)
-        return cls(folder, path, entries, tuple(sorted(digests_of(entries).items())))
+        return cls(folder, path, folders, entries, tuple(sorted(digests_of(entries, folders).items())))
 
     def enter(self) -> None:
         """Make the programs importable in this process. Raises VnetError if their code, or vnet's, is another."""
         known = set(sys.path)
         sys.path += [entry for entry in dict.fromkeys((*self.path, self.folder)) if entry not in known]
-        if tuple(sorted(digests_of(self.entries).items())) != self.code:
+        if tuple(sorted(digests_of(self.entries, self.folders).items())) != self.code:
             raise VnetError(
                 f"{socket.gethostname()}: vnet, or {', '.join(self.entries)}, is not the code that was to be run: "
                 "install the same there"
             )
+
+
+def modules_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the entries of the programs and own checks of a scenario."""
+    return (*entries_of(scenario), *scenario.program.checks)
 
 
 def is_fit() -> bool:

@@ -9,8 +9,9 @@ import typer
 from rich.console import Console
 
 from emulator.checks.judge import check_run
-from emulator.cli.options import ChecksOption, from_here
+from emulator.cli.options import ChecksOption
 from emulator.records.recorded_run import RecordedRun
+from emulator.scenario.program import from_here
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.summary import print_checks
 

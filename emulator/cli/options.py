@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from emulator.scenario.program import split_file
+from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat
 from vnet.errors import ScenarioError, printable
@@ -136,11 +136,3 @@ def _program_option(option: str) -> str:
     if not equals or not key.strip():
         raise ScenarioError(f"--option {printable(option)}: write it as KEY=VALUE, for example period_s=2")
     return f"program.options.{option}"
-
-
-def from_here(entry: str) -> str:
-    """An entry of the command line; a file that is there is meant from the current folder."""
-    name, function = split_file(entry) or ("", "")
-    if not name or not Path(name).is_file():
-        return entry
-    return f"{Path(name).resolve()}:{function}" if function else str(Path(name).resolve())

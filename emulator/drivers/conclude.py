@@ -40,7 +40,7 @@ from emulator.records.run_folder import (
     RunFolder,
     write_text,
 )
-from emulator.records.verdicts import Finding, unknown
+from emulator.records.verdicts import Finding, NotExercised, unknown
 
 
 def _start_up_s(emulation: Emulation) -> float | None:
@@ -49,10 +49,13 @@ def _start_up_s(emulation: Emulation) -> float | None:
     return float(started[0].details["start_up_s"]) if started else None
 
 
-def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgement, dict[str, Any]]:
+def conclude(
+    emulation: Emulation, wall_s: float, command: str, replay: str = ""
+) -> tuple[Judgement, dict[str, Any]]:
     """Write what is kept of a run and judge it. `command` is the vnet command that ran it (run, simulate).
 
-    Returns the judgement and the contents of verdict.json. Raises VnetError if the disk is full.
+    `replay` says why no replay is warranted, if none is. Returns the judgement and the contents of verdict.json.
+    Raises VnetError if the disk is full.
     """
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
@@ -68,6 +71,10 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
     folder.put(WORLD_FILE, world.write)
     recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
     judgement = judge(recorded, _own_findings(recorded, folder))
+    reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path))}"
+    if replay:
+        judgement.put(NotExercised("replay", replay))
+        reproduce += " --program MODULE:FUNCTION"
     verdict = {
         "format": FORMAT,
         **_judged(judgement),
@@ -82,7 +89,7 @@ def conclude(emulation: Emulation, wall_s: float, command: str) -> tuple[Judgeme
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
         "reported": {name: asdict(figure) for name, figure in reported_figures(states).items()},
-        "reproduce": f"vnet {command} {shlex.quote(str(folder.scenario_path))}",
+        "reproduce": reproduce,
         "versions": {
             "vnet": version("vnet-emulator"),
             "python": platform.python_version(),

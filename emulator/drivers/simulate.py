@@ -29,14 +29,19 @@ class _RunOverError(Exception):
     """The barrier has granted nothing more."""
 
 
-def simulate(emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None = None) -> tuple[float, bool]:
+def simulate(
+    emulation: Emulation,
+    before_horizon: Callable[[Lockstep], None] | None = None,
+    stop: threading.Event | None = None,
+) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
     it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
+    Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one.
     """
-    simulation = _Simulation(emulation, before_horizon)
+    simulation = _Simulation(emulation, before_horizon, stop or threading.Event())
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
@@ -55,7 +60,7 @@ def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
     """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
 
     def ask(number: int, frame: object) -> None:
-        simulation.interrupted = True
+        simulation.stop.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     here = threading.current_thread() is threading.main_thread()
@@ -72,14 +77,16 @@ def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
 class _Simulation:
     """All nodes on one loop, and the barrier that this loop yields to."""
 
-    def __init__(self, emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None) -> None:
+    def __init__(
+        self, emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None, stop: threading.Event
+    ) -> None:
         node_ids = emulation.world.node_ids
         self._process_of = node_ids[0]
         self._emulation = emulation
         self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
         self._before_horizon = before_horizon or (lambda lockstep: None)
         self._seq = 0
-        self.interrupted = False
+        self.stop = stop
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
         welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
         search_programs_in(emulation.scenario.program.folders)
@@ -109,7 +116,7 @@ class _Simulation:
             self.loop.close()
 
     def _exchange(self, next_timer_ns: int | None) -> int:
-        if self.interrupted:
+        if self.stop.is_set():
             raise KeyboardInterrupt
         self._lockstep.receive(self._process_of, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
         grants = self._lockstep.step()

@@ -6,8 +6,9 @@ user's own get one, and so does whoever reads a run from Python.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -41,6 +42,13 @@ class Run:
         """Return the run in `folder`. Raises VnetError if it is not the folder of a finished run."""
         recorded = RecordedRun.open(Path(folder))
         return cls(recorded, Path(folder), recorded.record)
+
+    html: ClassVar[Callable[[Run], str] | None] = None
+    """Function that shows a run as HTML, set by `emulator.report`."""
+
+    def _repr_html_(self) -> str | None:
+        """Return the run as a notebook shows it."""
+        return None if Run.html is None else Run.html(self)
 
     def __repr__(self) -> str:
         verdict = "not judged yet" if self._record is None else self._record.verdict.value

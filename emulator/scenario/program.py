@@ -22,6 +22,14 @@ def split_file(entry: str) -> tuple[str, str] | None:
     return None if found is None else (found[1], found[2] or "")
 
 
+def from_here(entry: str) -> str:
+    """Return an entry of a command line or a call; a file that is there is meant from the current folder."""
+    name, function = split_file(entry) or ("", "")
+    if not name or not Path(name).is_file():
+        return entry
+    return f"{Path(name).resolve()}:{function}" if function else str(Path(name).resolve())
+
+
 def _is_entry(entry: str) -> str:
     if not _MODULE.fullmatch(entry) and split_file(entry) is None:
         raise ValueError("write it as package.module:function, or as file.py:function")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 from emulator.scenario.overrides import as_overrides
+from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
 from vnet.errors import ScenarioError, shown
 
@@ -16,16 +17,17 @@ DATA = Path("scenario")
 """The name of plain data in messages. Relative paths in it are taken from the current folder."""
 
 
-def scenario_of(source: Source, changes: Mapping[str, Any]) -> Scenario:
-    """Return the scenario of a source with `changes`, values by `section.key`; None changes nothing.
+def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str] = ()) -> Scenario:
+    """Return the scenario of a source with `changes`, values by `section.key`, and with `checks` after its own.
 
-    Raises ScenarioError that names the key, the value and what is allowed.
+    None changes nothing. Raises ScenarioError that names the key, the value and what is allowed.
     """
+    checks = [from_here(check) for check in checks]
     overrides = as_overrides({key: value for key, value in changes.items() if value is not None})
     if isinstance(source, (str, Path)):
-        return load_scenario(Path(source), overrides)
+        return load_scenario(Path(source), overrides, checks)
     if isinstance(source, Scenario):
         source = source.model_dump(mode="json", exclude_none=True)
     if not isinstance(source, Mapping):
         raise ScenarioError(f"scenario = {shown(source)}: a path, a shipped scenario's name, or a dict is needed")
-    return scenario_from(deepcopy(dict(source)), DATA, overrides)
+    return scenario_from(deepcopy(dict(source)), DATA, overrides, checks=checks)

@@ -6,8 +6,11 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from vnet.errors import ProgramError, did_you_mean
@@ -26,8 +29,23 @@ RENAMED_MODULES = {"agents.liar": "agents.cooperative.attacker"}
 """New names of modules with a program, by the old."""
 
 
+_given: ContextVar[Mapping[str, Program]] = ContextVar("vnet_given_programs", default=MappingProxyType({}))
+
+
+@contextmanager
+def given_programs(programs: Mapping[str, Program]) -> Iterator[None]:
+    """Take these functions, by entry, for programs within the block: nothing is imported for them."""
+    before = _given.set(programs)
+    try:
+        yield
+    finally:
+        _given.reset(before)
+
+
 def load_program(entry: str) -> Program:
-    """Import `package.module:function`. Raises ProgramError with the reason in one line."""
+    """Import `package.module:function`, if it is not given. Raises ProgramError with the reason in one line."""
+    if entry in (given := _given.get()):
+        return given[entry]
     module_name, _, name = entry.partition(":")
     if module_name in RENAMED_MODULES:
         raise ProgramError(f"program.entry = {entry!r}: renamed; use {RENAMED_MODULES[module_name]}:{name}")

@@ -20,12 +20,12 @@ from vnet.errors import PayloadTooLargeError, ScenarioError, VnetError
 
 pytestmark = pytest.mark.slow
 
-ENTRIES = ("agents.beacon:main",)
+SCENARIO = Scenario()
 
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Worker]:
-    one = Worker(Place.here(ENTRIES))
+    one = Worker(Place.here(SCENARIO))
     yield one
     one.close()
 
@@ -53,7 +53,7 @@ def test_a_worker_is_fit_and_does_many_jobs(worker: Worker) -> None:
 
 
 def test_code_that_is_not_the_same_is_refused() -> None:
-    place = replace(Place.here(ENTRIES), code=(("vnet", "another"),))
+    place = replace(Place.here(SCENARIO), code=(("vnet", "another"),))
     other = Worker(place)
     for _ in range(2):
         with pytest.raises(VnetError, match=r"vnet, or agents\.beacon:main, is not the code that was to be run"):
@@ -62,18 +62,18 @@ def test_code_that_is_not_the_same_is_refused() -> None:
 
 
 def test_a_worker_that_dies_or_takes_too_long_says_so() -> None:
-    one = Worker(Place.here(ENTRIES))
+    one = Worker(Place.here(SCENARIO))
     with pytest.raises(WorkerDiedError, match=r"^its process ended with status 3$"):
         one.call(os._exit, 3)
     assert not one.is_alive
-    one = Worker(Place.here(ENTRIES))
+    one = Worker(Place.here(SCENARIO))
     with pytest.raises(WorkerTimeoutError, match=r"not over within 0\.1 s"):
         one.call(time.sleep, 1000, limit_s=0.1)
     assert not one.is_alive
 
 
 def test_a_thread_keeps_its_worker_and_takes_it_along() -> None:
-    place = Place.here(ENTRIES)
+    place = Place.here(SCENARIO)
     with ThreadPoolExecutor(1) as pool:
         pids = {pool.submit(call_fitly, place, os.getpid).result() for _ in range(3)}
     assert len(pids) == 1 and os.getpid() not in pids
@@ -85,7 +85,8 @@ def test_a_worker_ends_with_its_starter_in_the_midst_of_a_job() -> None:
     code = (
         "import os, threading, time\n"
         "from emulator.cells.worker import Place, Worker\n"
-        f"worker = Worker(Place.here({ENTRIES!r}))\n"
+        "from emulator.scenario.scenario import Scenario\n"
+        "worker = Worker(Place.here(Scenario()))\n"
         "worker.call(os.getpid)\n"
         "threading.Thread(target=worker.call, args=(time.sleep, 1000), daemon=True).start()\n"
         "print(worker.pid, flush=True)\n"
@@ -135,7 +136,7 @@ def test_a_job_whose_worker_dies_is_run_again_but_not_for_ever(
 
 def test_a_pool_that_is_closed_gives_up_what_it_does() -> None:
     pool = WorkerPool(1)
-    future = pool.submit(call_fitly, Place.here(ENTRIES), time.sleep, 1000)
+    future = pool.submit(call_fitly, Place.here(SCENARIO), time.sleep, 1000)
     while not future.running():
         threading.Event().wait(0.01)
     pool.shutdown(cancel_futures=True)

@@ -1,0 +1,182 @@
+"""The public API, `import emulator`: what it offers, from a script and from a running event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import emulator
+from emulator.records.run_files import RunFiles
+from tests.support.paths import ROOT
+from vnet import Node
+from vnet.errors import ProgramError, ScenarioError, VnetError
+
+SMALL: dict[str, Any] = {
+    "run": {"name": "small", "duration_s": 0.5},
+    "network": {"kind": "generated", "vehicles": 3},
+    "program": {"entry": "agents.beacon:main"},
+}
+
+
+async def greet(node: Node) -> None:
+    """Broadcast once a period."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"hello")
+        node.report(fix.position_m, fix.covariance_m2, heard=len(node.radio.drain()))
+
+
+def not_a_program(node: Node) -> None:
+    """Do nothing, and not even that asynchronously."""
+
+
+def test_the_public_names_are_these_and_no_more() -> None:
+    assert emulator.__all__ == ["Result", "Run", "run", "simulate"]
+    for name in emulator.__all__:
+        assert inspect.getdoc(getattr(emulator, name)), name
+        assert name in dir(emulator)
+    with pytest.raises(AttributeError, match="module 'emulator' has no attribute 'simulat'"):
+        emulator.simulat  # noqa: B018
+
+
+def test_importing_the_package_imports_nothing_heavy() -> None:
+    code = "import sys, emulator; print([m for m in ('numpy', 'pydantic', 'zenoh') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.fixture
+def fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have this process count as one with hash seed 0 and one thread of linear algebra."""
+    monkeypatch.setattr("emulator.api.is_fit", lambda: True)
+
+
+@pytest.mark.usefixtures("fit")
+def test_simulate_gives_a_run_with_what_was_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = emulator.simulate(SMALL, program=greet, seed=3, duration_s=0.3, set={"radio.loss": 0.0})
+    assert run.folder == tmp_path / "runs" / "small-3"
+    assert run.verdict == "valid"
+    assert (run.scenario.run.seed, run.scenario.run.duration_s, run.scenario.radio.loss) == (3, 0.3, 0.0)
+    assert run.scenario.program.entry == "tests.emulator.test_public:greet"
+    assert len(run.metrics) == 3 and len(run.states) == 9 and len(run.trace) == 3 * 2 * 3
+    assert run.reproduce.endswith("scenario.toml")
+    assert emulator.simulate(SMALL, program=greet, seed=3, duration_s=0.3, set={"radio.loss": 0.0}).folder.name == (
+        "small-3-2"
+    )
+
+
+@pytest.mark.usefixtures("fit")
+def test_simulate_works_inside_a_running_event_loop(tmp_path: Path) -> None:
+    async def main() -> emulator.Run:
+        return emulator.simulate(SMALL, out=tmp_path / "run")
+
+    assert asyncio.run(main()).verdict == "valid"
+
+
+def test_a_function_that_no_command_can_import_runs_here_and_replay_is_not_warranted(tmp_path: Path) -> None:
+    heard: list[str] = []
+
+    async def listen(node: Node) -> None:
+        async for _ in node.gnss:
+            heard.append(node.id)
+
+    run = emulator.simulate(SMALL, program=listen, out=tmp_path / "run")
+    assert heard == ["v01", "v02", "v03"] * 5
+    (reason,) = [each.reason for each in run.not_applicable if each.name == "replay"]
+    assert reason.startswith("not warranted: the program is test_a_function")
+    assert "which no command can import, and this process has not PYTHONHASHSEED=0" in reason
+    assert run.reproduce.endswith("scenario.toml --program MODULE:FUNCTION")
+
+
+@pytest.mark.usefixtures("fit")
+def test_an_interrupted_simulation_is_written_down(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C reaches the thread that waits; the run's own thread stops between two instants."""
+    from concurrent.futures import Future
+
+    wait, interrupts = Future.result, iter([True])
+
+    def interrupted_once(future: Future[Any], timeout: float | None = None) -> Any:
+        if next(interrupts, False):
+            raise KeyboardInterrupt
+        return wait(future, timeout)
+
+    monkeypatch.setattr(Future, "result", interrupted_once)
+    with pytest.raises(KeyboardInterrupt):
+        emulator.simulate(SMALL, duration_s=600, out=tmp_path / "run")
+    assert [event.kind for event in RunFiles(tmp_path / "run").events][-2:] == ["interrupted", "ended"]
+    assert emulator.Run.open(tmp_path / "run").verdict == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: emulator.simulate("twelv"), r"^twelv: cannot be read: .*did you mean twelve"),
+        (
+            lambda: emulator.simulate(SMALL, set={"radio.los": 1}),
+            r"radio\.los: unknown key \(did you mean loss\?\)",
+        ),
+        (lambda: emulator.simulate(SMALL, program=not_a_program), r"^program = <function not_a_program .*async"),  # type: ignore[arg-type]
+        (lambda: emulator.run(SMALL, program=not_a_program), r"^program = <function not_a_program .*async"),  # type: ignore[arg-type]
+        (lambda: emulator.run(SMALL, pacing="fast"), r"run\.pacing = 'fast'"),
+        (
+            lambda: emulator.run(SMALL, program=nested()),
+            r"^program = nested\.<locals>\.main of .*: run needs processes",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_one_line(call: Any, message: str) -> None:
+    with pytest.raises(VnetError, match=message) as raised:
+        call()
+    assert isinstance(raised.value, (ScenarioError, ProgramError))
+    assert "\n" not in str(raised.value)
+
+
+def nested() -> Any:
+    """A program that nobody can import."""
+
+    async def main(node: Node) -> None: ...
+
+    return main
+
+
+@pytest.mark.usefixtures("fit")
+def test_a_notebook_shows_the_report_in_a_frame_that_cannot_reach_it(tmp_path: Path) -> None:
+    shown = emulator.simulate(SMALL, out=tmp_path / "run")._repr_html_()
+    assert shown is not None
+    frame = re.fullmatch(
+        r'<iframe title="vnet report" sandbox="allow-scripts" style="[^"]*" srcdoc="([^"]*)">.*', shown
+    )
+    assert frame and "<" not in frame[1]
+    assert "vnet run run" in html.unescape(frame[1])
+
+
+@pytest.mark.slow
+def test_a_process_that_is_not_fit_has_a_worker_run_the_program(tmp_path: Path) -> None:
+    """Whatever its hash seed: the trace is that of the command."""
+    here = emulator.simulate("beacon", duration_s=0.5, out=tmp_path / "run")
+    command = [
+        "simulate",
+        "beacon",
+        "--duration",
+        "0.5",
+        "--out",
+        str(tmp_path / "command"),
+        "--no-report",
+        "--quiet",
+    ]
+    subprocess.run(
+        [sys.executable, "-m", "emulator.cli", *command], check=True, cwd=ROOT, stdout=subprocess.DEVNULL
+    )
+    there = emulator.Run.open(tmp_path / "command")
+    assert here.trace.equals(there.trace)
+    assert [each.reason for each in here.not_applicable if each.name == "replay"] == [
+        "it ran once; --check-determinism runs it twice"
+    ]
