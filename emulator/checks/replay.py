@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.reported import value_columns
 from emulator.records.run_folder import AGAIN
 from emulator.records.verdicts import Finding, NotExercised, result
 from vnet.errors import VnetError
@@ -31,6 +32,8 @@ def compare_folders(first: Path, second: Path) -> Finding:
     ours, theirs = RecordedRun.open(first), RecordedRun.open(second)
     tables = []
     for name, mine, other in zip(TABLES, _tables(ours), _tables(theirs), strict=True):
+        if name == "states":
+            mine, other = _with_values(mine, other), _with_values(other, mine)
         if set(mine.column_names) != set(other.column_names):
             raise VnetError(f"{second}: the table of the {name} has other columns than the one of {first}")
         tables.append((name, mine, other))
@@ -40,6 +43,14 @@ def compare_folders(first: Path, second: Path) -> Finding:
 def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
     """The tables of a run, as `TABLES` calls them."""
     return run.trace, run.states, run.metrics
+
+
+def _with_values(states: pa.Table, others: pa.Table) -> pa.Table:
+    """The states, with an empty column for each value that only the other run's programs report."""
+    for name in value_columns(others.schema):
+        if name not in states.column_names:
+            states = states.append_column(name, pa.nulls(len(states), others.schema.field(name).type))
+    return states
 
 
 def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:

@@ -182,7 +182,7 @@ def _finish(
     elif asked.quiet:
         output.print(f"verdict: {judgement.verdict}  {folder}")
     else:
-        print_summary(judgement, verdict, folder, Console(), asked.report)
+        print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
     if asked.report:
         report_at_end(folder)
     raise typer.Exit(status)

@@ -35,6 +35,7 @@ class OutputOptions:
     quiet: bool
     check_determinism: bool = False
     report: bool = True
+    verbose: bool = False
 
     @property
     def only_the_result(self) -> bool:
@@ -92,6 +93,9 @@ DeterminismOption = Annotated[
 ]
 LogFormatOption = Annotated[
     LogFormat, typer.Option(help="json: an object a line on stderr, and verdict.json in one line on stdout.")
+]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", "-v", metavar="", help="List all checks, not only those that are not valid.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only errors, and the verdict in one line.")]
 ReportOption = Annotated[

@@ -32,6 +32,7 @@ from emulator.cli.options import (
     ScenarioArgument,
     SeedOption,
     SetOption,
+    VerboseOption,
     load,
 )
 from emulator.scenario.scenario import Scenario
@@ -69,9 +70,10 @@ def run(
     ] = RouterKind.EMBEDDED,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
 ) -> None:
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
-    asked = OutputOptions(log_format, quiet, check_determinism, report)
+    asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
@@ -99,10 +101,11 @@ def simulate(
     check_determinism: DeterminismOption = False,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     report: ReportOption = True,
 ) -> None:
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
-    asked = OutputOptions(log_format, quiet, check_determinism, report)
+    asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
@@ -144,10 +147,11 @@ def emulator(
     rerun_vehicle: RerunVehicleOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
+    verbose: VerboseOption = False,
     report: ReportOption = True,
 ) -> None:
     """Run a scenario for agents that are started by hand, here or on other machines."""
-    asked = OutputOptions(log_format, quiet, report=report)
+    asked = OutputOptions(log_format, quiet, report=report, verbose=verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")

@@ -19,6 +19,7 @@ from emulator.report.source import Source
 from vnet.errors import VnetError
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
+REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
 METRICS = {
     "common-error": ("Common error", "common_error_rmse_m", "RMSE of the common error (m)"),
     "deviation": ("Deviation", "deviation_m", "deviation (m)"),
@@ -45,6 +46,7 @@ def comparison_page(comparison: Comparison) -> str:
         difference_rows=table(turned(rows)) if rows else None,
         scenario=table(comparison.scenario, "keys that differ") if comparison.scenario else None,
         key_figures=table(comparison.figures, "errors are means after the first fifth of the run"),
+        reported=table(comparison.reported, REPORTED) if comparison.reported else None,
         outcomes=table(comparison.outcomes, outcomes) if comparison.outcomes else None,
         checks=table(comparison.checks),
         charts=charts,

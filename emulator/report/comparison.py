@@ -14,7 +14,8 @@ from rich.text import Text
 
 from emulator.checks.replay import compare_folders
 from emulator.pages.text import cell
-from emulator.records.key_figures import KEY_FIGURES
+from emulator.records.key_figures import KEY_FIGURES, shown_figures
+from emulator.records.reported import ReportedFigure, figure_text
 from emulator.records.run_files import check_is_run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Finding, Verdict
@@ -80,15 +81,18 @@ class Comparison:
     @cached_property
     def figures(self) -> list[Row]:
         """Key figures with B − A; lengths in metres."""
-        ours, theirs = (record.figures for record in self.records)
-        rows = [
-            _difference(f"{title} (m)", ours.get(name), theirs.get(name), ".3f")
-            for name, title in KEY_FIGURES.items()
-            if ours.get(name) is not None or theirs.get(name) is not None
-        ]
+        ours, theirs = (shown_figures(record.figures) for record in self.records)
+        titles = [title for title in KEY_FIGURES.values() if title in ours or title in theirs]
+        rows = [_difference(f"{title} (m)", ours.get(title), theirs.get(title), ".3f") for title in titles]
         times = [(record.emulated_s, record.wall_s) for record in self.records]
         rows.append(_difference("emulated time (s)", times[0][0], times[1][0], ".1f"))
         return [*rows, _difference("wall-clock time (s)", times[0][1], times[1][1], ".1f")]
+
+    @cached_property
+    def reported(self) -> list[Row]:
+        """Values that programs report: mean and 5 to 95 % of both runs, and B − A of the means."""
+        ours, theirs = (record.reported for record in self.records)
+        return [_reported(name, ours.get(name), theirs.get(name)) for name in ours | theirs]
 
     @cached_property
     def outcomes(self) -> list[Row]:
@@ -136,6 +140,25 @@ def _difference(name: str, ours: float | None, theirs: float | None, form: str) 
     return {"figure": name, A: values[0], B: values[1], "B − A": change}
 
 
+def _reported(name: str, ours: ReportedFigure | None, theirs: ReportedFigure | None) -> Row:
+    """The row of a reported value, which only one of the runs may have."""
+    row: Row = {"figure": (ours or theirs or ReportedFigure(0)).words(name)[0]}
+    for letter, figure in ((A, ours), (B, theirs)):
+        _, mean, spread, _ = ("", "–", "", "") if figure is None else figure.words(name)
+        row |= {letter: mean, f"{letter}: 5 – 95 %": spread}
+    return row | {"B − A": _change(ours, theirs)}
+
+
+def _change(ours: ReportedFigure | None, theirs: ReportedFigure | None) -> str:
+    """The difference of two means; of shares in percentage points."""
+    if ours is None or theirs is None or ours.mean is None or theirs.mean is None:
+        return ""
+    change = theirs.mean - ours.mean
+    if ours.is_share and theirs.is_share:
+        return f"{100 * change:+.1f} %"
+    return figure_text(change) if change <= 0 else f"+{figure_text(change)}"
+
+
 def print_comparison(comparison: Comparison, console: Console) -> None:
     """The whole comparison, for a terminal."""
     console.print(f"A  {comparison.first.folder}", highlight=False, soft_wrap=True)
@@ -144,10 +167,12 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
         console.print(_table("scenario, where they differ", comparison.scenario))
     else:
         console.print("scenario: the same")
-    console.print(_table("verdicts", comparison.checks, _verdict_style))
     console.print(_table("figures (errors: means after the first fifth)", comparison.figures))
+    if comparison.reported:
+        console.print(_table("reported by the programs: means", comparison.reported))
     if comparison.outcomes:
         console.print(_table("outcomes, as shares of the attempted receptions", comparison.outcomes))
+    console.print(_table("verdicts", comparison.checks, _verdict_style))
     finding = comparison.finding
     console.print(Text(finding.text, style="green" if finding.verdict is Verdict.VALID else "bold red"))
     if rows := finding.figures.get("rows"):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -17,15 +19,27 @@ from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE,
 from emulator.records.verdict_file import Record
 from vnet.errors import VnetError
 
-NUMBERS = {
-    "vehicles": "number less",
-    "emulated (s)": "number less",
-    "RMSE (m)": "number",
-    "deviation (m)": "number less",
-    "PDR (%)": "number",
-}
-COLUMNS = {"run": "", "verdict": "", "when": "less"} | NUMBERS | {"files": "less"}
-"""Columns and their classes; those that are `less` are hidden on narrow screens."""
+MOST_REPORTED = 6
+"""Values of programs' own that have a column: those that most runs report."""
+ERRORS = {"common_error_rmse_m": ("RMSE (m)", False), "deviation_m": ("deviation (m)", True)}
+"""Titles of the errors of estimates, and whether narrow screens go without, by the name of the key figure."""
+Number = tuple[str, str, str]
+"""A number in a row: the key by which its column is sorted, its text, and a smaller text below."""
+NONE: Number = ("", "–", "")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers; one that is `less` is hidden on narrow screens."""
+
+    title: str
+    is_less: bool
+    read: Callable[[Record], Number]
+
+    @property
+    def kind(self) -> str:
+        """Class of its cells."""
+        return "number less" if self.is_less else "number"
 
 
 @dataclass(frozen=True)
@@ -49,11 +63,13 @@ def index_page(folder: Path) -> str:
     """Return the whole page."""
     entries = sorted(_entries(folder), key=lambda entry: (entry.when, entry.folder.name), reverse=True)
     latest = (folder / "latest").resolve()
+    numbers = _columns([entry.record for entry in entries if entry.record is not None])
+    titles = {"run": "", "verdict": "", "when": "less"}
     return render(
         "index.html.j2",
         name=folder.resolve().name,
-        columns=COLUMNS,
-        entries=[_row(entry, entry.folder.resolve() == latest) for entry in entries],
+        columns=titles | {column.title: column.kind for column in numbers} | {"files": "less"},
+        entries=[_row(entry, entry.folder.resolve() == latest, numbers) for entry in entries],
     )
 
 
@@ -79,7 +95,7 @@ def _entries(folder: Path) -> Iterator[Entry]:
             continue  # it has just been removed
 
 
-def _row(entry: Entry, is_latest: bool) -> dict[str, Any]:
+def _row(entry: Entry, is_latest: bool, numbers: Sequence[Column]) -> dict[str, Any]:
     folder, record = entry.folder, entry.record
     files = [name for name in (SCENARIO_FILE, VERDICT_FILE, RECORDING) if (folder / name).is_file()]
     return {
@@ -90,7 +106,7 @@ def _row(entry: Entry, is_latest: bool) -> dict[str, Any]:
         "verdict": record.verdict if record else None,
         "without": entry.without,
         "when": entry.when,
-        "numbers": [(kind, *texts) for kind, texts in zip(NUMBERS.values(), _numbers(record), strict=True)],
+        "numbers": [(each.kind, *(each.read(record) if record else ("", "", ""))) for each in numbers],
         "files": {name: _link(folder, name) for name in files},
     }
 
@@ -100,16 +116,41 @@ def _link(folder: Path, name: str) -> str:
     return quote(os.fsencode(f"{folder.name}/{name}"))
 
 
-def _numbers(record: Record | None) -> list[tuple[str, str]]:
-    """The key by which each column of numbers is sorted, and its text."""
-    if record is None:
-        return [("", "")] * len(NUMBERS)
-    share = record.share_of("delivered")
-    figures = [record.figures.get(name) for name in ("common_error_rmse_m", "deviation_m")]
-    values: Iterable[tuple[float | None, str]] = [
-        (record.vehicles, "d"),
-        (record.emulated_s, ".1f"),
-        *((figure, ".3f") for figure in figures),
-        (None if share is None else 100 * share, ".2f"),
+# Columns of numbers.
+
+
+def _columns(records: Sequence[Record]) -> list[Column]:
+    """The columns that some run has a number for."""
+    columns = [
+        Column("vehicles", True, lambda record: _number(record.vehicles, "d")),
+        Column("emulated (s)", True, lambda record: _number(record.emulated_s, ".1f")),
     ]
-    return [("", "–") if value is None else (f"{value:g}", format(value, form)) for value, form in values]
+    for name, (title, is_less) in ERRORS.items():
+        if any(record.figures.get(name) is not None for record in records):
+            columns.append(Column(title, is_less, partial(_figure, name)))
+    columns.append(Column("PDR (%)", False, _delivered))
+    counts = Counter(name for record in records for name in record.reported)
+    for name, _ in counts.most_common(MOST_REPORTED):
+        title = next(record.reported[name] for record in records if name in record.reported).words(name)[0]
+        columns.append(Column(title, False, partial(_reported, name)))
+    return columns
+
+
+def _number(value: float | None, form: str) -> Number:
+    return NONE if value is None else (f"{value:g}", format(value, form), "")
+
+
+def _figure(name: str, record: Record) -> Number:
+    return _number(record.figures.get(name), ".3f")
+
+
+def _delivered(record: Record) -> Number:
+    share = record.share_of("delivered")
+    return _number(None if share is None else 100 * share, ".2f")
+
+
+def _reported(name: str, record: Record) -> Number:
+    if (figure := record.reported.get(name)) is None:
+        return NONE
+    _, mean, spread, _ = figure.words(name)
+    return mean if figure.mean is None else f"{figure.mean:g}", mean, spread

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
-from emulator.records.key_figures import KEY_FIGURES
+from emulator.records.key_figures import shown_figures
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE, Event
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import CheckResult, Verdict
@@ -168,11 +168,7 @@ def _one_line(value: Any) -> Any:
 
 def key_figures(record: Record) -> dict[str, str]:
     """Return the figures that sum up a run, by title."""
-    found = {
-        title: f"{value:.3f} m"
-        for name, title in KEY_FIGURES.items()
-        if (value := record.figures.get(name)) is not None
-    }
+    found = {title: f"{value:.3f} m" for title, value in shown_figures(record.figures).items()}
     if (delivered := record.share_of("delivered")) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
         found["attempted receptions"] = f"{record.in_range:,}"

@@ -198,7 +198,8 @@ class PlainLines(_Lines):
         lost -= sum(shot.frames_by_outcome.get(name, 0) for name in ("out_of_range", "pending"))
         factor = f"{shot.real_time_factor or 0:4.1f}× real time"
         down = f"  down {', '.join(shot.down)}" if shot.down else ""
-        self._write(f"{shot.emulated_s:6.1f} s  {factor}  {rmse}delivered {delivered:,}  not {lost:,}{down}")
+        receptions = f"delivered {delivered:,} of {delivered + lost:,}"
+        self._write(f"{shot.emulated_s:6.1f} s  {factor}  {rmse}{receptions}{down}")
 
     def _event(self, event: Event) -> None:
         if is_bad(event):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,21 +14,37 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.judge import Judgement, Verdict
+from emulator.checks.own import PREFIX
 from emulator.pages.text import cell
-from emulator.records.key_figures import KEY_FIGURES
+from emulator.records.key_figures import shown_figures
+from emulator.records.reported import ReportedFigure
 from emulator.records.run_folder import RECORDING, REPORT
+from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
 
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 
 
 def print_summary(
-    judgement: Judgement, verdict: dict[str, Any], folder: Path, console: Console, report: bool = False
+    judgement: Judgement,
+    verdict: dict[str, Any],
+    folder: Path,
+    console: Console,
+    report: bool = False,
+    verbose: bool = False,
 ) -> None:
-    """The whole summary of a run that has just ended; with `report`, its report is about to be written."""
-    print_checks(judgement, console, verdict["reproduce"])
-    console.print(_figures(verdict))
-    console.print(_frames(verdict["frames_by_outcome"]))
+    """Print the summary of a run that has just ended; with `report`, its report is about to be written.
+
+    Checks are one line, and those that are not valid; with `verbose` they are all listed.
+    """
+    print_checks(judgement, console, verdict["reproduce"], verbose)
+    if verdict["reported"]:
+        table = _reported(verdict["reported"])
+        _print_table("reported by the program: all reports of all vehicles", table, console)
+    _print_table("the run", _figures(verdict), console)
+    if any(verdict["frames_by_outcome"].values()):
+        counts = verdict["frames_by_outcome"]
+        _print_table("receptions: one for each frame and receiver in range", _frames(counts), console)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
@@ -50,17 +67,20 @@ def as_typed(command: str) -> str:
     return f"{program} {rest}"
 
 
-def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None:
-    """The verdict and its checks; of those that failed the offending rows, and how to have them again."""
-    table = Table(title=Text(f"verdict: {judgement.verdict}", style=STYLE[judgement.verdict]), title_justify="left")
-    table.add_column("check")
-    table.add_column("verdict")
-    table.add_column("what was seen", overflow="fold")
-    for check in judgement.checks:
-        table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
-    console.print(table)
-    for reason, names in judgement.not_applicable.items():
-        console.print(Text(f"not applicable: {', '.join(names)}: {reason}", style="dim"))
+def print_checks(judgement: Judgement, console: Console, reproduce: str, verbose: bool = True) -> None:
+    """Print the verdict, and of checks that failed the offending rows and how to reproduce them.
+
+    With `verbose` all checks are listed, otherwise the user's own and those that are not valid; all are counted.
+    """
+    shown = [check for check in judgement.checks if verbose or _is_told(check)]
+    console.print(
+        Text(f"verdict: {judgement.verdict}", style=STYLE[judgement.verdict]), _counted(judgement, verbose)
+    )
+    if shown:
+        console.print(_listed(shown))
+    if verbose:
+        for reason, names in judgement.not_applicable.items():
+            console.print(Text(f"not applicable: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
             _print_details(check.figures, console)
@@ -69,6 +89,31 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str) -> None
             console.print(offending(rows))
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
+
+
+def _counted(judgement: Judgement, verbose: bool) -> Text:
+    """Number of checks by their verdict, behind the verdict of the run."""
+    counts = Counter(check.verdict.value for check in judgement.checks)
+    left = sum(map(len, judgement.not_applicable.values()))
+    parts = [f"{count} {verdict}" for verdict in Verdict if (count := counts[verdict.value])]
+    parts += [f"{left} not applicable"] if left else []
+    hint = "" if verbose else " (-v lists them)"
+    return Text(f" checks: {', '.join(parts) or 'none'}{hint}", style="dim")
+
+
+def _is_told(check: CheckResult) -> bool:
+    """Return whether a check is told to everybody: one that is not valid, or the user's own."""
+    return check.verdict is not Verdict.VALID or check.name.startswith(PREFIX)
+
+
+def _listed(checks: Sequence[CheckResult]) -> Table:
+    table = Table()
+    table.add_column("check")
+    table.add_column("verdict")
+    table.add_column("what was seen", overflow="fold")
+    for check in checks:
+        table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
+    return table
 
 
 def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -90,8 +135,24 @@ def _print_details(figures: dict[str, Any], console: Console) -> None:
                 console.print(Text(str(item[key]).rstrip()))
 
 
+def _print_table(title: str, table: Table, console: Console) -> None:
+    """Print a table below its title, which may be wider."""
+    console.print(Text(title, style="italic"))
+    console.print(table)
+
+
+def _reported(reported: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = Table()
+    table.add_column("figure")
+    for head in ("mean", "5 – 95 %", "at the end"):
+        table.add_column(head, justify="right")
+    for name, figure in reported.items():
+        table.add_row(*map(Text, ReportedFigure(**figure).words(name)))
+    return table
+
+
 def _figures(verdict: dict[str, Any]) -> Table:
-    table = Table(title="figures (means after the first fifth of the run)", title_justify="left", show_header=False)
+    table = Table(show_header=False)
     table.add_column()
     table.add_column(justify="right")
     table.add_row("vehicles", str(verdict["vehicles"]))
@@ -100,15 +161,14 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
     table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
-    for name, title in KEY_FIGURES.items():
-        if (value := verdict["figures"].get(name)) is not None:
-            table.add_row(title, f"{value:.3f} m")
+    for title, value in shown_figures(verdict["figures"]).items():
+        table.add_row(f"{title} (mean after the first fifth)", f"{value:.3f} m")
     return table
 
 
 def _frames(counts: dict[str, int]) -> Table:
     in_range = sum(count for outcome, count in counts.items() if outcome != "out_of_range")
-    table = Table(title="frames, by receiver in range", title_justify="left", show_header=False)
+    table = Table(show_header=False)
     table.add_column()
     table.add_column(justify="right")
     table.add_column(justify="right")

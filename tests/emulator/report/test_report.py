@@ -189,6 +189,33 @@ def test_a_folder_that_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:
     assert done.exit_code == 2 and "not a run's folder" in done.output and done.output.count("\n") == 1
 
 
+def test_what_a_program_reports_is_a_column_of_the_index(beacon: Path) -> None:
+    page = Page(write_index(beacon.parent).read_text())
+    figure = RecordedRun.open(beacon).record.reported["neighbours"]
+    _, mean, spread, _ = figure.words("neighbours")
+    assert "neighbours" in page.text and mean in page.words and spread in page.words
+    assert "RMSE (m)" not in page.text, "the program knows nothing of a common error"
+
+
+def test_runs_of_programs_that_report_other_values_are_compared(beacon: Path, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(beacon, tmp_path / "runs" / "other"))
+    states = pq.read_table(other / "states.parquet")
+    states = states.rename_columns(["hops" if name == "neighbours" else name for name in states.column_names])
+    pq.write_table(states, other / "states.parquet")
+    verdict = json.loads((other / "verdict.json").read_text())
+    verdict["reported"] = {"hops": verdict["reported"]["neighbours"]}
+    (other / "verdict.json").write_text(json.dumps(verdict))
+    done = vnet(["compare", str(beacon), str(other)])
+    assert done.exit_code == 0, done.output
+    assert "neighbours" in done.stdout and "hops" in done.stdout
+    rows = Comparison.of(beacon, other).reported
+    assert [row["figure"] for row in rows] == ["neighbours", "hops"]
+    assert [(row["A"], row["B"], row["B − A"]) for row in rows] == [
+        (rows[0]["A"], "–", ""),
+        ("–", rows[0]["A"], ""),
+    ]
+
+
 def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Path) -> None:
     runs = beacon.parent
     (runs / "latest").symlink_to("beacon-1")
