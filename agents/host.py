@@ -290,8 +290,11 @@ def _run_lockstep(attachment: _Attachment, welcomes: Sequence[wire.Welcome], pro
                 loop.run_forever()
             except SpinError as spin:
                 host.end_spinning(loop, spin)
+            except SystemExit as leave:
+                host.end_exited(leave)
     except _RunOverError:
         host.close(loop)
+        attachment.say(wire.Final(attachment.nonce, host.take_traffic()))
     finally:
         loop.close()
 

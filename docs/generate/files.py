@@ -125,6 +125,13 @@ EVENTS = {
     "interrupted": ("", "", "Ctrl-C or SIGTERM"),
     "finished": ("vehicle", "", "its program returned"),
     "crashed": ("vehicle", "`error`, `where`", "its program raised; the traceback"),
+    "exception": (
+        "vehicle",
+        "`error`, `place`, `where`",
+        "its program raised and nobody handled it: at that instant, so that the line may come after later ones; "
+        "where, and the traceback",
+    ),
+    "left_out": ("vehicle", "`what`, `count`", "how many events of this kind are not here: there were too many"),
     "spun": (
         "vehicle",
         "`error`, `where`",

@@ -50,7 +50,9 @@ not read are kept.
 """
 ERRORS = f"""
 `{PayloadTooLargeError.__name__}` is in `vnet.errors`; it has `size_bytes` and `max_payload_bytes`. A program that
-lets an error through has crashed: its vehicle is down from then on, and the run is invalid.
+lets an error through has crashed: its vehicle is down from then on, and the run is invalid. An error in a task, a
+callback or a job that is never handled makes it invalid too, and the program goes on:
+[checks.md](../checks.md#exceptions).
 """
 
 

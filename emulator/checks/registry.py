@@ -35,6 +35,7 @@ from emulator.checks.run import (
     check_kept_up,
     check_liveness,
     check_memory,
+    check_no_exceptions,
     check_presence,
     check_progress,
     check_transport,
@@ -318,6 +319,15 @@ CHECKS: list[Check] = [
         RUN,
         "No process died and no program crashed, except those that a fault ended.",
         invalid="one did",
+        unknown="no event says that the run started",
+        without_positions=WithoutPositions.JUDGE,
+    ),
+    Check(
+        check_no_exceptions,
+        RUN,
+        "Programs handled every exception that was raised in their tasks, callbacks, `finally` blocks and executor "
+        "jobs. One that is awaited, however late, is handled; one that leaves `main` counts in `agents_alive`.",
+        invalid="an event `exception`",
         unknown="no event says that the run started",
         without_positions=WithoutPositions.JUDGE,
     ),

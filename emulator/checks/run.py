@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from emulator.records.failures import in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
@@ -43,12 +44,34 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     if not gone:
         who = f"all {len(recorded.node_ids)} nodes" if recorded.node_ids else "all nodes"
         return CheckResult(name, Verdict.VALID, f"{who} to the end")
-    first = gone[0]
-    why = first.details.get("error") or first.details.get("how", "")
-    when = f"{first.node} {first.kind} at {first.time_ns / 1e9:.3f} s"
-    text = f"{len(gone)} of {len(recorded.node_ids) or 'the'} nodes: {when}: {why}"
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
-    return CheckResult(name, Verdict.INVALID, text, {"gone": listed})
+    return CheckResult(name, Verdict.INVALID, in_words(kinds_of(gone)), {"gone": listed})
+
+
+def check_no_exceptions(recorded: RecordedRun) -> Finding:
+    """Check that programs handled every exception that was raised in their tasks, callbacks and jobs."""
+    name = "no_exceptions"
+    raised = recorded.event("exception")
+    if not raised and not recorded.event("started"):
+        return unknown(name, "no event says that the run started")
+    if not raised:
+        return CheckResult(name, Verdict.VALID, "no exception was left unhandled")
+    kinds = kinds_of(raised)
+    left_out = sum(
+        int(e.details["count"]) for e in recorded.event("left_out") if e.details.get("what") == "exception"
+    )
+    rows = [
+        {
+            "what": kind.why,
+            "vehicles": len(kind.nodes),
+            "node": kind.first.node,
+            "time_ns": kind.first.time_ns,
+            "count": len(kind.events),
+        }
+        for kind in kinds
+    ]
+    first = {"node": kinds[0].first.node, "where": kinds[0].first.details.get("where", "")}
+    return result(name, len(raised), "", in_words(kinds), rows, count=len(raised) + left_out, **first)
 
 
 def _was_killed(recorded: RecordedRun, event: Event) -> bool:

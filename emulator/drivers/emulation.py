@@ -29,6 +29,9 @@ from vnet.node import Report
 from vnet.transport import wire
 from vnet.units import NS_PER_S
 
+MOST_EXCEPTIONS = 20
+"""Unhandled exceptions of a node that are written down, with their tracebacks; further ones are counted."""
+
 
 @dataclass(frozen=True)
 class PeriodView:
@@ -42,13 +45,14 @@ class PeriodView:
 
 @dataclass(frozen=True)
 class ProcessActions:
-    """Effects of faults and trips on processes from an instant on.
+    """Effects of faults and trips on processes from the instant `time_ns` on.
 
     `stop`: nodes whose programs end now, and whether they are killed; `start`: nodes that are started, for the
     first time or again; `paused`: all nodes that are paused; `clocks`: the errors of all clocks; `restarts`: of the
     emulator or its router.
     """
 
+    time_ns: int
     stop: dict[str, bool]
     start: list[str]
     paused: set[str]
@@ -88,6 +92,7 @@ class Emulation:
         self._finished = False
         self._reports: list[Report] = []
         self._arrived: list[Delivery] = []
+        self._exceptions = dict.fromkeys(world.node_ids, 0)
 
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""
@@ -155,18 +160,40 @@ class Emulation:
             return
         frames: dict[str, list[bytes]] = {}
         endings: list[wire.Ending] = []
+        unhandled: list[wire.Unhandled] = []
         for part in traffic:
             for frame in part.frames:
                 frames.setdefault(frame.node, []).append(frame.payload)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
+            unhandled.extend(part.unhandled)
         if frames:
             self._place(time_ns // self.world.period_ns)
         for node in sorted(frames, key=self.number.__getitem__):
             if self.up[node]:
                 self.engine.transmit(time_ns, self.number[node], frames[node])
+        self._tell_unhandled(time_ns, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)
+
+    def take_final(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
+        """Take what programs told as they were ended at `time_ns`; of frames, reports and endings nobody hears."""
+        self._tell_unhandled(time_ns, [each for part in traffic for each in part.unhandled])
+
+    def _tell_unhandled(self, time_ns: int, unhandled: Iterable[wire.Unhandled]) -> None:
+        """Write down exceptions that nobody handled, in the order in which they were raised."""
+        raised = [(min(time_ns, each.time_ns if each.time_ns is not None else time_ns), each) for each in unhandled]
+        for raised_ns, each in sorted(raised, key=lambda pair: (pair[0], self.number[pair[1].node])):
+            self._exceptions[each.node] += 1
+            if self._exceptions[each.node] <= MOST_EXCEPTIONS:
+                details = {"error": each.error, "place": each.place, "where": each.details}
+                self.folder.event(raised_ns, "exception", each.node, **details)
+
+    def tell_left_out(self, time_ns: int) -> None:
+        """Write down how many exceptions of each node were not, because there were too many."""
+        for node, count in self._exceptions.items():
+            if count > MOST_EXCEPTIONS:
+                self.folder.event(time_ns, "left_out", node, what="exception", count=count - MOST_EXCEPTIONS)
 
     def _place(self, period: int) -> None:
         """Frames are sent from where vehicles are at the start of the period."""
@@ -221,6 +248,7 @@ class Emulation:
         if starts_at_once:
             self.come_back(changes.started, time_ns)
         return ProcessActions(
+            time_ns=time_ns,
             stop={node: node in killed for node in changes.stopped},
             start=changes.started,
             paused=self._nodes_under(active, lambda fault: not fault.ends),

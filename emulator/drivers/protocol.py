@@ -15,7 +15,8 @@ class ProtocolError(VnetError):
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    named = [part.node for parts in (traffic.frames, traffic.reports, traffic.endings) for part in parts]
+    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled)
+    named = [part.node for parts in kinds for part in parts]
     for node in [*named, *waiting]:
         if node not in nodes:
             raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")

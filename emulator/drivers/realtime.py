@@ -88,6 +88,8 @@ class RealTime:
             self._awaited.discard(process_id)
         if now_ns < self._emulation.duration_ns:
             self._emulation.take(now_ns, [message.traffic])
+        else:
+            self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
 
     @property
     def awaited(self) -> frozenset[str]:

@@ -106,14 +106,20 @@ class _Simulation:
                     self.loop.run_forever()
                 except SpinError as spin:
                     self._host.end_spinning(self.loop, spin)
+                except SystemExit as leave:
+                    self._host.end_exited(leave)
         except _RunOverError:
-            self._host.close(self.loop)
+            self._close(self._emulation.duration_ns)
         except KeyboardInterrupt:
-            self._host.close(self.loop)
+            self._close(self.loop.now_ns)
             raise
         finally:
             asyncio.set_event_loop(None)
             self.loop.close()
+
+    def _close(self, time_ns: int) -> None:
+        self._host.close(self.loop)
+        self._emulation.take_final(time_ns, [self._host.take_traffic()])
 
     def _exchange(self, next_timer_ns: int | None) -> int:
         if self.stop.is_set():
@@ -139,7 +145,7 @@ class _Simulation:
         """Do to the programs what faults do to processes."""
         for action in actions:
             for node, killed in action.stop.items():
-                self._host.stop(node, killed)
+                self._host.stop(node, killed, action.time_ns)
             for node in action.start:
                 self._host.restart(self._emulation.welcome(node, _NONCE))
             self._host.pause(action.paused)

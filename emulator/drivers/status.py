@@ -14,6 +14,7 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.memory import resident_kb
 from emulator.faults.plan import PlannedFault
 from emulator.radio.outcomes import Outcome
+from emulator.records.failures import merged
 from emulator.records.run_folder import Event
 from vnet.units import NS_PER_S
 
@@ -27,6 +28,8 @@ SPEED_EVERY_S = 0.1
 FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m")
 """Figures of `PeriodFigures` that are shown."""
 EVENTS_KEPT = 8
+EVENTS_LOOKED_AT = 200
+"""Last events among which those of one kind of failure are told as one."""
 FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total")
 """Kinds of events that hold measurements, and are no news."""
 
@@ -162,7 +165,7 @@ class Course:
             frames_by_outcome={outcome.name: count for outcome, count in emulation.engine.counts.items() if count},
             frames_per_s=self._rates(),
             faults=tuple(fault_state(planned, emulation, now_ns) for planned in emulation.faults.faults),
-            events=tuple(self.news(-2 * EVENTS_KEPT)[-EVENTS_KEPT:]),
+            events=tuple(merged(self.news(-EVENTS_LOOKED_AT))[-EVENTS_KEPT:]),
             emulator_memory_mb=None if memory_kb is None else memory_kb / 1024,
         )
 

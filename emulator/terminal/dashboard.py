@@ -20,6 +20,7 @@ from rich.style import Style
 from emulator.drivers.status import BINS, FaultState, Snapshot
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN
+from emulator.records.failures import Kind
 from emulator.records.run_folder import Event
 from vnet.errors import printable
 
@@ -32,7 +33,8 @@ OUTCOMES = {
     outcome.name: (Style(color=PALETTE[outcome.facts.colour].either), outcome.facts.sign) for outcome in DRAWN
 }
 """Style and sign of each outcome; signs tell them apart where there are no colours."""
-BAD_EVENTS = ("died", "crashed", "spun", "stalled", "refused", "transport_gap", "observer_ended", "interrupted")
+BAD_EVENTS = ("died", "crashed", "exception", "spun", "stalled", "refused", "transport_gap", "observer_ended",
+              "interrupted")  # fmt: skip
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0
 """Between the foot and the top of a sparkline, so that what is steady does not look wild."""
@@ -315,6 +317,8 @@ def describe(event: Event) -> str:
     if event.kind == "started":
         start_up_s = event.details.get("start_up_s") or 0.0
         return f"started: all have joined in {start_up_s:.1f} s" if start_up_s else "started"
+    if event.kind == "exception":
+        return printable(f"{event.node}: {Kind((event,)).why}", 300)
     details = dict(event.details)
     fault, nodes = details.pop("fault", None), details.pop("nodes", None)
     who = event.node or fault or ""

@@ -16,14 +16,17 @@ from rich.console import Console
 
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.status import Course, Snapshot
+from emulator.records.failures import FAILURES, key_of, kinds_of
 from emulator.records.run_folder import Event
 from emulator.terminal.console import LogFormat
 from emulator.terminal.dashboard import Dashboard, describe, is_bad
 from emulator.terminal.painter import EVERY_S, Painter
-from vnet.errors import first_names
+from vnet.errors import first_names, printable
 
 PLAIN_LINE_EVERY_S = 5.0
 JSON_LINE_EVERY_S = 1.0
+LONGEST_LINE = 300
+"""Characters of a line about a failure."""
 
 
 class Progress:
@@ -175,6 +178,10 @@ class PlainLines(_Lines):
 
     every_s = PLAIN_LINE_EVERY_S
 
+    def __init__(self, emulation: Emulation, file: TextIO) -> None:
+        super().__init__(emulation, file)
+        self._told_kinds: set[tuple[str, ...]] = set()
+
     def state(self, text: str) -> None:
         """A line."""
         self._last_s = time.monotonic()
@@ -201,9 +208,17 @@ class PlainLines(_Lines):
         receptions = f"delivered {delivered:,} of {delivered + lost:,}"
         self._write(f"{shot.emulated_s:6.1f} s  {factor}  {rmse}{receptions}{down}")
 
-    def _event(self, event: Event) -> None:
-        if is_bad(event):
-            self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
+    def _tell_events(self) -> None:
+        """A line for each event, and one for each kind of failure, however many vehicles it befalls."""
+        news = self._course.news(self._told_events)
+        self._told_events = len(self._emulation.folder.events)
+        for kind in kinds_of(event for event in news if event.kind in FAILURES):
+            if (key := key_of(kind.first)) not in self._told_kinds:
+                self._told_kinds.add(key)
+                self._write(f"{kind.first.time_ns / 1e9:6.1f} s  {printable(kind.untimed, LONGEST_LINE)}")
+        for event in news:
+            if is_bad(event) and event.kind not in FAILURES:
+                self._write(f"{event.time_ns / 1e9:6.1f} s  {describe(event)}")
 
 
 class JsonLines(_Lines):

@@ -47,7 +47,8 @@ LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
 LIMIT_VEHICLES = 100
 """Most vehicles for which the bound is computed: its cost grows with their number."""
-WARNINGS = {"fault_started", "died", "crashed", "spun", "stalled", "refused", "interrupted", "observer_ended"}
+WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "refused", "interrupted",
+            "observer_ended"}  # fmt: skip
 LONGEST_DETAIL = 60
 NAMED_DOWN = 6
 ACTING, NOBODY = "acting", "none"

@@ -26,7 +26,7 @@ from vnet.node import Report
 from vnet.transport import keys, wire
 
 PAGE = Layouts()
-OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.StackDump)}
+OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}
 OF_THE_EMULATOR = {
     kind.__name__: kind for kind in (wire.Welcome, wire.Grant, wire.Batch, wire.StackRequest, wire.Await, wire.End)
 }
@@ -34,6 +34,7 @@ PARTS = {
     "Traffic": wire.Traffic,
     "Frame": wire.Frame,
     "Ending": wire.Ending,
+    "Unhandled": wire.Unhandled,
     "Lateness": wire.Lateness,
     "Packet": wire.WirePacket,
     "Fix": wire.WireFix,
@@ -141,7 +142,7 @@ def fields(kinds: dict[str, Any]) -> list[tuple[str, int, Field]]:
 
 def example(kind: str) -> list[Any]:
     """Values of a message that are as the page says, always the same."""
-    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[], [], []]}
+    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[], [], [], []]}
 
     def value(field: Field) -> Any:
         first = split(field.type, " or ")[0]
@@ -169,6 +170,12 @@ def test_vnet_refuses_what_the_page_does_not_allow(kind: str, index: int, field:
                 decode(msgpack.packb([kind, *altered]))
         else:
             decode(msgpack.packb([kind, *altered]))
+
+
+def test_an_agent_that_knows_nothing_of_exceptions_is_understood() -> None:
+    message = wire.decode_tx(msgpack.packb(["Yield", b"n", 0, None, [], [], [[["v01", b"x"]], [], []]]))
+    assert isinstance(message, wire.Yield)
+    assert message.traffic == wire.Traffic([wire.Frame("v01", b"x")], [], [])
 
 
 def test_a_reader_that_is_told_nonsense_says_so() -> None:

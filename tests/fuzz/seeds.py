@@ -40,6 +40,7 @@ TRAFFIC = wire.Traffic(
     [wire.Frame("v01", b"payload")],
     [Report(5, "v01", (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), {"mean_m": [0.5, 0.5], "n": 3.0})],
     [wire.Ending("v01", "crashed", "boom", "Traceback")],
+    [wire.Unhandled("v01", 5, "boom", "in a task", "Traceback")],
 )
 PACKET = wire.WirePacket("v01", "v02", 5, 6, b"payload")
 FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5)
@@ -48,6 +49,7 @@ TX: tuple[wire.AgentMessage, ...] = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import"),
     wire.Yield(b"n" * 16, 3, 100, ["v01"], [], TRAFFIC),
     wire.Frames(b"n" * 16, 3, 3, [(1, 2)], TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
+    wire.Final(b"n" * 16, TRAFFIC),
     wire.StackDump(b"n" * 16, "File …"),
 )
 RX: tuple[wire.EmulatorMessage, ...] = (

@@ -83,7 +83,8 @@ def run_apart(scenario: Scenario) -> Emulation:
                 for process_id, nodes in groups.items():
                     killed = [actions.stop[node] for node in nodes if node in actions.stop]
                     if killed:
-                        processes.pop(process_id).end(killed=any(killed))
+                        traffic = processes.pop(process_id).end(killed=any(killed))
+                        emulation.take_final(actions.time_ns, traffic)
                     if any(node in actions.start for node in nodes):
                         processes[process_id] = _Process(emulation, nodes)
             for process_id, grant in grants.items():
@@ -92,8 +93,8 @@ def run_apart(scenario: Scenario) -> Emulation:
                 lockstep.receive(process_id, processes[process_id].take_yield())
             grants = lockstep.step()
     finally:
-        for process in processes.values():
-            process.end(killed=False)
+        finals = [traffic for process in processes.values() for traffic in process.end(killed=False)]
+        emulation.take_final(emulation.duration_ns, finals)
     return emulation
 
 
@@ -108,6 +109,7 @@ class _Process:
         self._welcomes = [message for message in decoded if isinstance(message, wire.Welcome)]
         assert len(self._welcomes) == len(nodes)
         self._seq = 0
+        self._final: wire.Traffic | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -119,11 +121,12 @@ class _Process:
         assert isinstance(decoded, wire.Yield)
         return decoded
 
-    def end(self, killed: bool) -> None:
-        """End it from the emulator's side, and wait until it has."""
+    def end(self, killed: bool) -> list[wire.Traffic]:
+        """End it from the emulator's side, and wait until it has; returns what it said last, if it could."""
         self.grants.put(Killed if killed else Over)
         self._thread.join(60)
         assert not self._thread.is_alive()
+        return [] if self._final is None else [self._final]
 
     def _run(self) -> None:
         try:
@@ -150,7 +153,6 @@ class _Process:
 
     def _host_programs(self) -> None:
         loop = self._loop = VirtualTimeLoop(self._exchange, self._welcomes[0].spin_limit)
-        loop.set_exception_handler(lambda *_: None)  # killed tasks are pending tasks
         self._host = Host(self._welcomes, lambda: loop.now_ns)
         asyncio.set_event_loop(loop)
         try:
@@ -161,7 +163,12 @@ class _Process:
                     loop.run_forever()
                 except SpinError as spin:
                     self._host.end_spinning(loop, spin)
+                except SystemExit as leave:
+                    self._host.end_exited(leave)
         except Over:
             self._host.close(loop)
+            final = wire.decode_tx(wire.encode(wire.Final(b"n", self._host.take_traffic())))
+            assert isinstance(final, wire.Final)
+            self._final = final.traffic
         finally:
             loop.close()

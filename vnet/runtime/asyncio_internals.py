@@ -10,6 +10,9 @@ names what is missing or different when a new version of Python changes it. What
 - A round waits in `select(timeout)` of the selector given to the loop: `timeout` is 0 or less if a callback is
   ready or a timer is due, and None if there is no timer.
 - Timers that are earlier than `time()` plus `_clock_resolution` are due; `call_later` sets its timer by `call_at`.
+- A future whose exception nobody has retrieved has `_log_traceback` set, which may be cleared; discarded with it,
+  it calls the exception handler. Reading `_exception` does not clear it. What `gather` returns knows its
+  `_children`.
 - `_default_executor`, `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
 """
 
@@ -18,6 +21,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
 from typing import Any, cast
@@ -70,6 +74,29 @@ def context_of(handle: asyncio.Handle) -> Context:
 def abandon(task: asyncio.Task[Any]) -> None:
     """Let a pending task be destroyed without a message in the log."""
     _private(task)._log_destroy_pending = False
+
+
+def is_unretrieved(future: asyncio.Future[Any]) -> bool:
+    """Return whether a future or task has failed and nobody has retrieved its exception; asking does not."""
+    return bool(_private(future)._log_traceback)
+
+
+def error_of(future: asyncio.Future[Any]) -> BaseException | None:
+    """Return the exception of a future or task without retrieving it."""
+    return cast("BaseException | None", _private(future)._exception)
+
+
+def disclaim(future: asyncio.Future[Any]) -> BaseException:
+    """Return the exception that nobody has retrieved; asyncio does not complain of it any more."""
+    error = error_of(future)
+    assert error is not None
+    _private(future)._log_traceback = False
+    return error
+
+
+def gathered(future: asyncio.Future[Any]) -> Sequence[asyncio.Future[Any]]:
+    """Return the futures that `asyncio.gather` has joined in this one; none if it is another kind of future."""
+    return cast("Sequence[asyncio.Future[Any]]", getattr(future, "_children", ()))
 
 
 class NumberedTimer(asyncio.TimerHandle):

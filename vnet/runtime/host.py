@@ -19,12 +19,11 @@ from typing import Any
 from vnet.node import Node, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
+from vnet.runtime.current_node import current_node
 from vnet.runtime.programs import Program, Programs, error_line, load_program
+from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
-
-_current_node: contextvars.ContextVar[Node | None] = contextvars.ContextVar("vnet_node", default=None)
-"""On whose behalf code runs: a node, in one of its incarnations."""
 
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
@@ -57,6 +56,9 @@ class Host:
         self._past_clocks: dict[str, list[wire.ClockError]] = {}
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
+        self._stopped_ns: dict[Node, int] = {}
+        self._closing = False
+        self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)))
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -91,9 +93,10 @@ class Host:
 
     # What the transport asks of the host.
 
-    def start(self, loop: asyncio.AbstractEventLoop, programs: Programs) -> None:
+    def start(self, loop: SkewedLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""
         self._loop = loop
+        self._unhandled.attach(loop)
         self._programs = programs
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
@@ -102,16 +105,23 @@ class Host:
 
     def _start(self, node: Node) -> None:
         context = contextvars.copy_context()
-        context.run(_current_node.set, node)
+        context.run(current_node.set, node)
         program = self._run(node, self._programs[node.id])
         self._loop.create_task(program, name=f"{node.id} main", context=context)
 
-    def stop(self, node: str, killed: bool) -> None:
+    def _raised_ns(self, node: Node | None) -> int | None:
+        """Emulated time of an exception of `node`: while its process ends (simulated), when that began."""
+        if node in self._stopped_ns:
+            return self._stopped_ns[node]
+        return None if self._closing else self._clock()
+
+    def stop(self, node: str, killed: bool, time_ns: int) -> None:
         """A node's process is gone (simulated): its program is cancelled, unheard; if killed it goes no further."""
         gone = self.nodes[node]
         gone.disconnect()
         self._active[node] = False
         if killed:
+            self._unhandled.silence(gone)
             self._killed[gone] = self._tasks_of(gone)
             for task in self._killed[gone]:
                 asyncio_internals.abandon(task)
@@ -121,8 +131,16 @@ class Host:
                     program.close()
             self._hold()
         else:
+            self._stopped_ns[gone] = time_ns
             for task in self._tasks_of(gone):
                 task.cancel()
+
+    def _settle_stopped(self) -> None:
+        """Hear no more of processes that have ended: they have done what they could without waiting."""
+        for gone in self._stopped_ns:
+            self._unhandled.settle(gone)
+            self._unhandled.silence(gone)
+        self._stopped_ns.clear()
 
     def restart(self, welcome: wire.Welcome) -> None:
         """Run a node's program again, as another incarnation (simulated)."""
@@ -153,7 +171,7 @@ class Host:
         loop.clock_error_of = self._clock_error_of_task if self._clocks else _no_clock_error
 
     def _clock_error_of_task(self) -> wire.ClockError | None:
-        node = _current_node.get()
+        node = current_node.get()
         return None if node is None else self._clocks.get(node.id)
 
     def _shown_ns(self, node: str, time_ns: int) -> int:
@@ -175,12 +193,13 @@ class Host:
 
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
-        traffic = wire.Traffic(self._frames, self._reports, self._endings)
+        traffic = wire.Traffic(self._frames, self._reports, self._endings, self._unhandled.take())
         self._frames, self._reports, self._endings = [], [], []
         return traffic
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when nothing is left to do at this instant (lockstep)."""
+        self._settle_stopped()
         nodes = self.nodes.values()
         return wire.Yield(
             nonce,
@@ -222,6 +241,23 @@ class Host:
             if self._runs(node):
                 self.end(node.id, "spun", str(spin), self.stacks(node.id))
 
+    def end_exited(self, leave: SystemExit) -> None:
+        """After a SystemExit that left the loop: the task that raised it has ended its node's program."""
+        for task, owner in list(self._tasks.items()):
+            if owner is not None and task.done() and asyncio_internals.error_of(task) is leave:
+                asyncio_internals.disclaim(task)
+                self._exited(owner, leave)
+                return
+        raise leave
+
+    def _exited(self, node: Node, error: BaseException) -> None:
+        if isinstance(error, SystemExit) and not error.code:
+            self._over(node, "finished")
+        elif self._runs(node) and not self._closing:
+            self._over(node, "crashed", error_line(error), "".join(traceback.format_exception(error)[-30:]))
+        else:
+            self._unhandled.add(node, error, "in main")
+
     def _runs(self, node: Node) -> bool:
         """Return whether its program goes on, and is not what is left of an earlier incarnation."""
         return self.nodes[node.id] is node and self._active[node.id]
@@ -242,14 +278,27 @@ class Host:
         return tasks
 
     def close(self, loop: VirtualTimeLoop) -> None:
-        """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep)."""
+        """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep).
+
+        `take_traffic` then returns the exceptions that nobody has handled.
+        """
+        self._closing = True
         with contextlib.suppress(LoopAbandonedError, SpinError):
             loop.finish(_all_done(self._cancel_all()))
+        self._settle()
 
     async def cancel(self) -> None:
         """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""
+        self._closing = True
         if tasks := self._cancel_all():
             await asyncio.wait(tasks, timeout=1.0)
+        del tasks  # it would keep their exceptions from being discarded
+        self._settle()
+
+    def _settle(self) -> None:
+        self._settle_stopped()
+        self._unhandled.settle()
+        self._unhandled.close()
 
     async def _run(self, node: Node, program: Program) -> None:
         try:
@@ -257,10 +306,7 @@ class Host:
         except (asyncio.CancelledError, GeneratorExit):
             raise
         except (Exception, SystemExit) as error:
-            if isinstance(error, SystemExit) and not error.code:
-                self._over(node, "finished")
-                return
-            self._over(node, "crashed", error_line(error), "".join(traceback.format_exception(error)[-30:]))
+            self._exited(node, error)
         else:
             self._over(node, "finished")
 
@@ -276,8 +322,9 @@ class Host:
         **options: Any,  # from Python 3.13.3 on: the name, and whatever else a task takes
     ) -> asyncio.Task[Any]:
         task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context, **options)
-        owner = _current_node.get() if context is None else context.get(_current_node)
+        owner = current_node.get() if context is None else context.get(current_node)
         self._tasks[task] = owner
+        self._unhandled.watch(task, owner)
         return task
 
 
@@ -296,8 +343,9 @@ def _no_clock_error() -> wire.ClockError | None:
 
 def _owner(handle: asyncio.Handle) -> Node | None:
     """The node on whose behalf a callback is scheduled."""
-    return asyncio_internals.context_of(handle).get(_current_node)
+    return asyncio_internals.context_of(handle).get(current_node)
 
 
 async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
-    await asyncio.gather(*tasks, return_exceptions=True)
+    if tasks:
+        await asyncio.wait(tasks)  # which retrieves no exception: whether a program does is what matters

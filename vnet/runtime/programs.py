@@ -84,5 +84,8 @@ def _programs_of(module: ModuleType) -> list[str]:
 
 def error_line(error: BaseException) -> str:
     """Return the type and the message of an exception in one line."""
-    text = " ".join(str(error).split())
+    try:
+        text = " ".join(str(error).split())
+    except Exception as another:  # of the exception's own __str__
+        text = f"(its text cannot be made: {type(another).__name__})"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

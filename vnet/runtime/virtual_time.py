@@ -17,7 +17,7 @@ import selectors
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import Executor, Future
-from contextvars import Context
+from contextvars import Context, copy_context
 from itertools import count
 from typing import Any, NoReturn
 
@@ -49,6 +49,10 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     """
 
     clock_error_of: Callable[[], ClockError | None] = staticmethod(lambda: None)
+    on_failed: Callable[[asyncio.Future[Any]], None] = staticmethod(lambda future: None)
+    """Called when a future, which is no task, is given an exception."""
+    on_unhandled: Callable[[dict[str, Any]], bool] = staticmethod(lambda context: True)
+    """Called with what asyncio's own exception handler gets; returns whether to log it."""
 
     @property
     def now_ns(self) -> int:
@@ -67,6 +71,24 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         """Seconds on the loop's own clock."""
         return super().time()
 
+    def create_future(self) -> asyncio.Future[Any]:
+        """Make a future that tells the loop when it fails."""
+        return _TellingFuture(loop=self)
+
+    def default_exception_handler(self, context: dict[str, Any]) -> None:
+        """Log what nobody has handled, as asyncio does, and tell of it."""
+        if self.on_unhandled(context):
+            super().default_exception_handler(context)
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Executor | None, func: Callable[..., Any], *args: Any
+    ) -> asyncio.Future[Any]:
+        """Run a job as asyncio does; the future knows on whose behalf."""
+        outer = super().run_in_executor(executor, func, *args)
+        if isinstance(outer, _TellingFuture):
+            outer.job_context = copy_context()
+        return outer
+
     def call_at(  # type: ignore[override]
         self, when: float, callback: Callable[..., object], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
@@ -77,6 +99,18 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         """Time on the loop's own clock at which the clock of the task that asks shows `when`."""
         clock_error = self.clock_error_of()
         return when if clock_error is None else self.own_time() + (when - self.time()) / (1 + clock_error.rate)
+
+
+class _TellingFuture(asyncio.Future[Any]):
+    """A future that tells its loop when it fails; `job_context` is that of the executor job whose result it is."""
+
+    job_context: Context | None = None
+
+    def set_exception(self, exception: type | BaseException, /) -> None:
+        super().set_exception(exception)
+        loop = self.get_loop()
+        assert isinstance(loop, SkewedLoop)
+        loop.on_failed(self)
 
 
 class VirtualTimeLoop(SkewedLoop):
@@ -178,7 +212,8 @@ class VirtualTimeLoop(SkewedLoop):
         if executor is None:
             executor = asyncio_internals.default_executor(self, "vnet")
         job = executor.submit(func, *args)
-        outer: asyncio.Future[Any] = self.create_future()
+        outer = _TellingFuture(loop=self)
+        outer.job_context = copy_context()
         self._jobs.append((job, outer))
         job.add_done_callback(lambda _: self.call_soon_threadsafe(_nothing))
         return outer

@@ -1,8 +1,8 @@
 """The messages on the keys of a node: typed records and their msgpack encoding, without I/O.
 
-`tx` carries an agent's messages (`Hello`, `Yield`, `Frames`, `StackDump`), `rx` the emulator's (`Welcome`, `Grant`,
-`Batch`, `StackRequest`, `Await`, `End`). Decoding checks every type and bound; a violation is a `WireError`. All
-times are integer nanoseconds from the start of the run.
+`tx` carries an agent's messages (`Hello`, `Yield`, `Frames`, `Final`, `StackDump`), `rx` the emulator's (`Welcome`,
+`Grant`, `Batch`, `StackRequest`, `Await`, `End`). Decoding checks every type and bound; a violation is a
+`WireError`. All times are integer nanoseconds from the start of the run.
 """
 
 from __future__ import annotations
@@ -87,12 +87,27 @@ class Ending(msgspec.Struct, frozen=True, array_like=True):
     details: str = ""
 
 
+class Unhandled(msgspec.Struct, frozen=True, array_like=True):
+    """An exception of a node's program that nobody handled, and when it was raised.
+
+    A `time_ns` of None: as the program was ended. `error` is its type and message, `place` says where it came up,
+    `details` is the traceback.
+    """
+
+    node: str
+    time_ns: TimeNs | None
+    error: str
+    place: str = ""
+    details: str = ""
+
+
 class Traffic(msgspec.Struct, frozen=True, array_like=True):
-    """Frames, reports and endings of the nodes of one process, in the order of their creation."""
+    """Frames, reports, endings and exceptions of the nodes of one process, in the order of their creation."""
 
     frames: Sequence[Frame] = ()
     reports: Sequence[Report] = ()
     endings: Sequence[Ending] = ()
+    unhandled: Sequence[Unhandled] = ()
 
 
 class Hello(Message, frozen=True):
@@ -139,6 +154,13 @@ class Frames(Message, frozen=True):
     traffic: Traffic
     lateness: Lateness | None = None
     final: bool = False
+
+
+class Final(Message, frozen=True):
+    """Lockstep: what the programs of a process told as they were ended, after `End`."""
+
+    nonce: bytes
+    traffic: Traffic
 
 
 class StackDump(Message, frozen=True):
@@ -240,7 +262,7 @@ class End(Message, frozen=True):
     refused: bool = False
 
 
-AgentMessage = Hello | Yield | Frames | StackDump
+AgentMessage = Hello | Yield | Frames | Final | StackDump
 EmulatorMessage = Welcome | Grant | Batch | StackRequest | Await | End
 
 _M = TypeVar("_M")

@@ -68,6 +68,8 @@ class Driver(ABC):
         process_of = self._parts.members.process_of
         for process_id, killed in {process_of(node): killed for node, killed in actions.stop.items()}.items():
             await self._supervisor.end(process_id, killed, self._reason(process_id, killed))
+            if not killed:
+                await self._await_final(process_id, actions.time_ns)
         begun = list(dict.fromkeys(map(process_of, actions.start)))
         self._supervisor.begin_again(begun)
         await self._await_returned(begun)
@@ -79,6 +81,10 @@ class Driver(ABC):
         if killed:
             return "killed by a fault"
         return "it has left" if self._emulation.presence.is_outside(process_id) else "restarted by a fault"
+
+    @abstractmethod
+    async def _await_final(self, process_id: str, time_ns: int) -> None:
+        """Wait for the last message of a process that a fault ended at `time_ns`, if time can wait."""
 
     @abstractmethod
     async def _await_returned(self, process_ids: Sequence[str]) -> None:

@@ -70,7 +70,7 @@ class Inbox:
         self._incoming: deque[tuple[Callable[[str, Any], None], str, Any]] = deque()
         self._wake_pending = False
         self._closed = False
-        self.handlers: dict[type, Handler] = {wire.StackDump: self._take_stack}
+        self.handlers: dict[type, Handler] = {wire.StackDump: self._take_stack, wire.Final: _ignore}
         self.connected: set[str] = set()
         self.stacks: dict[str, str] = {}
 
@@ -133,3 +133,7 @@ class Inbox:
 
     def _take_stack(self, node: str, message: wire.StackDump) -> None:
         self.stacks[node] = message.text
+
+
+def _ignore(node: str, message: Any) -> None:
+    """Take a message that means nothing before the run."""

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 
 from emulator.drivers.live.driver import Driver, Parts
+from emulator.drivers.live.supervisor import DEATH_GRACE_S, ProcessState
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.protocol import check_ownership
 from vnet.transport import wire
 
+FINAL_WAIT_S = 1.0
+"""Seconds for which the last message of a process that a fault ends is awaited."""
 STACKS_WAIT_S = 1.0
 """Seconds for which the stacks of processes that do not yield are awaited."""
 
@@ -33,6 +37,9 @@ class LockstepDriver(Driver):
         super().__init__(parts, processes)
         self._lockstep = Lockstep(parts.emulation, processes)
         self._before_horizon = before_horizon
+        self._finals: dict[str, wire.Traffic] = {}
+        self._completed = False
+        parts.inbox.handlers[wire.Final] = self._take_final
 
     @property
     def time_ns(self) -> int:
@@ -62,9 +69,32 @@ class LockstepDriver(Driver):
                 grants = lockstep.step()
         for process_id, details in self._supervisor.take_deaths().items():
             lockstep.died(process_id, **details)
+        self._completed = True
+
+    def _take_final(self, process_id: str, message: wire.Final) -> None:
+        check_ownership(self._parts.members.nodes_with(process_id), message.traffic)
+        self._finals[process_id] = message.traffic
+        self._changes.set()
 
     async def finish(self, deadline_s: float) -> None:
-        """Nothing is left: the last yields were taken before the end."""
+        """Take what programs told as they were ended."""
+        there = self._supervisor.processes_in(ProcessState.RUNNING, ProcessState.PAUSED)
+        await self._all_final(there, deadline_s)
+        time_ns = self._emulation.duration_ns if self._completed else self.time_ns
+        self._emulation.take_final(time_ns, self._finals.values())
+
+    async def _await_final(self, process_id: str, time_ns: int) -> None:
+        await self._all_final([process_id], time.monotonic() + FINAL_WAIT_S)
+        if (traffic := self._finals.pop(process_id, None)) is not None:
+            self._emulation.take_final(time_ns, [traffic])
+
+    async def _all_final(self, process_ids: Collection[str], deadline_s: float) -> None:
+        """Wait until these processes have sent their last message, or have gone without: it is optional."""
+        while missing := [process_id for process_id in process_ids if process_id not in self._finals]:
+            if self._parts.inbox.connected.isdisjoint(missing):
+                deadline_s = min(deadline_s, time.monotonic() + DEATH_GRACE_S)
+            if not await self._changes.wait(deadline_s - time.monotonic()):
+                return
 
     async def _all_yielded(self) -> None:
         timeout_s = self._emulation.scenario.run.stall_timeout_s

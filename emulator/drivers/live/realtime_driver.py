@@ -61,6 +61,9 @@ class RealTimeDriver(Driver):
     async def _await_returned(self, process_ids: Sequence[str]) -> None:
         """Wait for nobody: `run` sees which processes have returned."""
 
+    async def _await_final(self, process_id: str, time_ns: int) -> None:
+        """Wait for nobody: time goes on."""
+
     async def finish(self, deadline_s: float) -> None:
         """Wait for the last acknowledgements, and decide what nobody has acknowledged."""
         while self._is_final_missing() and await self._changes.wait(deadline_s - time.monotonic()):

@@ -69,7 +69,7 @@ async def test_fails(vnet_emulation):
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
-            "*agents_alive is invalid: 1 of 3 nodes: v02 crashed at 1.500 s: RuntimeError: where has*",
+            "*agents_alive is invalid: v02 crashed at 1.5 s: RuntimeError: where has*",
             "*files: */vnet-1",
             "*again: vnet simulate */vnet-1/scenario.toml",
             "*- vnet -*",

@@ -34,11 +34,13 @@ reports = st.builds(
 )
 frames = st.builds(wire.Frame, names, st.binary(max_size=64))
 endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
+unhandled = st.builds(wire.Unhandled, names, st.none() | times, names, names, names)
 traffic = st.builds(
     wire.Traffic,
     st.lists(frames, max_size=3),
     st.lists(reports, max_size=3),
     st.lists(endings, max_size=2),
+    st.lists(unhandled, max_size=2),
 )
 histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(
@@ -54,6 +56,7 @@ agent_messages = st.one_of(
         st.none() | st.builds(wire.Lateness, histograms),
         st.booleans(),
     ),
+    st.builds(wire.Final, st.binary(), traffic),
     st.builds(wire.StackDump, st.binary(), names),
 )
 emulator_messages = st.one_of(

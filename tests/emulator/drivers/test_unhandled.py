@@ -1,0 +1,376 @@
+"""Exceptions that nobody handles make a run invalid; whatever asyncio takes for handled does not."""
+
+import asyncio
+import gc
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from emulator.checks.judge import judge
+from emulator.checks.run import check_no_exceptions
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import MOST_EXCEPTIONS, Emulation
+from emulator.records.failures import kinds_of
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import Event
+from emulator.records.verdicts import CheckResult, Verdict
+from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from vnet.node import Node
+
+Run = Callable[[Any], Emulation]
+held: list[object] = []
+"""Objects that a program's process holds when the run ends."""
+
+
+@pytest.fixture(autouse=True)
+def _quiet(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.CRITICAL, "asyncio")
+    held.clear()
+
+
+async def fails(after_s: float = 0.5) -> None:
+    await asyncio.sleep(after_s)
+    raise ValueError("boom")
+
+
+async def sends(node: Node) -> None:
+    async for _ in node.gnss:
+        await node.radio.broadcast(b"x")
+
+
+# Programs whose exceptions nobody handles.
+
+
+async def forgets_a_task(node: Node) -> None:
+    asyncio.create_task(fails())  # noqa: RUF006
+    await sends(node)
+
+
+async def holds_a_task(node: Node) -> None:
+    task = asyncio.create_task(fails())
+    await sends(node)
+    await task
+
+
+async def leaves_a_task_to_the_collector(node: Node) -> None:
+    async def knows_itself() -> None:
+        task = asyncio.current_task()
+        await asyncio.sleep(0.5)
+        raise ValueError(f"boom of {task is not None}")
+
+    asyncio.create_task(knows_itself())  # noqa: RUF006
+    await sends(node)
+
+
+async def collects(node: Node) -> None:
+    asyncio.get_running_loop().call_later(1.0, gc.collect)
+    await leaves_a_task_to_the_collector(node)
+
+
+async def fails_in_a_callback(node: Node) -> None:
+    asyncio.get_running_loop().call_later(0.5, lambda: 1 / 0)
+    await sends(node)
+
+
+async def fails_soon(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    asyncio.get_running_loop().call_soon(int, "x")
+    await sends(node)
+
+
+async def fails_when_done(node: Node) -> None:
+    done = asyncio.create_task(asyncio.sleep(0.5))
+    done.add_done_callback(lambda task: int("x"))
+    await sends(node)
+
+
+async def drops_a_job(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    asyncio.get_running_loop().run_in_executor(None, int, "x")
+    await sends(node)
+
+
+async def holds_a_job(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    held.append(asyncio.get_running_loop().run_in_executor(None, int, "x"))
+    await sends(node)
+
+
+async def drops_what_it_gathers(node: Node) -> None:
+    asyncio.gather(fails(), asyncio.sleep(9))
+    await sends(node)
+
+
+async def fails_a_future(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    held.append(future := asyncio.get_running_loop().create_future())
+    future.set_exception(ValueError("boom"))
+    await sends(node)
+
+
+async def shields_and_forgets(node: Node) -> None:
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(fails()), 0.1)
+    await sends(node)
+
+
+async def fails_at_the_end(node: Node) -> None:
+    try:
+        await sends(node)
+    finally:
+        raise ValueError("boom")
+
+
+async def a_task_fails_at_the_end(node: Node) -> None:
+    held.append(asyncio.create_task(fails_at_the_end(node)))
+    await asyncio.sleep(99)
+
+
+UNHANDLED: dict[Callable[[Node], Awaitable[None]], tuple[str, float]] = {
+    forgets_a_task: ("in a task", 0.5),
+    holds_a_task: ("in a task", 0.5),
+    leaves_a_task_to_the_collector: ("in a task", 0.5),
+    collects: ("in a task", 0.5),
+    fails_in_a_callback: ("in a callback", 0.5),
+    fails_soon: ("in a callback", 0.5),
+    fails_when_done: ("in a callback", 0.5),
+    drops_a_job: ("in an executor job", 0.5),
+    holds_a_job: ("in an executor job", 0.5),
+    drops_what_it_gathers: ("in a task", 0.5),
+    shields_and_forgets: ("in a task", 0.5),
+    fails_a_future: ("in a future", 0.5),
+    fails_at_the_end: ("in main", 3.0),
+    a_task_fails_at_the_end: ("in a task", 3.0),
+}
+
+
+# Programs that handle them.
+
+
+async def gathers(node: Node) -> None:
+    await asyncio.gather(fails(), asyncio.sleep(0.1), return_exceptions=True)
+    with pytest.raises(ValueError):
+        await asyncio.gather(fails(), fails(0.7))
+    await sends(node)
+
+
+async def waits_for(node: Node) -> None:
+    with pytest.raises(ValueError):
+        await asyncio.wait_for(fails(), 1.0)
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(fails(), 0.1)
+    await sends(node)
+
+
+async def groups(node: Node) -> None:
+    with pytest.raises(ExceptionGroup):
+        async with asyncio.TaskGroup() as group:
+            group.create_task(fails())
+            group.create_task(fails(0.5))
+            group.create_task(asyncio.sleep(9))
+    await sends(node)
+
+
+async def shields(node: Node) -> None:
+    inner = asyncio.create_task(fails())
+    with pytest.raises(TimeoutError):
+        await asyncio.wait_for(asyncio.shield(inner), 0.1)
+    with pytest.raises(ValueError):
+        await inner
+    await sends(node)
+
+
+async def cancels(node: Node) -> None:
+    task = asyncio.create_task(fails())
+    await asyncio.sleep(0.2)
+    task.cancel()
+    await sends(node)
+
+
+async def awaits_late(node: Node) -> None:
+    task = asyncio.create_task(fails())
+    await asyncio.sleep(2.0)
+    with pytest.raises(ValueError):
+        await task
+    await sends(node)
+
+
+async def awaits_at_the_end(node: Node) -> None:
+    task = asyncio.create_task(fails())
+    try:
+        await sends(node)
+    finally:
+        assert isinstance(task.exception(), ValueError)
+
+
+async def awaits_a_job(node: Node) -> None:
+    with pytest.raises(ValueError):
+        await asyncio.to_thread(int, "x")
+    await sends(node)
+
+
+async def has_a_handler(node: Node) -> None:
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
+    await forgets_a_task(node)
+
+
+HANDLED = [
+    gathers,
+    waits_for,
+    groups,
+    shields,
+    cancels,
+    awaits_late,
+    awaits_at_the_end,
+    awaits_a_job,
+    has_a_handler,
+]
+
+
+def entry(program: Callable[[Node], Awaitable[None]]) -> str:
+    return f"{__name__}:{program.__name__}"
+
+
+def exceptions(emulation: Emulation) -> list[Event]:
+    return [event for event in emulation.folder.events if event.kind == "exception"]
+
+
+def judged(emulation: Emulation) -> CheckResult:
+    judgement, _ = conclude(emulation, 1.0, "simulate")
+    return next(check for check in judgement.checks if check.name == "no_exceptions")
+
+
+RUNS = {"simulated": (run_together, 1), "processes": (run_apart, 1), "shared": (run_apart, 2)}
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("program", UNHANDLED, ids=lambda program: program.__name__)
+def test_what_nobody_handles_is_told_with_its_instant(program: Callable[..., Any], run: str) -> None:
+    drive, nodes_per_process = RUNS[run]
+    emulation = drive(scenario_of([], entry(program), vehicles=2, run={"nodes_per_process": nodes_per_process}))
+    place, time_s = UNHANDLED[program]
+    found = [
+        (event.node, event.time_ns / 1e9, event.details["place"].partition(" (")[0])
+        for event in exceptions(emulation)
+    ]
+    assert found == [("v01", time_s, place), ("v02", time_s, place)]
+    assert all("Error" in event.details["where"] for event in exceptions(emulation))
+    assert judged(emulation).verdict is Verdict.INVALID
+
+
+@pytest.mark.parametrize("program", HANDLED, ids=lambda program: program.__name__)
+def test_what_a_program_handles_is_none(program: Callable[..., Any]) -> None:
+    emulation = run_together(scenario_of([], entry(program), vehicles=2))
+    assert exceptions(emulation) == []
+    assert judged(emulation).verdict is Verdict.VALID
+    assert not [event for event in emulation.folder.events if event.kind == "crashed"]
+
+
+def test_the_node_goes_on_and_the_trace_does_not_depend_on_it() -> None:
+    failing = run_together(scenario_of([], entry(forgets_a_task)))
+    sound = run_together(scenario_of([], entry(sends)))
+    assert failing.engine.trace.to_table().equals(sound.engine.trace.to_table())
+
+
+FAULTS = [
+    {"kind": "kill", "at_s": 1.0, "duration_s": 0.5, "nodes": {"ids": ["v01"]}},
+    {"kind": "restart", "at_s": 1.1, "duration_s": 0.4, "nodes": {"ids": ["v02"]}},
+]
+
+
+@pytest.mark.parametrize(
+    "program", [forgets_a_task, holds_a_task, fails_at_the_end, collects], ids=lambda p: p.__name__
+)
+def test_faults_on_processes_change_nothing_between_live_and_simulated(program: Callable[..., Any]) -> None:
+    faults = (
+        FAULTS[1:] if program is fails_at_the_end else FAULTS
+    )  # what is left of the killed would fail when collected
+    together, apart = (run(scenario_of(faults, entry(program))) for run in (run_together, run_apart))
+
+    def told(emulation: Emulation) -> list[tuple[Any, ...]]:
+        return sorted((event.time_ns, event.node, event.details["place"]) for event in exceptions(emulation))
+
+    assert told(together) == told(apart)
+    restarted = [time_ns / 1e9 for time_ns, node, _ in told(apart) if node == "v02"]
+    killed = [time_ns / 1e9 for time_ns, node, _ in told(apart) if node == "v01"]
+    if program is fails_at_the_end:
+        assert (restarted, killed) == ([1.1, 3.0], [3.0])
+    elif program is forgets_a_task:
+        assert (restarted, killed) == ([0.5, 2.0], [0.5, 2.0])
+    else:
+        assert (restarted, killed) == ([0.5, 2.0], [2.0]), (
+            "nobody knows whether the killed one would have awaited it"
+        )
+
+
+async def fails_often(node: Node) -> None:
+    while True:
+        asyncio.get_running_loop().call_soon(int, f"x of {node.id}")
+        await asyncio.sleep(0.1)
+
+
+def test_a_flood_is_cut_and_counted() -> None:
+    emulation = run_together(scenario_of([], entry(fails_often), vehicles=2))
+    check = judged(emulation)
+    assert len(exceptions(emulation)) == 2 * MOST_EXCEPTIONS
+    left_out = [
+        (e.node, e.details["what"], e.details["count"]) for e in emulation.folder.events if e.kind == "left_out"
+    ]
+    assert left_out == [("v01", "exception", 30 - MOST_EXCEPTIONS), ("v02", "exception", 30 - MOST_EXCEPTIONS)]
+    assert check.figures["count"] == 60
+    assert check.text.startswith(
+        "2 vehicles: ValueError: invalid literal for int() with base 10: 'x of v01', in a ca"
+    )
+
+
+async def exits(node: Node) -> None:
+    async def leave() -> None:
+        await asyncio.sleep(0.5)
+        raise SystemExit(3 if node.id == "v01" else 0)
+
+    held.append(asyncio.create_task(leave()))
+    await sends(node)
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart])
+def test_sys_exit_in_a_task_ends_the_node_alone(run: Run) -> None:
+    emulation = run(scenario_of([], entry(exits), vehicles=3))
+    ended = [(event.kind, event.node, event.time_ns) for event in emulation.folder.events if event.node]
+    assert ended == [
+        ("crashed", "v01", 500_000_000),
+        ("finished", "v02", 500_000_000),
+        ("finished", "v03", 500_000_000),
+    ]
+
+
+def test_kinds_are_told_in_one_line_each() -> None:
+    raised = [
+        Event(500_000_000, "exception", f"v{n}", {"error": "ValueError", "place": "in a task (bg.py:5)"})
+        for n in range(3)
+    ]
+    assert [str(kind) for kind in kinds_of(raised)] == [
+        "3 vehicles: ValueError: in a task (bg.py:5), first at 0.5 s"
+    ]
+    crashed = [
+        Event(0, "crashed", f"v{n}", {"error": "KeyError: 'x'", "where": 'File "a.py", line 3, in f'})
+        for n in range(12)
+    ]
+    assert [str(kind) for kind in kinds_of(crashed)] == ["12 vehicles crashed at 0.0 s: KeyError: 'x'"]
+    assert str(kinds_of([*crashed, Event(1, "crashed", "v99", crashed[0].details)])[0]).startswith(
+        "13 vehicles crashed, first at"
+    )
+    (died,) = kinds_of([Event(1_250_000_000, "died", "v1", {"how": "SIGKILL"})])
+    assert str(died) == "v1 died at 1.25 s: SIGKILL"
+
+
+def test_without_a_start_nothing_is_known() -> None:
+    emulation = run_together(scenario_of([], entry(sends), vehicles=2))
+    conclude(emulation, 1.0, "simulate")
+    recorded = RecordedRun.open(emulation.folder.path)
+    assert judge(recorded).verdict is Verdict.VALID
+    recorded.events[:] = [event for event in recorded.events if event.kind != "started"]
+    finding = check_no_exceptions(recorded)
+    assert isinstance(finding, CheckResult)
+    assert finding.verdict is Verdict.UNKNOWN

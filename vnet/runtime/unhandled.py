@@ -1,0 +1,214 @@
+"""Exceptions of programs that nobody handles: in tasks nobody awaits, callbacks, executor jobs that were dropped.
+
+An exception that somebody retrieves, however late, is none. asyncio tells of the others when it discards the task
+or future; so the instant is remembered when it fails. What reference counting discards is told at once, which is
+the same in every process and every run. What the garbage collector finds, and what is still held, is told when the
+program ends: nothing here depends on when the collector runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import gc
+import logging
+import sysconfig
+import traceback
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from vnet.node import Node
+from vnet.runtime import asyncio_internals
+from vnet.runtime.current_node import current_node
+from vnet.runtime.programs import error_line
+from vnet.runtime.virtual_time import SkewedLoop
+from vnet.transport.wire import Unhandled
+
+LONGEST_TRACEBACK = 8000
+"""Characters of a traceback that is kept: its last ones."""
+MOST_HELD = 1000
+"""Exceptions that a process keeps until its end; of a flood, the first ones."""
+FIRST_CLEANING = 1000
+"""Failures that are remembered before those that have been retrieved are forgotten."""
+_NOT_THE_PROGRAM = (
+    f"{Path(__file__).parents[1]}/",
+    *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
+)
+"""Folders of code that is no program: vnet, the standard library, installed packages."""
+_NO_CONTEXT = contextvars.Context()
+_logger = logging.getLogger("asyncio")
+_SHIELDED = "exception in shielded future"
+"""End of asyncio's message, from Python 3.14 on, about a future whose caller was cancelled: that is legal."""
+
+
+class _Collector:
+    """Knows whether the garbage collector runs; registered once for the whole process."""
+
+    runs = False
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        self.runs = phase == "start"
+
+
+_collector = _Collector()
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """A task or future that failed: when, and whose it is."""
+
+    future: Callable[[], asyncio.Future[Any] | None]
+    time_ns: int | None
+    owner: Node | None
+    place: str
+
+
+class UnhandledExceptions:
+    """The exceptions of one loop's programs that nobody has handled.
+
+    `now_ns` gives the emulated time to be told for a node, and None while its program is ended; `fallback` is the
+    node that answers for code on nobody's behalf.
+    """
+
+    def __init__(self, now_ns: Callable[[Node | None], int | None], fallback: str) -> None:
+        self._loop: SkewedLoop | None = None
+        self._now_ns = now_ns
+        self._fallback = fallback
+        self._most = FIRST_CLEANING
+        self._failures: dict[int, _Failure] = {}  # by the id of the future, which is gone when asyncio tells of it
+        self._ready: list[Unhandled] = []
+        self._held: list[tuple[_Failure, BaseException]] = []  # nothing is formatted while the collector runs
+        self._silenced: weakref.WeakSet[Node] = weakref.WeakSet()
+
+    def attach(self, loop: SkewedLoop) -> None:
+        """Have the loop of the programs tell of what fails, until `close`."""
+        self._loop = loop
+        loop.on_failed, loop.on_unhandled = self._failed, self._unhandled
+        if _collector not in gc.callbacks:
+            gc.callbacks.append(_collector)
+
+    def watch(self, task: asyncio.Task[Any], owner: Node | None) -> None:
+        """Remember when a task fails."""
+
+        def done(task: asyncio.Future[Any]) -> None:
+            if asyncio_internals.is_unretrieved(task):
+                self._note(task, owner, "in a task")
+
+        task.add_done_callback(done, context=_NO_CONTEXT)
+
+    def add(self, owner: Node, error: BaseException, place: str) -> None:
+        """Take an exception that has just been caught outside asyncio."""
+        self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
+
+    def take(self) -> list[Unhandled]:
+        """Return the exceptions that are told by now, in the order of their instants."""
+        ready, self._ready = self._ready, []
+        return sorted(ready, key=lambda each: (each.time_ns is None, each.time_ns))
+
+    def settle(self, owner: Node | None = None) -> None:
+        """Tell of everything that nobody has retrieved by now, of all nodes or of one whose program has ended."""
+        for key, failure in list(self._failures.items()):
+            future = failure.future()
+            if owner in (None, failure.owner) and future is not None and asyncio_internals.is_unretrieved(future):
+                del self._failures[key]
+                self._held.append((failure, asyncio_internals.disclaim(future)))
+        held, self._held = self._held, []
+        for failure, error in held:
+            if owner not in (None, failure.owner):
+                self._held.append((failure, error))
+                continue
+            _logger.error("Exception %s was never retrieved", failure.place, exc_info=error)
+            self._ready_unless_silenced(failure, error)
+
+    def silence(self, owner: Node) -> None:
+        """Tell nothing more of this node: its process is gone."""
+        self._silenced.add(owner)
+        self._held = [(failure, error) for failure, error in self._held if failure.owner is not owner]
+
+    def close(self) -> None:
+        """Watch nothing any more."""
+        if self._loop is not None:
+            self._loop.on_failed, self._loop.on_unhandled = _ignore, _only_log
+            self._loop = None
+
+    # What asyncio tells.
+
+    def _failed(self, future: asyncio.Future[Any]) -> None:
+        """A future, which is no task, was given an exception."""
+        context = getattr(future, "job_context", None)
+        owner = current_node.get() if context is None else context.get(current_node)
+        self._note(future, owner, "in a future" if context is None else "in an executor job")
+
+    def _note(self, future: asyncio.Future[Any], owner: Node | None, place: str) -> None:
+        if len(self._failures) >= self._most and not _collector.runs:
+            self._forget_retrieved()
+        self._failures[id(future)] = _Failure(weakref.ref(future), self._now_ns(owner), owner, place)
+
+    def _forget_retrieved(self) -> None:
+        futures = {key: failure.future() for key, failure in self._failures.items()}
+        for key, future in futures.items():
+            if future is None or not asyncio_internals.is_unretrieved(future):
+                del self._failures[key]
+        self._most = 2 * len(self._failures) + FIRST_CLEANING
+
+    def _unhandled(self, context: dict[str, Any]) -> bool:
+        """Asyncio's exception handler was called; returns whether asyncio is to log it now."""
+        error = context.get("exception")
+        if error is None or str(context.get("message")).endswith(_SHIELDED):
+            return True
+        failure = self._failure_of(context, error)
+        if not _collector.runs:
+            self._ready_unless_silenced(failure, error)
+        elif len(self._held) < MOST_HELD and failure.owner not in self._silenced:
+            self._held.append((failure, error))
+        return not _collector.runs
+
+    def _failure_of(self, context: dict[str, Any], error: BaseException) -> _Failure:
+        future = context.get("future")
+        if future is None:
+            handle = context.get("handle")
+            owner = current_node.get() if handle is None else asyncio_internals.context_of(handle).get(current_node)
+            return _Failure(_nothing, self._now_ns(owner), owner, "in a callback")
+        for each in (future, *asyncio_internals.gathered(future)):
+            failure = self._failures.get(id(each))
+            if failure is not None and (each is future or asyncio_internals.error_of(each) is error):
+                if each is future:
+                    del self._failures[id(each)]
+                return failure
+        owner = current_node.get()
+        return _Failure(_nothing, self._now_ns(owner), owner, "in a future")
+
+    def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
+        if failure.owner not in self._silenced and not isinstance(error, KeyboardInterrupt):
+            self._ready.append(self._of(failure, error))
+
+    def _of(self, failure: _Failure, error: BaseException) -> Unhandled:
+        node = self._fallback if failure.owner is None else failure.owner.id
+        line = _own_line(error.__traceback__)
+        place = f"{failure.place} ({line})" if line else failure.place
+        details = "".join(traceback.format_exception(error))[-LONGEST_TRACEBACK:]
+        return Unhandled(node, failure.time_ns, error_line(error), place, details)
+
+
+def _own_line(trace: TracebackType | None) -> str:
+    """File and line of the innermost frame that is the program's own, or of the innermost of all."""
+    lines = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(trace)]
+    own = [line for line in lines if not line[0].startswith(_NOT_THE_PROGRAM)] or lines
+    return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
+
+
+def _nothing() -> None:
+    """Stand in for the reference to a future that nobody asks for."""
+
+
+def _ignore(future: asyncio.Future[Any]) -> None:
+    """Take no note."""
+
+
+def _only_log(context: dict[str, Any]) -> bool:
+    """Have asyncio log it, and no more."""
+    return True
