@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from agents.host import _Attachment
+from agents.attachment import Attachment
 from vnet.transport import wire
 
 
-def attachment() -> _Attachment:
+def attachment() -> Attachment:
     """The attachment of v01, to a session that does nothing."""
     declare = SimpleNamespace(
         declare_token=lambda *a: nullcontext(), declare_subscriber=lambda *a, **k: nullcontext()
@@ -20,7 +20,7 @@ def attachment() -> _Attachment:
         declare_subscriber=declare.declare_subscriber,
         liveliness=lambda: declare,
     )
-    return _Attachment(session, "run", ["v01"], ExitStack())
+    return Attachment(session, "run", ["v01"], ExitStack())
 
 
 @pytest.mark.parametrize("data", [b"\xc1", b"", b"\x93\xa5Grant\xa1x", b"\x91\xa9Nonsense1", b"\x81\x01\x02"])
