@@ -19,7 +19,7 @@ from emulator.cli.options import (
     SetOption,
     load,
 )
-from emulator.terminal.console import one_line_errors
+from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.standard_output import result_only
 
 
@@ -42,7 +42,11 @@ def campaign(
     scenario: ScenarioArgument,
     runs: Annotated[int, typer.Option(min=1, metavar="N", help="How many runs.")] = 200,
     faults: Annotated[
-        str, typer.Option(metavar="KINDS", help="random, or the kinds to draw from: kill,partition.")
+        str,
+        typer.Option(
+            metavar="KINDS",
+            help="random, the kinds to draw from (kill,partition), or none: the runs differ by their seeds.",
+        ),
     ] = "random",
     program: ProgramOption = None,
     seed: SeedOption = None,
@@ -62,10 +66,13 @@ def campaign(
     ] = 300.0,
 ) -> None:
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
-    from emulator.testing.campaign import Plan, run_campaign
+    from emulator.testing.campaign import run_campaign
+    from emulator.testing.campaign_plan import Plan
 
     with one_line_errors(), result_only(True):
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
         limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
         plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)
+        if plan.note:
+            tell(plan.note)
         raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))

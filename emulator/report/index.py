@@ -13,11 +13,12 @@ from typing import Any
 from urllib.parse import quote
 
 from emulator.pages.page import put_page, render
+from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_files import is_run_folder
 from emulator.records.run_folder import INDEX, RECORDING, REPORT, SCENARIO_FILE, VERDICT_FILE
 from emulator.records.verdict_file import Record
-from vnet.errors import VnetError
+from vnet.errors import VnetError, first_names
 
 MOST_REPORTED = 6
 """Values of programs' own that have a column: those that most runs report."""
@@ -70,7 +71,26 @@ def index_page(folder: Path) -> str:
         name=folder.resolve().name,
         columns=titles | {column.title: column.kind for column in numbers} | {"files": "less"},
         entries=[_row(entry, entry.folder.resolve() == latest, numbers) for entry in entries],
+        campaigns=sorted(_campaigns(folder), key=lambda campaign: campaign["when"], reverse=True),
     )
+
+
+def _campaigns(folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the campaigns in a folder."""
+    for path in sorted(each.parent for each in folder.glob(f"*/{CAMPAIGN_FILE}")):
+        row: dict[str, Any] = {"name": path.name, "problem": "", "runs": "–", "failed": "", "kinds": ""}
+        try:
+            row["when"] = datetime.fromtimestamp((path / CAMPAIGN_FILE).stat().st_mtime).astimezone()
+            record = read_campaign(path)
+            done = len(record.results)
+            row["runs"] = str(done) if done == record.runs else f"{done} of {record.runs}"
+            row["failed"] = record.failed
+            row["kinds"] = first_names(record.kinds, 4, with_total=True) or "none"
+        except VnetError as error:
+            row["problem"] = str(error).removeprefix(f"{path}/")
+        except OSError:
+            continue  # it has just been removed
+        yield row | {"link": _link(path, CAMPAIGN_PAGE if (path / CAMPAIGN_PAGE).is_file() else "")}
 
 
 def _entries(folder: Path) -> Iterator[Entry]:

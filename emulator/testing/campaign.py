@@ -7,7 +7,6 @@ schedule, so that it alone reproduces a failure. No failure stops a campaign; Ct
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import signal
 import tempfile
@@ -15,108 +14,57 @@ import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from emulator.checks.own import load_checks
+from emulator.checks.own import is_broken
 from emulator.records.atomic import write_atomically
+from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
-from emulator.scenario.faults import KINDS
+from emulator.records.verdicts import Verdict
+from emulator.report.index import write_index
 from emulator.scenario.scenario import Scenario, dump_scenario
+from emulator.testing.campaign_plan import Plan
+from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.schedules import ScheduleConstraints, draw_fault, known_kinds
-from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
+from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
-from vnet.errors import ScenarioError, VnetError
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
+from vnet.errors import VnetError
 
 FORMAT = 1
-LONGEST_S = 20.0
-MOST_FAULTS = 4
 WRITE_EVERY = 20
-SEEDS = 2**63
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """The runs of a campaign. `shrink_steps` bounds the runs that shrink a failure, `limit_s` each run's time."""
-
-    scenario: Scenario
-    runs: int
-    seed: int
-    kinds: tuple[str, ...]
-    limit_s: float = 300.0
-    shrink_steps: int = MOST_STEPS
-    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
-
-    @classmethod
-    def of(cls, scenario: Scenario, faults: str, runs: int, seed: int, **options: Any) -> Plan:
-        """A plan; `faults` is "random", or the kinds to draw from with commas between. Raises VnetError."""
-        run = scenario.run
-        if run.duration_s > LONGEST_S:
-            raise ScenarioError(
-                f"run.duration_s = {run.duration_s:g}: a campaign's runs take {LONGEST_S:g} s at most"
-            )
-        kinds = known_kinds(None if faults == "random" else faults.split(","))
-        plain = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()})
-        ScheduleConstraints.of(plain)
-        search_programs_in(plain.program.folders)
-        load_program(plain.program.entry)
-        load_checks(plain.program)
-        return cls(plain, runs, seed, kinds, **options)
-
-    def draw(self, number: int) -> Scenario:
-        """Run `number`: a network, a seed and one to four faults."""
-        seed = (self.seed + number) % SEEDS
-        changes: dict[str, Any] = {"seed": seed}
-        if self.scenario.network.kind == "generated":
-            changes["network.seed"] = seed
-        scenario = make_scenario(self.scenario, changes)
-        choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
-        weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
-        faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
-        return make_scenario(scenario, {"faults": faults})
-
-
-class _Random:
-    """A Chooser with a random generator."""
-
-    def __init__(self, seed: int) -> None:
-        self._rng = np.random.default_rng(seed)
-
-    def integer(self, low: int, high: int) -> int:
-        return int(self._rng.integers(low, high, endpoint=True))
-
-    def choice(self, items: Sequence[T]) -> T:
-        return items[self.integer(0, len(items) - 1)]
-
-    def subset(self, items: Sequence[T], most: int) -> list[T]:
-        chosen = self._rng.permutation(len(items))[: self.integer(1, most)]
-        return [items[number] for number in sorted(chosen.tolist())]
 
 
 @dataclass(frozen=True)
 class Outcome:
     """A run that is over; of one that failed also the shrunk one, and the folder where it is kept."""
 
-    seed: int
+    number: int
+    """Number of the run in its campaign, from 1."""
     scenario: Scenario
     trial: Trial
     shrunk: Scenario | None = None
     again: Trial | None = None
     steps: int = 0
     folder: Path | None = None
+
+    @property
+    def seed(self) -> int:
+        """Seed of the run."""
+        return self.scenario.run.seed
+
+    @property
+    def label(self) -> str:
+        """Name of its folder, should it have failed."""
+        return f"{self.number:03d}"
 
     @property
     def kinds(self) -> list[str]:
@@ -179,16 +127,25 @@ class Campaign:
         self._plan = plan
         self._folder = folder
         self._progress = progress
-        self._lock = threading.Lock()
-        self._numbers = count(1)
         self._workshop = TrialPool(plan.limit_s, [plan.scenario.program.entry.partition(":")[0]])
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 
     @property
     def failures(self) -> list[Outcome]:
-        """The runs that have failed, by seed."""
-        return sorted((o for o in self.outcomes if o.trial.failed), key=lambda o: o.seed)
+        """The runs that have failed, by number."""
+        return sorted((o for o in self.outcomes if o.trial.failed), key=lambda o: o.number)
+
+    @property
+    def kinds(self) -> list[FailureKind]:
+        """The ways in which runs have failed, the most frequent first."""
+        return failure_kinds((outcome.label, outcome.texts()) for outcome in self.failures)
+
+    @property
+    def broken(self) -> list[FailureKind]:
+        """The ways in which checks of the user's own could not be made."""
+        runs = sorted(self.outcomes, key=lambda o: o.number)
+        return failure_kinds((o.label, {n: t for n, t in o.trial.texts.items() if is_broken(n)}) for o in runs)
 
     def run(self) -> None:
         """All runs, on all cores; returns early, with what is there, after Ctrl-C."""
@@ -213,18 +170,18 @@ class Campaign:
 
     def _take_left(self, futures: Sequence[Future[Outcome]]) -> None:
         """Take the runs that were over, or half shrunk, when the campaign was interrupted."""
-        taken = {outcome.seed for outcome in self.outcomes}
+        taken = {outcome.number for outcome in self.outcomes}
         for future in futures:
             if future.cancelled() or future.exception() is not None:
                 continue
             outcome = future.result()
-            if outcome.seed not in taken and outcome.trial.verdicts:
+            if outcome.number not in taken and outcome.trial.verdicts:
                 self._take(outcome)
 
     def _one(self, number: int) -> Outcome:
         scenario = self._plan.draw(number)
         trial = self._try(scenario)
-        outcome = Outcome(scenario.run.seed, scenario, trial)
+        outcome = Outcome(number + 1, scenario, trial)
         return self._shrink(outcome) if trial.failed else outcome
 
     def _try(self, scenario: Scenario) -> Trial:
@@ -243,8 +200,7 @@ class Campaign:
 
         smallest, steps = shrink(outcome.scenario.fault, still_fails, self._plan.shrink_steps)
         shrunk = make_scenario(outcome.scenario, {"faults": smallest})
-        with self._lock:
-            folder = self._folder / "failures" / f"{next(self._numbers):03d}"
+        folder = self._folder / "failures" / outcome.label
         again = self._workshop.run(shrunk, folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
@@ -253,24 +209,27 @@ class Campaign:
 
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""
-        rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.seed)]
+        rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.number)]
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
-        write_atomically(self._folder / "campaign.json", json.dumps(head | {"results": rows}, indent=1) + "\n")
-        write_atomically(self._folder / "campaign.html", self._page())
+        write_atomically(self._folder / CAMPAIGN_FILE, json.dumps(head | {"results": rows}, indent=1) + "\n")
+        write_atomically(self._folder / CAMPAIGN_PAGE, self._page())
 
     def _page(self) -> str:
         run = self._plan.scenario.run
         facts = [
             f"{len(self.outcomes)} of {self._plan.runs} runs of {run.duration_s:g} emulated seconds, "
-            f"seeds from {self._plan.seed} on; {len(self.failures)} failed."
+            f"seeds from {self._plan.seed} on; {len(self.failures)} failed.",
+            *([self._plan.note + "."] if self._plan.note else []),
+            *(f"{kind.check} could not be made in {runs_of(kind)}: {kind.text}" for kind in self.broken),
         ]
         matrix = count_verdicts((outcome.kinds, outcome.trial.verdicts) for outcome in self.outcomes)
-        return page(f"Campaign {run.name}", facts, matrix, [self._described(o) for o in self.failures])
+        failures = [self._described(outcome) for outcome in self.failures]
+        return page(f"Campaign {run.name}", facts, matrix, failures, self.kinds)
 
     def _described(self, outcome: Outcome) -> dict[str, Any]:
         assert outcome.folder is not None
         return {
-            "number": outcome.folder.name,
+            "number": outcome.label,
             "seed": outcome.seed,
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
@@ -278,16 +237,26 @@ class Campaign:
             "folder": f"failures/{outcome.folder.name}",
         }
 
-    def summary(self) -> Table:
-        """The failures, for a terminal."""
+    def summary(self) -> Iterator[Table | Text]:
+        """Yield the failures for a terminal: a line a kind, and the first run of each kind in full."""
+        kinds = self.kinds
+        if len(kinds) < len(self.failures):
+            for kind in kinds:
+                yield Text(f"{runs_of(kind)}, first {kind.first}: {kind.check}: {kind.text}")
+        first = {kind.first for kind in kinds}
         table = Table(title=f"failures: {len(self.failures)} of {len(self.outcomes)} runs", title_justify="left")
         for name in ("", "seed", "failed", "smallest schedule"):
             table.add_column(name, overflow="fold")
-        for outcome in self.failures:
+        for outcome in (outcome for outcome in self.failures if outcome.label in first):
             told = self._described(outcome)
             texts = "\n".join(f"{name}: {text}" for name, text in told["checks"].items())
             table.add_row(told["number"], str(outcome.seed), Text(texts), Text(told["schedule"] or "none"))
-        return table
+        yield table
+
+
+def runs_of(kind: FailureKind) -> str:
+    """Return the number of a kind's runs with its noun."""
+    return f"{kind.runs} run{'s' if kind.runs != 1 else ''}"
 
 
 def _folders(name: str) -> Iterator[Path]:
@@ -318,7 +287,8 @@ def _interrupted_once() -> Iterator[None]:
 def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
     """Run a campaign, print its result and return the exit status. Raises VnetError.
 
-    0 if no run failed, 1 if one did, 130 if it was interrupted.
+    0 if no run failed, 1 if one did, 3 if none did but a check of the user's own could not be made, 130 if it was
+    interrupted.
     """
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
@@ -329,9 +299,17 @@ def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
     with _interrupted_once(), Progress(*columns, console=console) as progress:
         campaign = Campaign(plan, folder, progress)
         campaign.run()
+    if folder.resolve().parent.name == RUNS.name:
+        write_index(folder.resolve().parent)
     if campaign.failures:
-        console.print(campaign.summary())
-    console.print(f"{len(campaign.outcomes)} runs, {len(campaign.failures)} failed: {folder / 'campaign.html'}")
+        console.print(*campaign.summary(), sep="\n")
+    for kind in campaign.broken:
+        console.print(Text(f"unknown in {runs_of(kind)}: {kind.check}: {kind.text}"))
+    done = len(campaign.outcomes)
+    failed = f"{done} run{'s' if done != 1 else ''}, {len(campaign.failures)} failed"
+    console.print(f"{failed}: {folder / CAMPAIGN_PAGE}", highlight=False, soft_wrap=True)
     if campaign.interrupted:
         return 130
-    return 1 if campaign.failures else 0
+    if campaign.failures:
+        return Verdict.INVALID.exit_status
+    return Verdict.UNKNOWN.exit_status if campaign.broken else 0

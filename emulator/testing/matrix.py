@@ -11,6 +11,8 @@ from emulator.pages.page import render
 from emulator.records.verdicts import Verdict
 
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
+NO_FAULTS = "no faults"
+"""Row of the runs without any fault."""
 Matrix = Mapping[str, Mapping[str, Counter[Verdict]]]
 
 
@@ -24,7 +26,7 @@ def count_verdicts(runs: Iterable[tuple[Sequence[str], Mapping[str, Verdict]]]) 
     """Count the verdicts by kind of fault and check, of runs with the kinds of their faults and their verdicts."""
     matrix: dict[str, dict[str, Counter[Verdict]]] = {}
     for kinds, verdicts in runs:
-        for kind in sorted(set(kinds)):
+        for kind in sorted(set(kinds)) or [NO_FAULTS]:
             row = matrix.setdefault(kind, {})
             for check, verdict in verdicts.items():
                 column, only = column_of(check)
@@ -33,14 +35,29 @@ def count_verdicts(runs: Iterable[tuple[Sequence[str], Mapping[str, Verdict]]]) 
     return dict(sorted(matrix.items()))
 
 
-def page(title: str, facts: Sequence[str], matrix: Matrix, failures: Sequence[Mapping[str, Any]]) -> str:
+def page(
+    title: str,
+    facts: Sequence[str],
+    matrix: Matrix,
+    failures: Sequence[Mapping[str, Any]],
+    failure_kinds: Sequence[object] = (),
+) -> str:
     """Return the whole page.
 
-    A failure has `number`, `seed`, `checks` (texts by name), `schedule` (TOML), `command` and `folder`.
+    A failure has `number`, `seed`, `checks` (texts by name), `schedule` (TOML), `command` and `folder`; a kind of
+    failures `check`, `text`, `first` (a number) and `runs`.
     """
     columns = list(dict.fromkeys(column for row in matrix.values() for column in row))
     kinds = {kind: [_cell(row.get(column, Counter())) for column in columns] for kind, row in matrix.items()}
-    return render("campaign.html.j2", title=title, facts=facts, columns=columns, kinds=kinds, failures=failures)
+    return render(
+        "campaign.html.j2",
+        title=title,
+        facts=facts,
+        columns=columns,
+        kinds=kinds,
+        failures=failures,
+        failure_kinds=failure_kinds,
+    )
 
 
 def _cell(counts: Counter[Verdict]) -> tuple[Counter[Verdict], Verdict | None]:

@@ -19,6 +19,8 @@ from vnet.errors import ScenarioError, did_you_mean
 
 AT_STEPS, DURATION_STEPS = 100, 10
 """Faults start on hundredths of a second and last tenths."""
+LEAST_TIME_S = 1 / DURATION_STEPS
+"""Least time that a run must leave for faults."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class ScheduleConstraints:
     @classmethod
     def of(cls, scenario: Scenario) -> ScheduleConstraints:
         """Return the constraints of a scenario. Raises ScenarioError if there is no time for faults."""
-        if scenario.healed_s * DURATION_STEPS < 1:
+        if scenario.healed_s < LEAST_TIME_S:
             raise ScenarioError(
                 f"run.duration_s - run.settle_s = {scenario.healed_s:g}: leaves no time for faults of 0.1 s"
             )

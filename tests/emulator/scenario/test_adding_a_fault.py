@@ -14,7 +14,7 @@ from emulator.scenario.fault_draws import Drawn
 from emulator.scenario.fault_families import DelayFault, Fault, Probability
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
-from emulator.testing.campaign import Plan
+from emulator.testing.campaign_plan import Plan
 from tests.emulator.checks.test_judge import run_scenario
 from vnet.errors import ScenarioError
 from vnet.types import Array

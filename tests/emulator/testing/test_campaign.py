@@ -19,7 +19,8 @@ from emulator.checks.judge import Verdict
 from emulator.scenario.faults import Pause
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.testing import campaign
-from emulator.testing.campaign import Plan, run_campaign
+from emulator.testing.campaign import run_campaign
+from emulator.testing.campaign_plan import Plan
 from emulator.testing.matrix import column_of, count_verdicts, page
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError, ScenarioError, VnetError

@@ -12,8 +12,9 @@ from emulator.faults.selectors import Nodes
 from emulator.scenario.fault_families import Selector
 from emulator.scenario.faults import KINDS, Kill, Loss, Partition, Pause
 from emulator.scenario.scenario import Scenario
-from emulator.testing.campaign import Plan, schedule_toml
-from emulator.testing.schedules import known_kinds, simulated_kinds
+from emulator.testing.campaign import schedule_toml
+from emulator.testing.campaign_plan import Plan
+from emulator.testing.schedules import ScheduleConstraints, known_kinds, simulated_kinds
 from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.strategies import faults
 from emulator.world.world import build_world
@@ -91,7 +92,7 @@ def test_only_the_kinds_that_were_asked_for_are_drawn() -> None:
 
 def test_no_time_for_faults_is_said() -> None:
     with pytest.raises(ScenarioError, match="leaves no time for faults"):
-        Plan.of(Scenario.model_validate({"run": {"duration_s": 3.0}}), "random", 1, 1)
+        ScheduleConstraints.of(Scenario.model_validate({"run": {"duration_s": 3.0}}))
 
 
 def test_a_campaign_draws_the_same_for_a_seed_and_every_kind_at_last() -> None:

@@ -1,0 +1,48 @@
+"""`campaign.json`, read as a foreign file: how many runs of a campaign have failed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from emulator.scenario.sections import first_problem
+from vnet.bounded import read_bounded
+from vnet.errors import VnetError
+
+CAMPAIGN_FILE, CAMPAIGN_PAGE = "campaign.json", "campaign.html"
+LARGEST_BYTES = 256 * 2**20
+
+
+@dataclass(frozen=True)
+class CampaignRecord:
+    """The fields of campaign.json that a list of campaigns needs."""
+
+    seed: int
+    runs: int
+    kinds: list[str]
+    results: list[dict[str, Any]]
+
+    @property
+    def failed(self) -> int:
+        """Number of runs that have failed."""
+        return sum("failed" in result for result in self.results)
+
+
+_RECORD = TypeAdapter(CampaignRecord)
+
+
+def read_campaign(folder: Path) -> CampaignRecord:
+    """Read the campaign.json of a folder. Raises VnetError where it is not what vnet writes."""
+    path = folder / CAMPAIGN_FILE
+    try:
+        return _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValidationError as error:
+        raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
+    except (ValueError, RecursionError) as error:
+        raise VnetError(f"{path}: not JSON: {error}") from None

@@ -1,0 +1,104 @@
+"""The runs of a campaign: which scenario, how many, and which faults each of them meets."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+
+from emulator.checks.own import load_checks
+from emulator.scenario.faults import KINDS
+from emulator.scenario.scenario import Scenario
+from emulator.testing.scenarios import make_scenario
+from emulator.testing.schedules import LEAST_TIME_S, ScheduleConstraints, draw_fault, known_kinds
+from emulator.testing.shrinking import MOST_STEPS
+from vnet.errors import ScenarioError
+from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import load_program
+
+LONGEST_S = 20.0
+MOST_FAULTS = 4
+SEEDS = 2**63
+RANDOM, NONE = "random", "none"
+"""Faults of all kinds, and no faults at all: then the runs differ by their seeds."""
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The runs of a campaign. `shrink_steps` bounds the runs that shrink a failure, `limit_s` each run's time."""
+
+    scenario: Scenario
+    runs: int
+    seed: int
+    kinds: tuple[str, ...]
+    limit_s: float = 300.0
+    shrink_steps: int = MOST_STEPS
+    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    note: str = ""
+    """Change of the scenario that the campaign has made by itself, in one line; "" if none."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, faults: str, runs: int, seed: int, **options: Any) -> Plan:
+        """A plan; `faults` is "random", "none", or the kinds to draw from with commas between. Raises VnetError."""
+        run = scenario.run
+        if run.duration_s > LONGEST_S:
+            raise ScenarioError(
+                f"run.duration_s = {run.duration_s:g}: a campaign's runs take {LONGEST_S:g} s at most"
+            )
+        plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()}), ""
+        kinds = () if faults == NONE else known_kinds(None if faults == RANDOM else faults.split(","))
+        if kinds:
+            plain, note = _with_time_for_faults(plain)
+            ScheduleConstraints.of(plain)
+        search_programs_in(plain.program.folders)
+        load_program(plain.program.entry)
+        load_checks(plain.program)
+        return cls(plain, runs, seed, kinds, note=note, **options)
+
+    def draw(self, number: int) -> Scenario:
+        """Run `number`: a network, a seed and one to four faults, if there are to be any."""
+        seed = (self.seed + number) % SEEDS
+        changes: dict[str, Any] = {"seed": seed}
+        if self.scenario.network.kind == "generated":
+            changes["network.seed"] = seed
+        scenario = make_scenario(self.scenario, changes)
+        if not self.kinds:
+            return scenario
+        choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
+        weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
+        faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
+        return make_scenario(scenario, {"faults": faults})
+
+
+def _with_time_for_faults(scenario: Scenario) -> tuple[Scenario, str]:
+    """Return a scenario that leaves time for faults, half of its duration if it left none, and what was changed."""
+    run = scenario.run
+    if scenario.healed_s >= LEAST_TIME_S:
+        return scenario, ""
+    settle_s = run.duration_s / 2
+    note = (
+        f"run.settle_s = {run.settle_s:g} leaves no time for faults in {run.duration_s:g} s: this campaign takes "
+        f"{settle_s:g}"
+    )
+    return make_scenario(scenario, {"settle": settle_s}), note
+
+
+class _Random:
+    """A Chooser with a random generator."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = np.random.default_rng(seed)
+
+    def integer(self, low: int, high: int) -> int:
+        return int(self._rng.integers(low, high, endpoint=True))
+
+    def choice(self, items: Sequence[T]) -> T:
+        return items[self.integer(0, len(items) - 1)]
+
+    def subset(self, items: Sequence[T], most: int) -> list[T]:
+        chosen = self._rng.permutation(len(items))[: self.integer(1, most)]
+        return [items[number] for number in sorted(chosen.tolist())]

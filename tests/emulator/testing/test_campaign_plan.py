@@ -1,0 +1,105 @@
+"""The runs of a campaign are drawn from its seed, with time for faults; failures of one kind are one line."""
+
+from pathlib import Path
+
+import pytest
+
+from emulator.checks.judge import Verdict
+from emulator.report.index import write_index
+from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.testing.campaign_plan import Plan
+from emulator.testing.failure_kinds import FailureKind, failure_kinds
+from emulator.testing.matrix import count_verdicts, page
+from tests.support.paths import ROOT
+from vnet.errors import ScenarioError
+
+
+def scenario(duration_s: float, settle_s: float) -> Scenario:
+    return Scenario.model_validate(
+        {
+            "run": {"duration_s": duration_s, "settle_s": settle_s},
+            "network": {"vehicles": 4},
+            "fault": [{"kind": "loss", "duration_s": 0.1, "probability": 0.1}] if duration_s > settle_s else [],
+        }
+    )
+
+
+def test_a_scenario_that_leaves_no_time_for_faults_gets_some_and_is_told() -> None:
+    plan = Plan.of(load_scenario(ROOT / "scenarios" / "twelve.toml"), "random", 3, seed=1)
+    assert plan.note == "run.settle_s = 5 leaves no time for faults in 5 s: this campaign takes 2.5"
+    for number in range(3):
+        drawn = plan.draw(number)
+        assert drawn.run.settle_s == 2.5
+        assert all(fault.at_s + fault.duration_s <= 2.5 + 1e-9 for fault in drawn.fault)
+        assert drawn.fault
+
+
+def test_a_scenario_that_leaves_time_for_faults_is_taken_as_it_is() -> None:
+    plan = Plan.of(scenario(2.0, 0.5), "random", 1, seed=1)
+    assert (plan.note, plan.draw(0).run.settle_s) == ("", 0.5)
+
+
+def test_without_faults_the_runs_differ_by_their_seeds() -> None:
+    plan = Plan.of(scenario(2.0, 2.0), "none", 2, seed=7)
+    first, second = plan.draw(0), plan.draw(1)
+    assert plan.note == "" and plan.kinds == () and first.fault == second.fault == ()
+    assert [drawn.run.seed for drawn in (first, second)] == [7, 8]
+    assert [drawn.network.seed for drawn in (first, second)] == [7, 8]
+    assert first.run.settle_s == 2.0
+    assert Plan.of(scenario(2.0, 0.5), "none", 1, seed=1).draw(0).fault == ()
+
+
+def test_a_run_too_short_for_faults_is_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"run.duration_s - run.settle_s = 0.05: leaves no time for faults"):
+        Plan.of(scenario(0.1, 0.1), "random", 1, seed=1)
+    assert Plan.of(scenario(0.1, 0.1), "none", 1, seed=1).kinds == ()
+
+
+def test_the_matrix_counts_runs_without_faults() -> None:
+    matrix = count_verdicts([([], {"range": Verdict.VALID}), ([], {"range": Verdict.INVALID})])
+    assert matrix == {"no faults": {"range": {Verdict.VALID: 1, Verdict.INVALID: 1}}}
+
+
+def test_failures_that_differ_in_numbers_and_names_are_of_one_kind() -> None:
+    crash = "1 of 10 nodes: {} crashed at {} s: UnicodeDecodeError: 'utf-8' can't decode byte {} in position {}"
+    failures = [
+        ("002", {"finite": "3 reports with NaN or infinity"}),
+        ("004", {"agents_alive": crash.format("v04", 1.5, "0xcf", 28)}),
+        (
+            "009",
+            {
+                "agents_alive": crash.format("v10", 12, "0x8", 1),
+                "effect:kill-0": "nothing",
+                "effect:kill-1": "nothing",
+            },
+        ),
+    ]
+    assert failure_kinds(failures) == [
+        FailureKind("agents_alive", failures[1][1]["agents_alive"], "004", 2),
+        FailureKind("finite", "3 reports with NaN or infinity", "002"),
+        FailureKind("effect (its own)", "nothing", "009"),
+    ]
+    text = page("Campaign", [], {}, [], failure_kinds(failures))
+    assert '<td class="number">2</td><td>agents_alive</td><td><a href="#failure-004">004</a>: 1 of 10 nodes' in text
+
+
+def test_the_list_of_runs_has_the_campaigns(tmp_path: Path) -> None:
+    for name, text in {
+        "camp": '{"format": 1, "seed": 3, "runs": 4, "kinds": ["kill"], "results": [{"failed": {}}, {"seed": 4}]}',
+        "seeds": '{"seed": 3, "runs": 1, "kinds": [], "results": [{"seed": 4}]}',
+        "odd": '{"seed": 3, "runs": "<b>", "kinds": [], "results": []}',
+        "none": "{",
+    }.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "campaign.json").write_text(text)
+    (tmp_path / "camp" / "campaign.html").touch()
+    index = write_index(tmp_path).read_text()
+    assert '<a href="./camp/campaign.html">camp</a>' in index
+    assert '<td class="number">2 of 4</td><td class="number invalid">1</td>\n<td>kill</td>' in index
+    assert '<td class="number">1</td><td class="number ">0</td>\n<td>none</td>' in index
+    assert "runs = &#39;&lt;b&gt;&#39;: " in index
+    assert "campaign.json: not JSON" in index
+
+
+def test_a_list_without_campaigns_says_nothing_of_them(tmp_path: Path) -> None:
+    assert "Campaigns" not in write_index(tmp_path).read_text()
