@@ -11,16 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from emulator.api import run, simulate
+    from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
     from emulator.report.notebook import Run
 
-__all__ = ["Result", "Run", "run", "simulate"]
+__all__ = ["Result", "Run", "run", "simulate", "sweep"]
 
 _PUBLIC = {
     "Result": "emulator.checks.own",
     "Run": "emulator.report.notebook",
     "run": "emulator.api",
     "simulate": "emulator.api",
+    "sweep": "emulator.cells.sweep",
 }
 """Modules of the public names."""
 

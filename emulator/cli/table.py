@@ -73,6 +73,14 @@ COMMANDS = (
     Command(
         "conformance", Panel.BREAK, "conformance", "conformance", "Check an agent of your own against the protocol."
     ),
+    Command(
+        "sweep",
+        Panel.STUDY,
+        "sweep",
+        "sweep",
+        "Run it over values of its keys and over seeds: a table.",
+        runs_programs=True,
+    ),
     Command("analyze", Panel.STUDY, "studies", "analyze", "Analyze a network's graph without a run."),
     Command(
         "experiment",

@@ -21,7 +21,7 @@ from tests.support.paths import ROOT
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
-APART = ("campaign",)
+APART = ("campaign", "sweep")
 """Commands of vnet that are run in a process of their own, as they start some themselves."""
 PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 """Run by this Python, with these arguments first."""
@@ -40,6 +40,7 @@ ONLY_PARSED = {
 """Why these are parsed, and not run."""
 NOT_RUN = {
     "cd": "the shell's own",
+    "dask": "waits for work",
     "docker": "needs an engine",
     "ip": "changes the machine; what it executes in a namespace is parsed",
     "make": "builds an environment; the target must be there",
@@ -103,7 +104,13 @@ def _expensive(arguments: list[str]) -> bool:
     short = float(given.get("--duration", "inf")) <= SHORT_S
     many = arguments[0] == "campaign" and int(given.get("--runs", "200")) > MOST_RUNS
     slow = any(argument.endswith(EXPENSIVE) for argument in arguments)
-    return many or "realtime" in arguments or "--router" in arguments or (slow and not short)
+    return (
+        many
+        or "realtime" in arguments
+        or "--executor" in arguments
+        or "--router" in arguments
+        or (slow and not short)
+    )
 
 
 def parse(words: Sequence[str]) -> None:

@@ -38,7 +38,7 @@ def not_a_program(node: Node) -> None:
 
 
 def test_the_public_names_are_these_and_no_more() -> None:
-    assert emulator.__all__ == ["Result", "Run", "run", "simulate"]
+    assert emulator.__all__ == ["Result", "Run", "run", "simulate", "sweep"]
     for name in emulator.__all__:
         assert inspect.getdoc(getattr(emulator, name)), name
         assert name in dir(emulator)
@@ -130,6 +130,17 @@ def test_an_interrupted_simulation_is_written_down(tmp_path: Path, monkeypatch: 
             lambda: emulator.run(SMALL, program=nested()),
             r"^program = nested\.<locals>\.main of .*: run needs processes",
         ),
+        (lambda: emulator.sweep(SMALL, {}, program=nested()), r"^program = nested.*: sweep needs processes"),
+        (lambda: emulator.sweep(SMALL, {"radio.los": [1]}), r"^sweep, radio\.los = 1: radio\.los: unknown key"),
+        (lambda: emulator.sweep(SMALL, {"radio.loss": [0, 2]}), r"^sweep, radio\.loss = 2: radio\.loss = 2"),
+        (
+            lambda: emulator.sweep(SMALL, {"radio.loss": "ab"}),
+            r"^vary radio\.loss = .ab.: a list of values is needed",
+        ),
+        (lambda: emulator.sweep(SMALL, {"radio.loss": []}), r"^vary radio\.loss: at least one value"),
+        (lambda: emulator.sweep(SMALL, {"run.seed": [1]}), r"^vary run\.seed: a sweep sets it itself"),
+        (lambda: emulator.sweep(SMALL, {}, seeds=0), r"^seeds = range\(1, 1\): how many"),
+        (lambda: emulator.sweep(SMALL, {}, seeds=10**7), r"^a sweep of 10,000,000 runs"),
     ],
 )
 def test_what_cannot_be_used_is_one_line(call: Any, message: str) -> None:

@@ -70,7 +70,12 @@ def test_what_runs_programs_starts_again_before_it_imports_anything(name: str, t
 
 
 def test_the_commands_that_run_programs_are_those() -> None:
-    assert {command.name for command in COMMANDS if command.runs_programs} == {"simulate", "campaign", "experiment"}
+    assert {command.name for command in COMMANDS if command.runs_programs} == {
+        "campaign",
+        "experiment",
+        "simulate",
+        "sweep",
+    }
 
 
 def test_a_command_line_names_its_command() -> None:

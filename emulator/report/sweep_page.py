@@ -1,0 +1,167 @@
+"""The page of a sweep: each figure against the varied keys, with 95 % confidence intervals of its mean."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
+from emulator.pages.page import render, table
+from emulator.records.verdicts import Verdict
+from emulator.report.drawing import DASHES, Drawing, draw_charts
+from emulator.scenario.scenario import Scenario
+from vnet.units import title_of, unit_of
+
+CONFIDENCE = 0.95
+COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, NAVY, GREY)
+"""Colours of the curves; a ninth curve is not drawn."""
+MOST_CHARTS = 24
+NO_FIGURES = ("seed", "vehicles", "emulated_s", "wall_s", "real_time_factor")
+"""Numbers of a row that are no results."""
+Rows = Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Mean of a figure over seeds, half of its confidence interval (None for one seed), and their number."""
+
+    value: float
+    half: float | None
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g}" if self.half is None else f"{self.value:.4g} ± {self.half:.2g}"
+
+
+def mean_of(values: Sequence[float]) -> Mean:
+    """Return the mean of one number or more, with the interval of Student's t distribution."""
+    from scipy.special import stdtrit  # slow to import, and commands that write no page need it not
+
+    count = len(values)
+    if count == 1:
+        return Mean(float(values[0]), None, 1)
+    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(count))
+    return Mean(float(np.mean(values)), half, count)
+
+
+def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
+    """Return the page of the rows of a sweep over the keys `varied`."""
+    names = figures_of(rows, varied)
+    shown = _changing(rows, names)
+    drawers = {f"figure-{i}": (heading(name), partial(_draw, rows, varied, name)) for i, name in enumerate(shown)}
+    charts, missing = draw_charts(dict(list(drawers.items())[:MOST_CHARTS]) if varied else {})
+    counts = Counter(row["verdict"] for row in rows)
+    seeds = len({row["seed"] for row in rows})
+    return render(
+        "sweep.html.j2",
+        title=f"Sweep {scenario.run.name}",
+        facts=[
+            f"{len(rows)} run{'s' if len(rows) != 1 else ''} of {scenario.run.duration_s:g} emulated seconds",
+            f"{seeds} seed{'s' if seeds != 1 else ''} for each combination of values",
+            scenario.program.entry,
+        ],
+        verdicts=[(Verdict(name), count) for name, count in sorted(counts.items())],
+        charts=charts,
+        missing=missing,
+        left_out=len(drawers) - len(charts) if varied else 0,
+        means=table(_means(rows, varied, shown[:MOST_CHARTS] if varied else names)),
+        failed=table(_failed(rows, varied)),
+    )
+
+
+def figures_of(rows: Rows, varied: Sequence[str]) -> list[str]:
+    """Return the names of the figures, those that programs report first."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    found = [n for n in names if n not in (*NO_FIGURES, *varied) and not n.startswith("frames_")]
+    numeric = [n for n in found if any(_is_number(row.get(n)) for row in rows)]
+    own = [name.removeprefix("last.") for name in numeric if name.startswith("last.")]
+    return sorted(numeric, key=lambda name: name.removeprefix("last.") not in own)
+
+
+def _changing(rows: Rows, names: Sequence[str]) -> list[str]:
+    """Those of the figures that are not the same in all rows."""
+    return [name for name in names if len({row[name] for row in rows if _is_number(row.get(name))}) > 1]
+
+
+def heading(name: str) -> str:
+    """Return the title of a figure, with its unit."""
+    last = name.startswith("last.")
+    plain = name.removeprefix("last.")
+    unit = unit_of(plain)
+    return f"{title_of(plain)}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _groups(rows: Rows, keys: Sequence[str]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """The rows by their values of some keys, in their order."""
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return groups
+
+
+def _mean(rows: Rows, name: str) -> Mean | None:
+    values = [row[name] for row in rows if _is_number(row.get(name))]
+    return mean_of(values) if values else None
+
+
+def _means(rows: Rows, varied: Sequence[str], names: Sequence[str]) -> list[dict[str, Any]]:
+    return [
+        {**dict(zip(varied, values, strict=True)), "runs": len(group)}
+        | {heading(name): "–" if (mean := _mean(group, name)) is None else str(mean) for name in names}
+        for values, group in _groups(rows, varied).items()
+    ]
+
+
+def _failed(rows: Rows, varied: Sequence[str]) -> list[dict[str, Any]]:
+    """The runs that are not valid, with the checks that failed."""
+    names = (*varied, "seed", "verdict", "failed")
+    return [{name: row[name] for name in names} for row in rows if row["verdict"] != Verdict.VALID]
+
+
+def _draw(rows: Rows, varied: Sequence[str], name: str) -> Drawing:
+    """Draw a figure against the varied key with the most values, of numbers if possible; the others make curves."""
+    key = max(varied, key=lambda key: (_all_numbers(rows, key), len({row[key] for row in rows})))
+    others = [other for other in varied if other != key]
+    curves = _groups(rows, others)
+    shown = dict(list(curves.items())[: len(COLOURS)])
+    made = canvas(key, heading(name), -(-len(shown) // 3) if others else 0)
+    ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
+    for (values, curve), colour in zip(shown.items(), COLOURS, strict=False):
+        label = ", ".join(
+            f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True)
+        )
+        _draw_curve(made, curve, key, name, colour, label, ticks)
+    if ticks is not None:
+        made.axes.set_xticks(range(len(ticks)), ticks)
+    if others:
+        legend(made)
+    left = f" {len(curves) - len(shown)} more curves are not drawn." if len(curves) > len(shown) else ""
+    return Drawing(made, f"Mean over seeds; bars: 95 % confidence interval of the mean.{left}")
+
+
+def _draw_curve(
+    made: Canvas, rows: Rows, key: str, name: str, colour: str, label: str, ticks: Sequence[str] | None
+) -> None:
+    points = [(values[0], mean) for values, group in _groups(rows, [key]).items() if (mean := _mean(group, name))]
+    if not points:
+        return
+    if ticks is None:
+        points.sort(key=lambda point: float(point[0]))
+    at = [float(x) if ticks is None else ticks.index(str(x)) for x, _ in points]
+    value = [mean.value for _, mean in points]
+    half = [mean.half or 0.0 for _, mean in points]
+    style: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 3.5, "capsize": 3, "label": label}
+    made.axes.errorbar(at, value, yerr=half, linestyle=DASHES[0] if ticks is None else "none", **style)
+
+
+def _all_numbers(rows: Rows, key: str) -> bool:
+    return all(_is_number(row[key]) for row in rows)

@@ -1,0 +1,194 @@
+"""A sweep: its cells, its table, its page, and that it goes on where it stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+import emulator
+from emulator.cells import sweep as subject
+from emulator.cells.cells import Cell, CellResult, compute
+from emulator.cells.measure import WALL_CLOCK
+from emulator.cells.sweep import SweepPlan, parse_shard
+from emulator.cli.sweep import sweep as command
+from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page
+from emulator.scenario.source import scenario_of
+from tests.support.cli import command_app
+from vnet.errors import VnetError
+
+TINY: dict[str, Any] = {
+    "run": {"name": "tiny", "duration_s": 0.4},
+    "network": {"kind": "generated", "vehicles": 3},
+    "radio": {"range_m": 20_000.0},
+}
+VARY: dict[str, list[Any]] = {"radio.loss": [0, 0.5], "network.vehicles": [3, 4]}
+
+
+def plan(vary: dict[str, list[Any]] = VARY, seeds: range = range(1, 3), **changes: Any) -> SweepPlan:
+    return SweepPlan.of(scenario_of(TINY, {}), vary, seeds, **{"keeps_network": False} | changes)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Cell]:
+    """Run cells here; returns those that were run."""
+    ran: list[Cell] = []
+
+    def each(jobs: list[Cell], *_: object) -> Any:
+        for cell in jobs:
+            ran.append(cell)
+            result: CellResult = compute(cell)
+            yield cell, result
+
+    monkeypatch.setattr("emulator.cells.cells.each_done", each)
+    return ran
+
+
+def test_the_cells_are_all_combinations_with_every_seed() -> None:
+    cells = plan().cells
+    assert [tuple(cell.labels.values()) for cell in cells] == [
+        (loss, vehicles, seed) for loss in (0, 0.5) for vehicles in (3, 4) for seed in (1, 2)
+    ]
+    assert [cell.scenario.run.seed for cell in cells] == [1, 2] * 4
+    assert [cell.scenario.network.seed for cell in cells] == [1, 2] * 4, "a seed draws the network"
+    assert {cell.scenario.network.seed for cell in plan(keeps_network=True).cells} == {1}
+    assert [cell.scenario.network.seed for cell in plan({"network.seed": [7, 8]}).cells] == [7, 7, 8, 8]
+    assert len({cell.digest for cell in cells}) == len(cells)
+
+
+def test_shards_are_the_whole_without_an_overlap() -> None:
+    whole = plan()
+    shards = [whole.shard(number, 3) for number in (1, 2, 3)]
+    assert sorted(cell.digest for shard in shards for cell in shard) == sorted(cell.digest for cell in whole.cells)
+    assert parse_shard("2/3") == (2, 3)
+    for text in ("0/3", "4/3", "1", "a/b", "1/0"):
+        with pytest.raises(VnetError, match=rf"^--shard {text}: write it as i/n"):
+            parse_shard(text)
+
+
+@pytest.mark.slow
+def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_process: list[Cell]) -> None:
+    table = emulator.sweep(TINY, VARY, seeds=[1, 2], out=tmp_path)
+    assert len(in_this_process) == len(table) == 8
+    assert table.column_names[:4] == ["radio.loss", "network.vehicles", "seed", "verdict"]
+    rows = table.to_pylist()
+    assert all(row["vehicles"] == row["network.vehicles"] and row["verdict"] == "valid" for row in rows)
+    assert [row["packet_delivery_ratio"] == 1 for row in rows] == [True] * 4 + [False] * 4
+    assert rows[0]["neighbours"] > rows[-1]["neighbours"] / 2 and rows[0]["last.neighbours"] == 2, (
+        "what is reported"
+    )
+    assert set(WALL_CLOCK) <= set(table.column_names)
+    assert pq.read_table(tmp_path / "sweep.parquet").equals(table)
+    page = (tmp_path / "sweep.html").read_text()
+    assert "8 runs of 0.4 emulated seconds" in page and page.count("<figure") >= 3
+    again = emulator.sweep(TINY, VARY | {"radio.loss": [0, 0.5, 1]}, seeds=2, out=tmp_path)
+    assert len(in_this_process) == 12 == len(again), "what it shares with the first is not run again"
+
+
+def test_a_run_of_a_program_that_crashes_is_a_row(tmp_path: Path, in_this_process: list[Cell]) -> None:
+    del in_this_process
+    program = "tests.emulator.cells.test_sweep:crash"
+    row = emulator.sweep(TINY, {}, program=program, out=tmp_path).to_pylist()[0]
+    assert row["verdict"] == "invalid" and row["failed"]
+    assert "Not valid: 1" in (tmp_path / "sweep.html").read_text()
+
+
+async def crash(node: Any) -> None:
+    """Crash at once."""
+    raise RuntimeError(node.id)
+
+
+def test_an_interrupted_sweep_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def one_only(jobs: list[Cell], *_: object) -> Any:
+        yield jobs[0], compute(jobs[0])
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
+    arguments = ["tiny.toml", "--vary", "radio.loss=0,0.5"]
+    for done in (1, 2):
+        monkeypatch.setattr("emulator.cells.cells.each_done", one_only)
+        result = CliRunner().invoke(command_app(command), arguments)
+        assert result.exit_code == 130
+        assert f"interrupted: {done} of 2 runs are in runs/sweep-tiny; the same command goes on" in result.output
+    monkeypatch.setattr("emulator.cells.cells.each_done", lambda jobs, *_: iter([1 / 0] if jobs else []))
+    result = CliRunner().invoke(command_app(command), arguments)
+    assert result.exit_code == 0, result.output
+    assert "2 runs: 2 valid" in result.output
+    assert "runs/sweep-tiny/sweep.html" in result.output
+
+
+def test_shards_may_run_anywhere_and_the_last_makes_the_table(tmp_path: Path, in_this_process: list[Cell]) -> None:
+    (tmp_path / "tiny.toml").write_text("[run]\nname = 'tiny'\nduration_s = 0.4\n[network]\nvehicles = 3\n")
+    given = [str(tmp_path / "tiny.toml"), "--seeds", "3", "--out", str(tmp_path / "out")]
+    first = CliRunner().invoke(command_app(command), [*given, "--shard", "1/2"])
+    assert (
+        first.exit_code == 0 and "shard 1/2: 2 runs are in" in first.output and "1 of 3 are missing" in first.output
+    )
+    assert not (tmp_path / "out" / "sweep.parquet").exists()
+    second = CliRunner().invoke(command_app(command), [*given, "--shard", "2/2"])
+    assert "3 runs: 3 valid" in second.output and len(in_this_process) == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--vary", "radio.loss"], "--vary radio.loss: write it as KEY=VALUES"),
+        (["--vary", "radio.loss="], "radio.loss=: write its values with commas between"),
+        (["--vary", "radio.los=1,2"], "sweep, radio.los = 1: radio.los: unknown key (did you mean loss?)"),
+        (["--shard", "3/2"], "--shard 3/2: write it as i/n"),
+        (["--executor", "ray"], "--executor ray: write it as dask://HOST:PORT"),
+    ],
+)
+def test_what_is_mistyped_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(command_app(command), ["beacon", *options])
+    assert result.exit_code == 2
+    assert message in result.output
+    assert not (tmp_path / "runs").exists()
+
+
+def test_confidence_intervals_are_those_of_student() -> None:
+    assert mean_of([2.0]) == Mean(2.0, None, 1)
+    three = mean_of([1.0, 2.0, 3.0])
+    assert three.value == 2.0 and three.half == pytest.approx(4.302653 / 3**0.5)
+    assert str(three) == "2 ± 2.5" and str(mean_of([2.0])) == "2"
+
+
+def test_the_page_shows_own_figures_first_and_no_constants() -> None:
+    rows: list[dict[str, Any]] = [
+        {
+            "kind": kind,
+            "radio.loss": loss,
+            "seed": seed,
+            "verdict": "valid",
+            "failed": "",
+            "pdr": 1 - loss + seed / 9,
+        }
+        | {"same": 3.0, "frames_lost": seed, "delay_ms": seed, "last.delay_ms": 4.0, "wall_s": seed / 7}
+        for kind in ("a", "b")
+        for loss in (0, 0.5)
+        for seed in (1, 2)
+    ]
+    rows[0]["last.delay_ms"] = None
+    assert figures_of(rows, ["kind", "radio.loss"]) == ["delay_ms", "last.delay_ms", "pdr", "same"]
+    assert heading("last.delay_ms") == "delay (ms), at the end"
+    page = sweep_page(scenario_of(TINY, {}), rows, ["kind", "radio.loss"])
+    assert page.count("<figure") == 2, "neither what is constant nor the wall clock"
+    assert "1.167 ± 0.71" in page and "kind a" in page
+    by_name = sweep_page(scenario_of(TINY, {}), [row for row in rows if row["radio.loss"] == 0], ["kind"])
+    assert by_name.count("<figure") == 2
+    assert "<figure" not in sweep_page(scenario_of(TINY, {}), rows[:2], [])
+
+
+def test_columns_of_several_kinds_are_texts() -> None:
+    table = subject._table([{"a": 1, "b": "x", "c": None}, {"a": 2.5, "b": True, "d": 3}])
+    assert table.to_pylist() == [
+        {"a": 1.0, "b": "x", "c": None, "d": None},
+        {"a": 2.5, "b": "true", "c": None, "d": 3},
+    ]
