@@ -46,6 +46,8 @@ COMMANDS = (
         "Run it in one process: the same trace, faster.",
         runs_programs=True,
     ),
+    Command("demo", Panel.RUN, "demo", "demo", "Run the shipped scenario quickstart, and record it."),
+    Command("new", Panel.RUN, "new", "new", "Write a scenario, a program, a check and a test to begin with."),
     Command(
         "emulator", Panel.RUN, "runs", "emulator", "Run it for agents that are started by hand, here or elsewhere."
     ),

@@ -1,0 +1,89 @@
+"""vnet without a clone: a wheel is built, installed into an environment of its own, and used in an empty folder."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+Command = Callable[..., str]
+
+
+def clean_environment() -> dict[str, str]:
+    """Return the environment without what would lead to the clone."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
+
+
+def run_pip(*arguments: object) -> None:
+    command = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", *map(str, arguments)]
+    subprocess.run(command, check=True, env=clean_environment())
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment with the wheel; its dependencies are those that are installed here.
+
+    A path in a .pth file is searched, but .pth files in it are not read: so nothing leads to the clone.
+    """
+    folder = tmp_path_factory.mktemp("wheel")
+    source = folder / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("vnet", "agents", "emulator", "scenarios"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True)  # a build leaves files beside its source
+    run_pip("wheel", "--no-deps", "--no-build-isolation", "-w", folder, source)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True)
+    python = folder / "venv" / "bin" / "python"
+    (wheel,) = folder.glob("*.whl")
+    run_pip("--python", python, "install", "--no-deps", "--no-index", "--ignore-installed", wheel)
+    (site,) = (folder / "venv" / "lib").glob("python*/site-packages")
+    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    return folder / "venv" / "bin"
+
+
+@pytest.fixture
+def command(environment: Path, tmp_path: Path) -> Command:
+    """Run a command of the environment in an empty folder; returns its standard output."""
+
+    def run(*arguments: str, folder: str = ".") -> str:
+        words = [str(environment / arguments[0]), *arguments[1:]]
+        done = subprocess.run(
+            words,
+            cwd=tmp_path / folder,
+            env=clean_environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=300,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_it_is_the_wheel_that_runs(command: Command, environment: Path) -> None:
+    found = command(
+        "python", "-c", "import agents, emulator, vnet; print(agents.__file__, emulator.__file__, vnet.__file__)"
+    )
+    assert all(Path(name).is_relative_to(environment.parent) for name in found.split())
+    assert command("vnet", "--version") == command("vnet-emulator", "--version")
+
+
+def test_shipped_scenarios_run_by_their_names(command: Command, tmp_path: Path) -> None:
+    assert "verdict: valid" in command("vnet", "run", "twelve", "--duration", "1", "--quiet")
+    command("vnet", "demo", "--duration", "0.1", "--out", "demo")
+    assert (tmp_path / "demo" / "recording.rrd").stat().st_size > 0
+
+
+def test_a_new_project_runs_and_its_tests_pass(command: Command) -> None:
+    command("vnet", "new", "mynet")
+    assert "verdict: valid" in command("vnet", "simulate", "mynet.toml", "--quiet", folder="mynet")
+    assert "2 passed" in command("python", "-m", "pytest", "-p", "no:cacheprovider", folder="mynet")
