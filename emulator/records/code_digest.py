@@ -15,7 +15,7 @@ import sysconfig
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from importlib.machinery import ModuleSpec, PathFinder
+from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ OWN = ("vnet", "emulator")
 LEFT_OUT = "experiments"
 """The part of vnet on which no run depends."""
 _SITE = ("purelib", "platlib", "stdlib", "platstdlib")
+_SITE_NAMES = frozenset({"site-packages", "dist-packages"})
 
 
 def code_digests(scenario: Scenario) -> dict[str, str]:
@@ -129,15 +130,33 @@ def _find(module: str, searched: list[str]) -> ModuleSpec | None:
         if not parent:
             return importlib.util.find_spec(module) or PathFinder.find_spec(module, searched)
         package = _find(parent, searched)
-        locations = None if package is None else package.submodule_search_locations
-        return None if locations is None else PathFinder.find_spec(module, list(locations))
+        folders = None if package is None else package.submodule_search_locations
+        return None if folders is None else _find_in(list(folders), module)
     except (ImportError, ValueError):
         return None
 
 
+def _find_in(folders: list[str], module: str) -> ModuleSpec | None:
+    """Find a module of a package by the package's folders.
+
+    `PathFinder` needs the package imported where the module is a package without `__init__.py`.
+    """
+    portions: list[str] = []
+    for folder in folders:
+        spec = FileFinder(folder, (SourceFileLoader, SOURCE_SUFFIXES)).find_spec(module)
+        if spec is not None and spec.loader is not None:
+            return spec
+        portions += (spec.submodule_search_locations or []) if spec is not None else []
+    if not portions:
+        return None
+    namespace = ModuleSpec(module, None, is_package=True)
+    namespace.submodule_search_locations = portions
+    return namespace
+
+
 def _is_installed(path: Path) -> bool:
-    """Return whether a file is of the standard library, or was installed."""
-    return any(path.is_relative_to(folder) for folder in _installed_folders())
+    """Return whether a file is of the standard library, or was installed, in this environment or another."""
+    return not _SITE_NAMES.isdisjoint(path.parts) or any(path.is_relative_to(f) for f in _installed_folders())
 
 
 @cache

@@ -66,6 +66,30 @@ def test_each_module_of_a_program_counts_and_no_other(name: str, program: Path) 
     assert not any(module.startswith("cd_") for module in sys.modules), "nothing is imported"
 
 
+def test_a_namespace_package_within_a_package_counts(program: Path) -> None:
+    inner = program / "cd_program" / "plain" / "leaf.py"
+    inner.parent.mkdir()
+    inner.write_text("LEAF = 1\n")
+    (program / "cd_program" / "near.py").write_text("from cd_program.plain.leaf import LEAF\n")
+    before = program_digest([ENTRY])
+    assert before is not None
+    inner.write_text("LEAF = 2\n")
+    assert program_digest([ENTRY]) != before
+
+
+def test_what_is_installed_in_another_environment_does_not_count(
+    program: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = program / "lib" / "site-packages"
+    other.mkdir(parents=True)
+    (other / "cd_installed.py").write_text("")
+    monkeypatch.syspath_prepend(other)
+    (program / "cd_program" / "near.py").write_text("import cd_installed\n")
+    before = program_digest([ENTRY])
+    (other / "cd_installed.py").write_text("changed = True\n")
+    assert before is not None and program_digest([ENTRY]) == before
+
+
 def test_a_program_that_cannot_be_found_has_no_digest(program: Path) -> None:
     (program / "cd_program" / "app.py").unlink()
     assert program_digest([ENTRY]) is None
