@@ -119,6 +119,11 @@ STATES_ABOUT = (
     f"{MOST_COLUMNS} names stay in `values`."
 )
 EVENTS = {
+    "note": (
+        "",
+        "`what`",
+        "oddities of the input: vehicles left out, ids escaped, ways clipped",
+    ),
     "code_changed": ("", "`what`", "program or vnet have changed since the run whose scenario this one repeats"),
     "started": ("", "`start_up_s`", "all have joined; time 0"),
     "ended": ("", "`wall_s`", "the run is over"),

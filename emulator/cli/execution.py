@@ -58,7 +58,7 @@ class Request:
         """Return the run, with a folder that is not made yet. Raises VnetError for what cannot be done."""
         if self.sinks is not None and self.sinks.vehicle is not None and self.sinks.vehicle not in world.node_ids:
             raise VnetError(f"--rerun-vehicle {self.sinks.vehicle}: no such vehicle")
-        folder = prepare_folder(self.out, self.file, self.scenario, self.asked.log_format)
+        folder = prepare_folder(self.out, self.file, self.scenario, self.asked.log_format, world.notes)
         return Emulation(self.scenario, world, folder)
 
 

@@ -15,7 +15,7 @@ from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.cli.help import group
 from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
-from emulator.terminal.console import one_line_errors
+from emulator.terminal.console import one_line_errors, tell
 from vnet.errors import VnetError
 
 app = group("Run the paper's experiments, and vnet's own.")
@@ -140,6 +140,9 @@ def city(
     map_aside: Annotated[
         float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
     ] = 0.0,
+    refuse_impossible: Annotated[
+        bool, typer.Option("--refuse-impossible", metavar="", help="Refuse trips that no vehicle can drive.")
+    ] = False,
     seeds: SeedsOption = 3,
     duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 300.0,
     out: OutOption = None,
@@ -151,7 +154,9 @@ def city(
 
     with one_line_errors():
         folder = _folder(out, "city")
-        place = study.place(trips, roads, map_sigma, map_aside)
+        place = study.place(trips, roads, map_sigma, map_aside, "refuse" if refuse_impossible else "leave_out")
+        for note in study.notes(place, duration):
+            tell(note)
         cells = study.city_cells(place, range(1, seeds + 1), duration)
         results = _run(cells, folder, "city", only, live)
         if not live:

@@ -48,7 +48,9 @@ PLACE_M = 50.0
 """The map of errors has squares of this side."""
 
 
-def place(trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float) -> dict[str, Any]:
+def place(
+    trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float, impossible_trips: str = "leave_out"
+) -> dict[str, Any]:
     """The sections `network` and `map` of scenarios: of files, or of a generated city.
 
     Raises VnetError unless both trips and roads are given, and from files that are there.
@@ -61,7 +63,11 @@ def place(trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float
         if not path.is_file():
             raise VnetError(f"{option} {path}: no such file")
     return {
-        "network": {"kind": "trips", "path": str(trips and trips.resolve())},
+        "network": {
+            "kind": "trips",
+            "path": str(trips and trips.resolve()),
+            "impossible_trips": impossible_trips,
+        },
         "map": {"path": str(roads and roads.resolve()), "sigma_m": sigma_m, "aside_m": aside_m},
     }
 
@@ -78,6 +84,12 @@ def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float
         for seed in seeds
         for mechanism in ("centralized", *MECHANISMS)
     ]
+
+
+def notes(place: Mapping[str, Any], duration_s: float) -> tuple[str, ...]:
+    """Lines for the user about the trips: which were left out, and why. Raises ScenarioError for a bad file."""
+    data = {"run": {"duration_s": duration_s, "settle_s": 0.0}, **place}
+    return build_world(_checked(data)).notes
 
 
 def city_scenario(place: Mapping[str, Any], seed: int, mechanism: str, duration_s: float) -> Scenario:

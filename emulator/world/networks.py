@@ -27,6 +27,9 @@ REFERENCE_RANGE_M = 3000.0
 """Radio range at which the degrees below hold."""
 MAX_COORDINATE_M = 2e7
 """Bound of coordinates: twice what projections use, and what the cooperative program's frames hold in 32-bit cm."""
+LARGEST_EXTENT_DEG = 2.0
+"""Extent of the largest region whose vehicles are taken for positions in degrees."""
+DEGREES_NOTE = "x_m and y_m look like degrees, and are taken for metres; trips may be in lat_deg and lon_deg"
 _LONGEST_LINE = 10_000
 """Characters of a line of a network file."""
 
@@ -55,11 +58,15 @@ _LARGEST_ANNEALED = 200
 
 @dataclass(frozen=True)
 class Network:
-    """Vehicles and their lanes: `position_m` (N, 2) on the centre line, `heading_rad` (N,) in [0, 2π)."""
+    """Vehicles and their lanes: `position_m` (N, 2) on the centre line, `heading_rad` (N,) in [0, 2π).
+
+    `notes` are lines for the user about the file.
+    """
 
     node_ids: tuple[str, ...]
     position_m: Array
     heading_rad: Array
+    notes: tuple[str, ...] = ()
 
 
 def load_network(path: Path) -> Network:
@@ -81,7 +88,16 @@ def load_network(path: Path) -> Network:
     if not vehicles:
         raise ScenarioError(f"{path}: no vehicles; at least one row is needed")
     numbers = np.array(list(vehicles.values()))
-    return Network(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi))
+    notes = (f"{path}: {DEGREES_NOTE}",) if _look_like_degrees(numbers[:, :2]) else ()
+    return Network(tuple(vehicles), numbers[:, :2], np.mod(numbers[:, 2], 2 * np.pi), notes)
+
+
+def _look_like_degrees(position_m: Array) -> bool:
+    """Return True for positions within some metres, with fractions, that would be places on earth in degrees."""
+    extent = np.ptp(position_m, axis=0).max()
+    on_earth = bool((np.abs(position_m) <= 180.0).all()) and bool((np.abs(position_m).min(axis=0) <= 90.0).any())
+    has_fractions = bool((position_m != np.round(position_m, 2)).any())
+    return 0 < extent < LARGEST_EXTENT_DEG and on_earth and has_fractions
 
 
 def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, tuple[float, float, float]]:

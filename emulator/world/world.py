@@ -9,7 +9,7 @@ all receivers, and the noise of each.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +57,8 @@ class World:
     `lane_map` is given to programs; `lane_of` (N,), the lane of each vehicle that stands on one, is not. `links`
     (N, N) is `radio.links`: the receiver is the row, the sender the column; it is None if range or path loss
     decide. `moves` is true if vehicles drive, enter and leave. `course_m` (K, N, 2) are the positions at the start
-    of each period, NaN for an absent vehicle. Raise ScenarioError if the scenario's links, exceptions or processes
-    do not fit the vehicles.
+    of each period, NaN for an absent vehicle. `notes` are lines for the user about the input. Raise ScenarioError
+    if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 
     def __init__(
@@ -73,6 +73,7 @@ class World:
         self.periods = periods_of(scenario)
         self.lane_map = lane_map
         self.lane_of = lane_of
+        self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
@@ -171,13 +172,15 @@ def _stand_on_lanes(scenario: Scenario, network: Network) -> World:
     lateral_m = _draw_lateral(scenario, count)
     position_m = network.position_m + lateral_m[:, :, None] * normal
     heading_rad = np.broadcast_to(network.heading_rad, lateral_m.shape)
-    return World(scenario, Motion(network.node_ids, position_m, heading_rad), lane_map, np.argsort(order))
+    motion = Motion(network.node_ids, position_m, heading_rad, notes=network.notes)
+    return World(scenario, motion, lane_map, np.argsort(order))
 
 
 def _drive(scenario: Scenario) -> World:
     """Return a world in which vehicles drive recorded trips, or generated ones through a city or a map."""
     # Maps and trips need half of scipy, whose import takes longer than many a run of vehicles that stand.
-    from emulator.world.maps.around import read_lanes
+    from emulator.world.maps.around import lanes_around, notes_of
+    from emulator.world.maps.files import read_roads
     from emulator.world.trips.drive import drive, drive_through_city
 
     section, periods = scenario.map, periods_of(scenario)
@@ -187,7 +190,9 @@ def _drive(scenario: Scenario) -> World:
     else:
         motion = drive(scenario.network, periods, scenario.period_ns)
         if section is not None:
-            lanes = read_lanes(section, motion.position_m, motion.origin_deg)
+            roads = read_roads(section.path, section.origin_deg or motion.origin_deg)
+            lanes = lanes_around(roads, section, motion.position_m)
+            motion = replace(motion, notes=(*motion.notes, *notes_of(section.path, roads)))
     return World(scenario, motion, lanes, np.zeros(0, dtype=np.intp))
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from emulator.scenario.scenario import Map
-from emulator.world.maps.files import read_roads
+from emulator.world.maps.osm import CLIPPED
 from emulator.world.maps.roads import Roads
 from vnet.errors import ScenarioError
 from vnet.roads.road_map import RoadMap
@@ -19,18 +20,11 @@ SAMPLES = 5000
 """Positions that are tested for it."""
 
 
-def read_lanes(section: Map, course_m: Array, origin_deg: tuple[float, float] | None) -> RoadMap:
-    """Return the lanes of `[map]` around the positions `course_m` (K, N, 2) of all vehicles.
-
-    `origin_deg` is the origin of their metres. Raise ScenarioError if the file cannot be read, or most positions
-    are off the map.
-    """
-    roads = read_roads(section.path, section.origin_deg or origin_deg)
-    return lanes_around(roads, section, course_m)
-
-
 def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
-    """Return the lanes as `read_lanes` does, from roads that have been read."""
+    """Return the lanes of `[map]`, read as `roads`, around the positions `course_m` (K, N, 2) of all vehicles.
+
+    Raise ScenarioError if most positions are off the map.
+    """
     position_m = course_m[np.isfinite(course_m[..., 0])]
     low_m, high_m = position_m.min(axis=0) - section.margin_m, position_m.max(axis=0) + section.margin_m
     part = roads.within(low_m, high_m)
@@ -45,6 +39,12 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
             "check origin_deg and the projection"
         )
     return lanes
+
+
+def notes_of(path: Path, roads: Roads) -> tuple[str, ...]:
+    """Return the line for the user about a map that was cut from a larger one."""
+    clipped = roads.notes.get(CLIPPED, 0)
+    return (f"{path}: {CLIPPED}: {clipped}",) if clipped else ()
 
 
 def _far_share(lanes: RoadMap, position_m: Array) -> float:

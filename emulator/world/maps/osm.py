@@ -12,6 +12,10 @@ from vnet.errors import ScenarioError, printable
 if TYPE_CHECKING:
     from osmium.osm import Way
 
+CLIPPED = "ways clipped where the file lacks their nodes"
+"""Count in `Roads.notes` of ways that leave the part of a map that was cut out."""
+_UNDEFINED_DEG = 200.0
+"""Nodes that a file lacks have a longitude beyond it."""
 _LONGEST_LINE = 1 << 16
 """Bytes of a line that are searched at once."""
 
@@ -35,6 +39,8 @@ def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
         raise ScenarioError(f"{path}: {_line_of(path, value)}{printable(str(error), 300)}") from None
     except (RuntimeError, ValueError, OSError) as error:
         raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
+    if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
+        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways: extract maps with their nodes")
     return builder.build_from_degrees(origin_deg)
 
 
@@ -57,14 +63,24 @@ def _add_way(path: Path, builder: RoadsBuilder, way: Way) -> None:
     name = f"way {way.id}"
     if len(way.nodes) < 2:
         raise ScenarioError(f"{path}: {name}: {len(way.nodes)} nodes; a road needs two")
-    points = []
+    pieces = _pieces(path, way)
+    if len(pieces) != 1 or len(pieces[0]) != len(way.nodes):
+        builder.note(CLIPPED)
+    for points in pieces:
+        if found.reversed:
+            points.reverse()
+        if len(points) > 1:
+            builder.add(name, points, found.kind, found.lanes, found.lane_width_m)
+
+
+def _pieces(path: Path, way: Way) -> list[list[tuple[int, tuple[float, float]]]]:
+    """Return the points of a way, (node, (longitude, latitude)), in pieces between nodes that the file lacks."""
+    pieces: list[list[tuple[int, tuple[float, float]]]] = [[]]
     for node in way.nodes:
-        if not node.location.valid():
-            raise ScenarioError(
-                f"{path}: {name}: node {node.ref} is not in the file, or not on the earth; "
-                "extract maps with complete ways"
-            )
-        points.append((node.ref, (node.location.lon, node.location.lat)))
-    if found.reversed:
-        points.reverse()
-    builder.add(name, points, found.kind, found.lanes, found.lane_width_m)
+        if node.location.valid():
+            pieces[-1].append((node.ref, (node.location.lon, node.location.lat)))
+        elif abs(node.location.lon_without_check()) > _UNDEFINED_DEG:
+            pieces.append([])
+        else:
+            raise ScenarioError(f"{path}: way {way.id}: node {node.ref} is not on the earth")
+    return [piece for piece in pieces if piece]

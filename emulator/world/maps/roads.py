@@ -240,6 +240,11 @@ class RoadsBuilder:
             one_way = 0 in lanes
         self._rows.append(_Row(name, kind, *lanes, lane_width_m, one_way))
 
+    @property
+    def is_empty(self) -> bool:
+        """True as long as there are no roads."""
+        return not self._rows
+
     def coordinates(self) -> Array:
         """Return the coordinates (N, 2) of the points so far."""
         return np.array(self._coordinates, dtype=float).reshape(-1, 2)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from emulator.scenario.scenario import Map, Network
 from emulator.scenario.sumo import read_begin_s
-from emulator.world.maps.around import lanes_around
+from emulator.world.maps.around import lanes_around, notes_of
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
 from emulator.world.trips.clean import Rules
@@ -32,7 +32,7 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     """
     path = network.path
     assert path is not None
-    rules = Rules(network.fastest_mps, network.longest_gap_s)
+    rules = Rules(network.fastest_mps, network.longest_gap_s, network.impossible_trips == "leave_out")
     duration_s = (periods - 1) * period_ns / NS_PER_S
     start_s = network.start_s
     if network.kind == "sumo":
@@ -57,7 +57,8 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
         motion = motion_of(trips, selection, rules)
     except ScenarioError as error:
         raise ScenarioError(f"{path}: {error}") from None
-    return replace(motion, origin_deg=samples.origin_deg)
+    notes = tuple(f"{path}: {note}" for note in (*samples.notes, *motion.notes))
+    return replace(motion, origin_deg=samples.origin_deg, notes=notes)
 
 
 def drive_through_city(
@@ -74,6 +75,8 @@ def drive_through_city(
         source, side = section.path, Side(1.0 if section.drive_on == "right" else -1.0, section.aside_m)
         roads = read_roads(section.path, section.origin_deg)
     motion = generate_motion(source, roads, network.vehicles, network.seed, periods, period_ns, side)
+    if section is not None:
+        motion = replace(motion, notes=notes_of(section.path, roads))
     lanes = roads.lane_map() if section is None else lanes_around(roads, section, motion.position_m)
     return motion, lanes
 

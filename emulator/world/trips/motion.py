@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.world.trips.clean import Rules, clean
+from emulator.world.trips.clean import ImpossibleTripError, Rules, clean
 from emulator.world.trips.samples import Trip
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, first_names
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
@@ -20,6 +21,8 @@ CHORD_S = 0.5
 """Half of the time over which a heading is computed from positions."""
 SHORTEST_STAY_S = 1.0
 """Shortest presence of a vehicle that takes part."""
+MOST_LEFT_OUT = 0.5
+"""Largest share of vehicles that are left out; if more are impossible, the file's units or ids are wrong."""
 MOST_STATES = 50_000_000
 """Most vehicles times periods, so that the truth fits into memory."""
 
@@ -30,12 +33,14 @@ class Motion:
 
     An absent vehicle's entries are NaN. The heading of a vehicle that is present is NaN only if it never moves and
     its trip has no headings. `origin_deg` (latitude, longitude) is the origin of the metres, if it is known.
+    `notes` are lines for the user about the input.
     """
 
     node_ids: tuple[str, ...]
     position_m: Array
     heading_rad: Array
     origin_deg: tuple[float, float] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -54,9 +59,18 @@ class Selection:
 def motion_of(trips: list[Trip], selection: Selection, rules: Rules) -> Motion:
     """Resample trips to a run's periods; vehicles are in the order in which they enter, then in that of the file.
 
-    Raise ScenarioError if no vehicle is present during the run, or the truth does not fit into memory.
+    Raise ScenarioError if no vehicle is present during the run, if the truth does not fit into memory, or for an
+    impossible trip that is not to be left out.
     """
-    driven = [(trip.node_id, _drive(trip, selection, rules)) for trip in trips]
+    driven: list[tuple[str, Array | None]] = []
+    impossible: list[ImpossibleTripError] = []
+    for trip in trips:
+        try:
+            driven.append((trip.node_id, _drive(trip, selection, rules)))
+        except ImpossibleTripError as error:
+            impossible.append(error)
+            if not rules.leaves_out or len(impossible) > MOST_LEFT_OUT * len(trips):
+                raise
     present = [(int(np.flatnonzero(np.isfinite(d[:, 0]))[0]), name, d) for name, d in driven if d is not None]
     present.sort(key=lambda entry: entry[0])
     present = present[: selection.most]
@@ -73,7 +87,16 @@ def motion_of(trips: list[Trip], selection: Selection, rules: Rules) -> Motion:
             "set max_vehicles, or a disc, or a shorter run"
         )
     states = np.stack([driven for _, _, driven in present], axis=1)
-    return Motion(tuple(name for _, name, _ in present), states[..., :2], states[..., 2])
+    names = tuple(name for _, name, _ in present)
+    return Motion(names, states[..., :2], states[..., 2], notes=_left_out(impossible, len(trips)))
+
+
+def _left_out(impossible: Sequence[ImpossibleTripError], of: int) -> tuple[str, ...]:
+    """Return the line that says which vehicles are left out, and why."""
+    if not impossible:
+        return ()
+    reasons = first_names([error.reason for error in impossible], most=3, with_total=True)
+    return (f"{len(impossible)} of {of} vehicles left out as impossible: {reasons}",)
 
 
 def _drive(trip: Trip, selection: Selection, rules: Rules) -> Array | None:

@@ -6,6 +6,7 @@ for a vehicle with two positions at one time. Repeated samples count once.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from emulator.scenario.scenario import FAR_S
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import middle_deg, project
-from vnet.errors import ScenarioError, shown
+from vnet.errors import ScenarioError, first_names, shown
 from vnet.transport.keys import is_segment
 from vnet.types import Array
 
@@ -31,6 +32,8 @@ DEGREES = ("lat_deg", "lon_deg")
 """Columns of positions in degrees."""
 OPTIONAL = ("heading_rad", "speed_mps")
 """Columns that a file may lack."""
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.]|^[_.]")
+"""Characters of an id that are escaped where one of them cannot be part of a key."""
 _BOUND = {
     "time_s": FAR_S,
     "x_m": MAX_COORDINATE_M,
@@ -40,6 +43,19 @@ _BOUND = {
     "heading_rad": 1e6,
     "speed_mps": 1e6,
 }
+
+
+def node_id(given: str) -> str:
+    """Return the id of a node for an id in a file: itself if keys can hold it, else with characters escaped.
+
+    Any character but letters, digits, `_` and `.` becomes its code in hexadecimal between hyphens, as `#` becomes
+    `-23-`; so does a hyphen, so that the given id can be read from the escaped one. An `x` goes before what does
+    not begin with a letter or a digit.
+    """
+    if is_segment(given) or not given.isprintable():
+        return given
+    escaped = _UNSAFE.sub(lambda found: f"-{ord(found[0]):x}-", given)
+    return f"x{escaped}" if escaped.startswith("-") else escaped
 
 
 @dataclass(frozen=True)
@@ -59,13 +75,15 @@ class Samples:
     """The samples of a file, added in its order.
 
     `unit` is what messages count (row or line). Only samples within `window_s` are kept, if it is given.
-    `origin_deg` (latitude, longitude) is the origin of the metres of trips that were in degrees, set by `trips`.
+    `origin_deg` (latitude, longitude) is the origin of the metres of trips that were in degrees, and `notes` are
+    lines for the user; both are set by `trips`.
     """
 
     def __init__(self, path: Path, unit: str, window_s: tuple[float, float] | None = None) -> None:
         self._path = path
         self._unit = unit
         self.origin_deg: tuple[float, float] | None = None
+        self.notes: list[str] = []
         self._window_s = window_s
         self._code: dict[str, int] = {}
         self._last: dict[str, Array] = {}
@@ -98,8 +116,8 @@ class Samples:
             raise self._problem(line[np.argmax(index < 0)], "id is missing")
         names = [str(name) for name in encoded.dictionary.to_pylist()]
         for number, name in enumerate(names):
-            if not is_segment(name):
-                text = f"id = {shown(name)}: letters, digits, '_', '.', '-', at most 64"
+            if not is_segment(node_id(name)):
+                text = f"id = {shown(name)}: printable characters are needed, at most 64"
                 raise self._problem(line[np.argmax(index == number)], text)
         codes = [self._code.setdefault(name, len(self._code)) for name in names]
         if len(self._code) > MOST_IDS:
@@ -168,13 +186,25 @@ class Samples:
         position_m = self._positions_m(columns, origin_deg)
         order = np.argsort(columns["code"], kind="stable")
         code = columns["code"][order].astype(np.int64)
-        names = list(self._code)
+        names = self._node_ids()
         trips = []
         for rows in np.split(order, np.flatnonzero(np.diff(code)) + 1):
             known = {name: columns[name][rows] for name in OPTIONAL if name in columns}
             name = names[int(columns["code"][rows[0]])]
             trips.append(Trip(name, columns["time_s"][rows], position_m[rows], **known))
         return trips
+
+    def _node_ids(self) -> list[str]:
+        """Return the ids of the nodes, in the order of their numbers. Raise ScenarioError if two are the same."""
+        by_id: dict[str, str] = {}
+        for name in self._code:
+            if (other := by_id.setdefault(node_id(name), name)) != name:
+                raise ScenarioError(f"{self._path}: ids {shown(other)} and {shown(name)} are both {node_id(name)}")
+        renamed = [f"{shown(name)} is {id_}" for id_, name in by_id.items() if id_ != name]
+        if renamed:
+            some = first_names(renamed, most=3, with_total=True)
+            self.notes.append(f"ids with characters that keys of messages cannot hold are escaped: {some}")
+        return list(by_id)
 
     def _positions_m(self, columns: dict[str, Array], origin_deg: tuple[float, float] | None) -> Array:
         if METRES[0] in columns:

@@ -158,3 +158,20 @@ def test_a_generated_network_survives_a_file(tmp_path: Path) -> None:
     assert again.node_ids == network.node_ids
     assert np.array_equal(again.position_m, network.position_m)
     assert np.array_equal(again.heading_rad, network.heading_rad)
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ("a,-83.7412,42.2808,0\nb,-83.7395,42.2811,0\n", True),
+        ("a,-83.7412,42.2808,0\n", False),
+        ("a,0.123,0.456,0\nb,3000.5,20.125,0\n", False),
+        ("a,0,0,0\nb,1,1,0\n", False),
+        ("a,5.125,5.125,0\nb,5.125,5.125,0\n", False),
+    ],
+)
+def test_coordinates_that_look_like_degrees_are_told(tmp_path: Path, rows: str, told: bool) -> None:
+    path = tmp_path / "network.csv"
+    path.write_text(HEADER + rows)
+    said = f"{path}: x_m and y_m look like degrees, and are taken for metres; trips may be in lat_deg and lon_deg"
+    assert load_network(path).notes == ((said,) if told else ())

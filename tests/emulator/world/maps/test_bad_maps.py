@@ -4,6 +4,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from emulator.world.maps import roads as roads_module
 from emulator.world.maps.files import READERS, read_roads, write_roads
+from emulator.world.maps.osm import CLIPPED
 from tests.support import maps
 from vnet.errors import ScenarioError
 
@@ -105,8 +107,7 @@ def node(coordinates: str) -> str:
 
 BOMB = '<!DOCTYPE a [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;">]>'
 BAD_OSM = {
-    "a node that is missing": (maps.osm_xml(nodes=(1, 2, 3)), "way 10: node 4 is not in the file"),
-    "no node at all": (maps.osm_xml(nodes=()), "way 10: node 1 is not in the file"),
+    "no node at all": (maps.osm_xml(nodes=()), "it lacks the nodes of its"),
     "a way of one node": (maps.osm_xml({5: ((1,), {"highway": "primary"})}), "way 5: 1 nodes; a road needs two"),
     "a way of no node": (maps.osm_xml({5: ((), {"highway": "primary"})}), "way 5: 0 nodes; a road needs two"),
     "a way along one point": (
@@ -116,11 +117,10 @@ BAD_OSM = {
     "no road": (maps.osm_xml({5: ((1, 2), {"highway": "footway"})}), "no roads that vehicles may use"),
     "a latitude that is none": (node('lat="north" lon="-83.7"'), "line 3: wrong format for coordinate: 'north'"),
     "a latitude that is not a number": (node('lat="nan" lon="-83.7"'), "line 3: "),
-    "a latitude beyond the pole": (node('lat="95" lon="-83.7"'), "way 10: node 1 is not in the file, or not on"),
+    "a latitude beyond the pole": (node('lat="95" lon="-83.7"'), "way 10: node 1 is not on the earth"),
     "metres": (node('lat="4682000" lon="271000"'), "line 3: wrong format for coordinate: '4682000'"),
     "a node of the other side": (node('lat="-83.74" lon="42.28"'), "way 10: 9,341 km from the origin"),
     "a node at 0°, 0°": (node('lat="0" lon="0"'), "way 10: 5,146 km from the origin"),
-    "no coordinates": (node(""), "way 10: node 1 is not in the file, or not on the earth"),
     "entities": (maps.osm_xml().replace("<osm ", BOMB + "<osm "), "XML entities are not"),
     "text that is not closed": (maps.osm_xml().replace("</osm>", ""), ""),
     "a network of SUMO": (maps.sumo_net(), ""),
@@ -139,9 +139,22 @@ def test_a_line_that_is_no_xml_is_named(tmp_path: Path) -> None:
     assert f"line {line}" in refusal(write(tmp_path, "town.osm", text))
 
 
-def test_a_pbf_file_with_a_missing_node(tmp_path: Path) -> None:
-    path = maps.write_pbf(tmp_path / "town.osm.pbf", {7: ((1, 99), {"highway": "primary"})})
-    assert "way 7: node 99 is not in the file" in refusal(path)
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_way_of_a_cut_file_is_clipped_where_nodes_are_missing(tmp_path: Path, reverse: bool) -> None:
+    tags = {"highway": "primary", "oneway": "-1" if reverse else "yes"}
+    ways = {7: ((1, 2, 99, 3, 98, 97, 4, 3), tags), 8: ((98, 2), tags), 9: ((1, 2), tags)}
+    roads = read_roads(maps.write_pbf(tmp_path / "town.osm.pbf", ways))
+    assert [len(roads.node[a:b]) for a, b in pairwise(roads.first)] == [2, 2, 2]
+    assert roads.name == ("way 7", "way 7", "way 9")
+    assert roads.notes[CLIPPED] == 2
+    whole = read_roads(maps.write_pbf(tmp_path / "whole.osm.pbf", {9: ways[9]}), origin_deg=maps.degrees(1)[::-1])
+    same = read_roads(maps.write_pbf(tmp_path / "again.osm.pbf", ways), origin_deg=maps.degrees(1)[::-1])
+    assert same.node_m[same.node[-2:]] == pytest.approx(whole.node_m[whole.node]), "the direction is kept"
+
+
+def test_a_node_without_coordinates_is_as_one_that_is_missing(tmp_path: Path) -> None:
+    roads = read_roads(write(tmp_path, "town.osm", node("")))
+    assert roads.notes[CLIPPED] >= 1
 
 
 def test_without_pyosmium_it_is_said_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,6 +133,28 @@ def test_degrees_become_metres_from_the_origin_or_from_their_middle(tmp_path: Pa
     assert read(path, origin_deg=(42.28, -83.74))["a"].position_m[0] == pytest.approx([0, 0], abs=1e-6)
 
 
+def test_ids_of_sumo_are_escaped_so_that_they_can_be_told_apart(tmp_path: Path) -> None:
+    ids = ("flow#1:0/2", ":J1_0", "plain-1.0", "a-b c", "-7", "flow-23-1")
+    rows = "".join(f"{name},{time_s},{9 * number},0\n" for number, name in enumerate(ids) for time_s in (0, 2))
+    samples = READERS[".csv"](write(tmp_path, "t.csv", HEADER + rows), None)
+    assert [trip.node_id for trip in samples.trips(None)] == [
+        "flow-23-1-3a-0-2f-2",
+        "x-3a-J1_0",
+        "plain-1.0",
+        "a-2d-b-20-c",
+        "x-2d-7",
+        "flow-23-1",
+    ]
+    (note,) = samples.notes
+    assert "'flow#1:0/2' is flow-23-1-3a-0-2f-2" in note and note.endswith(", … (4)")
+
+
+def test_ids_that_would_be_the_same_are_refused(tmp_path: Path) -> None:
+    rows = "".join(f"{name},{time_s},{9 * time_s},0\n" for name in ("a#b", "a-23-b") for time_s in (0, 2))
+    path = write(tmp_path, "t.csv", HEADER + rows)
+    assert refusal(path) == "ids 'a#b' and 'a-23-b' are both a-23-b"
+
+
 # What is refused.
 
 HEADER = "id,time_s,x_m,y_m\n"
@@ -152,7 +174,7 @@ HEADER = "id,time_s,x_m,y_m\n"
         (HEADER + "a,0,1,2\na,1e300,1,2\n", "row 3: time_s = 1e+300"),
         (HEADER + "a,0,1,2\na,1,4e7,2\n", "row 3: x_m = 4e+07"),
         (HEADER + "a,0,1,2\n,1,1,2\n", "row 3: id = ''"),
-        (HEADER + "a,0,1,2\na b,1,1,2\n", "row 3: id = 'a b'"),
+        (HEADER + "a,0,1,2\na\x07b,1,1,2\n", "row 3: id = 'a\\x07b'"),
         (HEADER + "a,5,1,2\nb,0,1,2\na,4,1,2\n", "row 4: a: time_s = 4 after 5"),
         (HEADER + "a,5,1,2\nb,0,1,2\na,5,1,3\n", "row 4: a has two positions at time_s = 5"),
         (HEADER + "a,0,1,2\n", "no vehicle is present"),
@@ -206,7 +228,7 @@ def test_a_wrong_matrix_is_refused_with_its_array(tmp_path: Path) -> None:
         ({"heading_rad": np.zeros((2, 2))}, "heading_rad is (2, 2)"),
         ({"id": np.array(["a"])}, "1 ids for 2 rows"),
         ({"id": np.array(["a", "a"])}, "appears twice"),
-        ({"id": np.array(["a", "b/c"])}, "row 2: id = 'b/c'"),
+        ({"id": np.array(["a", "b\x07"])}, "row 2: id = 'b\\x07'"),
         ({"x_m": np.full((2, 3), np.nan), "y_m": np.full((2, 3), np.nan)}, "no samples"),
     ):
         arrays: dict[str, Any] = {name: value for name, value in {**good, **change}.items() if value is not None}

@@ -71,7 +71,7 @@ def test_a_stand_is_a_stand_if_the_vehicle_then_starts_as_vehicles_do() -> None:
 
 def test_a_position_held_for_longer_than_a_gap_is_believed() -> None:
     time_s = np.arange(0, 40, 0.1)
-    said_m = np.where(time_s < 5, 10 * time_s, np.where(time_s < 25, 50.0, 50 + 10 * (time_s - 25 + 0.5)))
+    said_m = np.where(time_s < 5, 10 * time_s, np.where(time_s < 25, 50.0, 50 + 10 * (time_s - 25)))
     x_m = x_of(drive(trip(time_s, said_m), seconds=39))
     assert x_m[60:249] == pytest.approx(np.full(189, 50.0))
 
@@ -113,6 +113,50 @@ def test_a_trip_of_mostly_jumps_is_refused() -> None:
     rng = np.random.default_rng(1)
     with pytest.raises(ScenarioError, match=r"a: .* of 99 steps are faster than 70 m/s: check units"):
         drive(trip(np.arange(100) / 10, rng.uniform(0, 1e4, 100)))
+
+
+def test_one_impossible_trip_is_left_out_and_told() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    wild_m = 1000.0 * (np.arange(100) % 2)
+    course = drive(trip(time_s, 15 * time_s, name="a"), trip(time_s, wild_m, name="b"))
+    assert course.node_ids == ("a",)
+    assert course.notes == ("1 of 2 vehicles left out as impossible: b: 99 of 99 steps are faster than 70 m/s",)
+
+
+def test_impossible_trips_are_refused_if_wanted_or_if_most_are() -> None:
+    time_s = np.arange(0, 10, 0.1)
+    good, *wild = [trip(time_s, 15 * time_s), *(trip(time_s, 1000.0 * (np.arange(100) % 2), name=n) for n in "bcd")]
+    with pytest.raises(ScenarioError, match="check units"):
+        drive(good, *wild)
+    with pytest.raises(ScenarioError, match="check units"):
+        motion_of([good, wild[0]], Selection(0.0, 101, TENTH_NS), Rules(70.0, 10.0, leaves_out=False))
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 12.0])
+@pytest.mark.parametrize("jump_m", [8.0, 17.0, 60.0])
+def test_a_jump_is_driven_as_fast_as_the_vehicle_drives_around_it(speed_mps: float, jump_m: float) -> None:
+    """Receivers correct themselves by some metres at once; nothing drives aside at 50 m/s."""
+    time_s = np.arange(0, 30, 0.1)
+    said_m = np.where(time_s < 15, 0.0, jump_m)
+    noise_m = np.random.default_rng(1).normal(0, 0.05, len(time_s))
+    course = drive(trip(time_s, speed_mps * time_s + noise_m, said_m), seconds=29)
+    aside_mps = np.abs(np.diff(course.position_m[:, 0, 1])) * 10
+    assert np.isfinite(aside_mps).all() or jump_m == 60.0, "it stays, unless it would drive too long"
+    assert np.nanmax(aside_mps) <= 1.5 * speed_mps + 7.0
+    assert course.position_m[100, 0, 1] == 0.0
+    assert course.position_m[-1, 0, 1] == jump_m
+
+
+def test_real_driving_is_not_taken_for_jumps() -> None:
+    """Full acceleration, hard braking, a stand with noise, and positions rounded to a metre."""
+    time_s = np.arange(0, 60, 0.1)
+    speed_mps = np.interp(time_s, [0, 10, 15, 25, 29, 45, 60], [0, 0, 45, 45, 0, 0, 10])
+    true_m = np.cumsum(speed_mps) / 10
+    noisy_m = true_m + np.random.default_rng(1).normal(0, 0.3, len(time_s))
+    for said_m in (true_m, noisy_m, np.round(true_m)):
+        (rows,) = clean(trip(time_s, said_m), RULES)
+        assert x_of(drive(trip(time_s, said_m), seconds=59)) == pytest.approx(said_m[:591], abs=2.0)
+        assert len(rows) > 100
 
 
 @settings(max_examples=150, deadline=None)
