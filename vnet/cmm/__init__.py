@@ -2,4 +2,82 @@
 
 Symbols follow the paper, M. Shen, J. Sun, D. Zhao, "Semi-Interpenetrating Cooperative Localization in Connected
 Vehicle Networks": c is the GNSS error that all vehicles share, x_i vehicle i's estimate of it, x̄ their mean.
+
+The names of `__all__` are public, and need no emulator: the filter of one vehicle, consensus, and fusion weights.
+They are imported when they are first used, because an agent should start with what it needs, and no more.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vnet.cmm.consensus import (
+        AveragingConsensus,
+        Consensus,
+        ConsensusConfig,
+        DirectMean,
+        RatioConsensus,
+        Share,
+    )
+    from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+    from vnet.cmm.weights import (
+        OptimizedWeights,
+        constant_weights,
+        max_degree_weights,
+        metropolis_weights,
+        no_fusion_weights,
+        random_weights,
+    )
+
+__all__ = [
+    "AveragingConsensus",
+    "Consensus",
+    "ConsensusConfig",
+    "DirectMean",
+    "Observation",
+    "OptimizedWeights",
+    "RatioConsensus",
+    "Rbpf",
+    "RbpfConfig",
+    "Share",
+    "constant_weights",
+    "max_degree_weights",
+    "metropolis_weights",
+    "no_fusion_weights",
+    "random_weights",
+]
+
+_MODULES = {
+    "vnet.cmm.consensus": (
+        "AveragingConsensus",
+        "Consensus",
+        "ConsensusConfig",
+        "DirectMean",
+        "RatioConsensus",
+        "Share",
+    ),
+    "vnet.cmm.rbpf": ("Observation", "Rbpf", "RbpfConfig"),
+    "vnet.cmm.weights": (
+        "OptimizedWeights",
+        "constant_weights",
+        "max_degree_weights",
+        "metropolis_weights",
+        "no_fusion_weights",
+        "random_weights",
+    ),
+}
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'vnet.cmm' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*globals(), *__all__])
