@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from emulator.pages.canvas import Canvas, Span, canvas, from_zero, legend, logarithmic, styled, thin, to_svg
-from emulator.report.source import Source
+from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
 from vnet.types import Array
 
@@ -89,13 +89,15 @@ def draw_charts(
 ) -> tuple[list[Chart], dict[str, list[str]]]:
     """Draw figures, given as (title, drawer) by id; returns them and the titles of the others, by reason.
 
-    A drawer with nothing to show raises VnetError with the reason.
+    A drawer raises NothingToShow where the run has no such data, and VnetError with the reason if it cannot be had.
     """
     charts: list[Chart] = []
     missing: dict[str, list[str]] = {}
     for key, (title, draw) in drawers.items():
         try:
             drawing = draw()
+        except NothingToShow:
+            continue
         except VnetError as error:
             missing.setdefault(str(error), []).append(title)
             continue

@@ -7,7 +7,7 @@ import numpy as np
 from emulator.pages.canvas import BLUE, GREEN, GREY, QUIET, RED
 from emulator.records.metrics import anees_band
 from emulator.report.drawing import DASHES, Drawing, Line, faults_note, time_figure
-from emulator.report.source import Source
+from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
 
 
@@ -38,6 +38,8 @@ def common_error(source: Source) -> Drawing:
 
 def position(source: Source) -> Drawing:
     """Draw the errors of the estimated positions and of the raw fixes."""
+    if not source.estimates_positions:
+        raise NothingToShow("no program estimated its position")
     lines = _lines(source, {"estimates": "position_rmse_m", "raw fixes": "fix_rmse_m"})
     made = time_figure(lines, "RMSE of position (m)", source.end_s, source.spans)
     text = "Distance of the vehicles' estimates, and of their receivers' raw fixes, from the true positions."
@@ -54,7 +56,8 @@ def consensus(source: Source) -> Drawing:
 
 def consistency(source: Source) -> Drawing:
     """Draw the normalized squared errors of the filters."""
-    lines = _lines(source, {"common error": "common_error_anees", "position": "position_anees"})
+    names = {"common error": "common_error_anees"}
+    lines = _lines(source, names | ({"position": "position_anees"} if source.estimates_positions else {}))
     made = time_figure(lines, "ANEES (1 = consistent)", source.end_s, source.spans)
     count = int(np.median(source.metrics["reporting"].to_numpy())) or 1
     low, high = anees_band(count)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 from emulator.report.drawing import Chart, Drawing, draw_charts
 from emulator.report.error_figures import common_error, consensus, consistency, position
+from emulator.report.map_figures import map_charts
 from emulator.report.network_figures import degrees, links, weights
+from emulator.report.program_figures import program_charts
 from emulator.report.radio_figures import ages, busy, latency, outcomes, totals
 from emulator.report.source import Source
 
@@ -25,9 +28,27 @@ FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "degrees": ("Node degrees", degrees),
     "weights": ("Fusion weights", weights),
 }
-"""Title and drawing by id, in the order of the page. A figure with nothing to show raises VnetError."""
+"""Title and drawing by id, in the order of the page. A figure without data raises NothingToShow."""
 
 
-def draw(source: Source) -> tuple[list[Chart], dict[str, list[str]]]:
-    """Draw all figures of a run; returns also the titles of those with nothing to show, by reason."""
-    return draw_charts({key: (title, partial(figure, source)) for key, (title, figure) in FIGURES.items()})
+@dataclass(frozen=True)
+class Charts:
+    """The charts of a run, and the titles of those that cannot be drawn, by reason."""
+
+    map: list[Chart]
+    program: list[Chart]
+    figures: list[Chart]
+    missing: dict[str, list[str]]
+
+
+def draw(source: Source) -> Charts:
+    """Draw all figures of a run."""
+    drawers = {key: (title, partial(figure, source)) for key, (title, figure) in FIGURES.items()}
+    network, program, figures = (
+        draw_charts(each) for each in (map_charts(source), program_charts(source), drawers)
+    )
+    missing: dict[str, list[str]] = {}
+    for _, problems in (network, program, figures):
+        for reason, titles in problems.items():
+            missing.setdefault(reason, []).extend(titles)
+    return Charts(network[0], program[0], figures[0], missing)

@@ -17,7 +17,7 @@ from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.drawing import DASHES, Drawing
-from emulator.report.source import Source
+from emulator.report.source import NothingToShow, Source
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
 from vnet.types import Array
@@ -40,7 +40,7 @@ def links(source: Source) -> Drawing:
     recorded = source.recorded
     count = len(recorded.node_ids)
     if not len(recorded.trace):
-        raise VnetError("no frame was sent to anybody in range")
+        raise NothingToShow("no frame was sent to anybody in range")
     link = recorded.sender * count + recorded.receiver
     rows = np.bincount(link, minlength=count * count)
     used = np.flatnonzero(rows)
@@ -199,7 +199,7 @@ def mean_weights(source: Source) -> Array:
     node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
     at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
     if not fits.any():
-        raise VnetError("no program reported any (as values named weight.ID)")
+        raise NothingToShow("no program reported any (as values named weight.ID)")
     total = np.bincount((at * count + of)[fits], weights=weight[fits], minlength=count * count)
     reports = np.bincount(node[np.unique(row[chosen])], minlength=count)
     return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,8 +12,10 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.pages.canvas import Span
+from emulator.records.key_figures import SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.reported import reported_figures
 from emulator.records.run_folder import METRICS_FILE, STATES_FILE, TRACE_FILE, Event
 from emulator.records.verdict_file import Record
 from emulator.scenario.scenario import Scenario
@@ -39,6 +41,10 @@ COLUMNS = {
 CUT = ("interrupted", "stalled")
 """Events that end a run before its time."""
 T = TypeVar("T")
+
+
+class NothingToShow(VnetError):
+    """A run has no data for a figure, as its program or its radio has nothing of the kind: pages say nothing."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,7 @@ class Source:
     def busy_ratio(self) -> Array:
         """(windows, N), how busy each vehicle found the medium. Raises VnetError if there is no MAC."""
         if self.scenario.radio.mac is None:
-            raise VnetError("no MAC configured ([radio.mac])")
+            raise NothingToShow("no MAC configured ([radio.mac])")
         if not len(self.recorded.busy_ratio):
             raise VnetError("the run was over within the first window")
         return self.recorded.busy_ratio
@@ -91,6 +97,42 @@ class Source:
         """The radio in figures, without the channel busy ratio where its table cannot be read."""
         has_busy = maybe(lambda: self.recorded.busy_ratio) is not None
         return radio_metrics(self.recorded, has_busy=has_busy)
+
+    # What programs report by names of their own.
+
+    @cached_property
+    def value_names(self) -> list[str]:
+        """Names of the values with a report that can be drawn; none where the states cannot be read."""
+        states = maybe(lambda: self.recorded.states)
+        return [] if states is None else list(reported_figures(states))
+
+    def values_of(self, name: str) -> Array:
+        """Return a value (periods, N), true as 1; NaN where it was not reported."""
+        return self.recorded.value(name)
+
+    def is_boolean(self, name: str) -> bool:
+        """Return whether a value is a boolean."""
+        return bool(pa.types.is_boolean(self.recorded.states.schema.field(name).type))
+
+    def period_times_s(self, periods: int) -> Array:
+        """Return the starts of the first so many periods in seconds."""
+        return np.arange(periods) * self.scenario.period_ns / 1e9
+
+    def text_shares(self, name: str) -> tuple[Array, list[str]]:
+        """Return the shares (periods, texts) of the reporting vehicles that say each text, and the texts.
+
+        The most frequent text comes first.
+        """
+        column = self.recorded.states[name].cast(pa.string()).combine_chunks().dictionary_encode()
+        texts = column.dictionary.to_pylist()
+        code = column.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+        period = self.recorded.states["period"].to_numpy()
+        said = np.zeros((int(period.max(initial=-1)) + 1, len(texts)))
+        np.add.at(said, (period[code >= 0], code[code >= 0]), 1)
+        order = np.argsort(-said.sum(axis=0), kind="stable")
+        total = said.sum(axis=1, keepdims=True)
+        shares = np.where(total > 0, said / np.maximum(total, 1), np.nan)[:, order]
+        return shares, [texts[index] for index in order.tolist()]
 
     # Metrics, events and times, as the figures need them.
 
@@ -103,8 +145,17 @@ class Source:
         """(periods,) a column of the metrics; NaN where nobody reported. Raises VnetError if nobody ever did."""
         column = np.asarray(self.metrics[name].cast(pa.float64()).to_numpy(zero_copy_only=False), dtype=float)
         if not np.isfinite(column).any():
-            raise VnetError("no program reported what it needs")
+            raise NothingToShow("no program reported what it needs")
         return np.where(np.isfinite(column), column, np.nan)
+
+    @cached_property
+    def estimates_positions(self) -> bool:
+        """True if programs report positions of their own, and not their raw fixes again."""
+        estimate, fix = (maybe(partial(self.metric, name)) for name in ("position_rmse_m", "fix_rmse_m"))
+        if estimate is None or fix is None:
+            return estimate is not None
+        both = np.isfinite(estimate) & np.isfinite(fix)
+        return not np.allclose(estimate[both], fix[both], rtol=SAME, atol=0)
 
     @cached_property
     def end_s(self) -> float:

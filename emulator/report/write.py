@@ -31,6 +31,8 @@ MOST_ROWS = 50
 """Rows of a check's figures that are shown."""
 MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
+SAMPLES = {"memory"}
+"""Events that are series of measurements, and would drown the others."""
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
 
 
@@ -52,7 +54,6 @@ def write_report(folder: Path) -> Path:
 
 def report_page(source: Source) -> str:
     """Return the whole page."""
-    charts, missing = draw(source)
     record = maybe(lambda: source.record)
     return render(
         "report.html.j2",
@@ -64,8 +65,9 @@ def report_page(source: Source) -> str:
         checks=_checks(record) if record else [],
         not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
-        charts=charts,
-        missing=missing,
+        has_errors=bool(record and shown_figures(record.figures)),
+        reported=_reported(record) if record else None,
+        charts=draw(source),
         radio=radio_section(source),
         events=_events(source),
         scenario=_scenario(source),
@@ -181,13 +183,20 @@ def key_figures(record: Record) -> dict[str, str]:
     return found
 
 
+def _reported(record: Record) -> Table | None:
+    """The figures of what the program reports; None without any."""
+    heads = ("figure", "mean", "5 – 95 %", "at the end")
+    rows = [dict(zip(heads, figure.words(name), strict=True)) for name, figure in record.reported.items()]
+    return table(rows, "all reports of all vehicles; at the end: the mean of each vehicle's last") if rows else None
+
+
 # Events, the scenario, and how to reproduce the run.
 
 
 def _events(source: Source) -> dict[str, Any] | str:
     """The number of events and the rows that are shown; or a sentence where there are none."""
     try:
-        events = source.events
+        events = [event for event in source.events if event.kind not in SAMPLES]
     except VnetError as error:
         return str(error)
     if not events:

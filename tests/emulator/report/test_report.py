@@ -111,7 +111,33 @@ def test_a_report_needs_nothing_from_elsewhere(cooperative: Path) -> None:
 def test_a_figure_with_nothing_to_show_is_left_out_with_the_reason(beacon: Path) -> None:
     page = page_of(beacon)
     assert "common-error" not in page.ids and "latency" in page.ids
-    assert re.search(r"Not shown .*Common error.*: no program reported what it needs", page.text)
+    assert not {"position", "consensus", "consistency", "weights", "busy"} & set(page.ids)
+    for word in ("Common error", "Not shown", "ANEES", "RMSE"):
+        assert word not in page.text, "nothing is said of what the program does not do"
+
+
+def test_what_the_program_reports_has_curves_and_maps_and_comes_before_the_checks(beacon: Path) -> None:
+    page = page_of(beacon)
+    assert page.ids.index("program") < page.ids.index("network") < page.ids.index("checks")
+    assert {"own-0", "map", "map-0"} <= set(page.ids)
+    assert "figure mean 5 – 95 % at the end neighbours" in page.text
+    assert "Map: neighbours" in page.text and "mean of the vehicles" in page.text
+
+
+def test_samples_of_memory_are_no_news(beacon: Path) -> None:
+    event = {"time_ns": 0, "kind": "memory", "node": "v01", "time_s": [0.0], "rss_kb": [1000]}
+    with (beacon / "events.jsonl").open("a") as file:
+        file.write(json.dumps(event) + "\n")
+    page = page_of(beacon)
+    assert "rss_kb" not in page.text and "ended" in page.words
+
+
+def test_checks_that_failed_come_first(beacon: Path) -> None:
+    verdict = json.loads((beacon / "verdict.json").read_text())
+    verdict["verdict"] = verdict["checks"][0]["verdict"] = "invalid"
+    (beacon / "verdict.json").write_text(json.dumps(verdict))
+    page = page_of(beacon)
+    assert page.ids.index("checks") < page.ids.index("program")
 
 
 def test_a_shared_medium_is_shown(tmp_path: Path) -> None:

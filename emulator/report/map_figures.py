@@ -1,0 +1,193 @@
+"""Maps of a run: roads, vehicles, and their links or trajectories; coloured by what programs report."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgba
+from matplotlib.lines import Line2D
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+
+from emulator.pages.canvas import BLUE, GREY, INK, SKY, Canvas, canvas, legend
+from emulator.records.reported import figure_text, is_text
+from emulator.report.drawing import Drawing
+from emulator.report.program_figures import Drawers, label_of
+from emulator.report.source import NothingToShow, Source
+from vnet.errors import printable
+from vnet.types import Array, Mask
+from vnet.units import title_of
+
+INNER_PX = 334
+"""Width of a map inside its axes, at the size that it is drawn for."""
+LEAST_PX, MOST_PX = 150, 420
+"""Bounds of its height."""
+MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 8000, 3000, 400
+"""Road segments, links and trajectories that are drawn: more would make a page of many megabytes."""
+MOST_NAMED = 30
+"""Vehicles up to which each has its name beside it."""
+POINTS_A_TRAJECTORY = 80
+LEVELS = 5
+OPACITY = (0.06, 0.25, 0.45, 0.7, 1.0)
+"""Opacity of a vehicle's point, by the level of its value."""
+MOST_COLOURED = 6
+"""Values with a map of their own."""
+KILOMETRES_FROM_M = 3000.0
+"""Extent from which on axes are in kilometres."""
+
+
+def map_charts(source: Source) -> Drawers:
+    """Return title and drawing of the map, and of a map for each value that programs report, by id."""
+    drawers: Drawers = {"map": ("Map", partial(_network, source))}
+    names = [name for name in source.value_names if not is_text(source.recorded.states.schema.field(name).type)]
+    for number, name in enumerate(names[:MOST_COLOURED]):
+        drawers[f"map-{number}"] = (f"Map: {title_of(name)}", partial(_coloured, source, name))
+    return drawers
+
+
+def _network(source: Source) -> Drawing:
+    """Draw roads, vehicles, and trajectories where vehicles drive, else the links that delivered frames."""
+    made, scale = _frame(source, 0)
+    position_m = _last_positions(source)
+    if source.recorded.moves:
+        shown = _draw_trajectories(made, source, scale)
+        text = f"Grey: roads. Lines: the ways of {shown}; points: where they were last."
+    else:
+        shown = _draw_links(made, source, scale)
+        text = f"Grey: roads. Lines: {shown}; points: vehicles."
+    _draw_vehicles(made, position_m * scale)
+    if len(position_m) <= MOST_NAMED:
+        for node, (x, y) in zip(source.recorded.node_ids, position_m * scale, strict=True):
+            if np.isfinite(x):
+                name = printable(node, 12)
+                made.axes.annotate(name, (x, y), (4, 3), textcoords="offset points", fontsize=9, color=INK)
+    return Drawing(made, text)
+
+
+def _coloured(source: Source, name: str) -> Drawing:
+    """Draw each vehicle by the last value that it reported."""
+    last = _last_values(source.values_of(name))
+    known = np.isfinite(last)
+    low, high = float(last[known].min()), float(last[known].max())
+    if low == high:
+        raise NothingToShow("all vehicles ended with the same value")
+    made, scale = _frame(source, 1)
+    position_m = _last_positions(source) * scale
+    level = np.clip(((last - low) / (high - low) * LEVELS), 0, LEVELS - 1)
+    level = np.where(known, level, -1).astype(int)
+    handles = []
+    dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 7, "markeredgewidth": 0.8}
+    dots["markeredgecolor"] = BLUE
+    levels = sorted(set(level[known].tolist()))
+    for each in levels:
+        some = position_m[level == each]
+        dots["markerfacecolor"] = to_rgba(BLUE, OPACITY[each])
+        made.axes.plot(*some.T, **dots)
+        label = _range(low, high, each, source.is_boolean(name))
+        handles.append(Line2D([], [], label=label, **dots))
+    _draw_vehicles(made, position_m[~known], GREY)
+    legend(made, [handles[0], handles[-1]])
+    silent = " Grey: never reported it." if (~known).any() else ""
+    return Drawing(made, f"{label_of(name)}: what each vehicle reported last.{silent}")
+
+
+def _range(low: float, high: float, level: int, is_boolean: bool) -> str:
+    """Name a level: by the range of its values."""
+    if is_boolean:
+        return "true" if level else "false"
+    width = (high - low) / LEVELS
+    return f"{figure_text(low + level * width)} – {figure_text(low + (level + 1) * width)}"
+
+
+def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
+    """Make axes of equal scale around all vehicles, with the roads; returns also the axes' units a metre."""
+    world = source.recorded.world
+    low, high = world.area_m
+    centre, half = (low + high) / 2, np.maximum((high - low) / 2 * 1.08, 25.0)
+    height_px = float(np.clip(INNER_PX * half[1] / half[0], LEAST_PX, MOST_PX))
+    half = np.maximum(half, (half[1] * INNER_PX / height_px, half[0] * height_px / INNER_PX))
+    is_wide = 2 * half.max() > KILOMETRES_FROM_M
+    scale, unit = (1e-3, "km") if is_wide else (1.0, "m")
+    made = canvas(f"east ({unit})", f"north ({unit})", legend_rows, plot_px=height_px)
+    (left, bottom), (right, top) = (centre - half) * scale, (centre + half) * scale
+    made.axes.set(xlim=(left, right), ylim=(bottom, top))
+    made.axes.grid(visible=False)
+    _draw_roads(made, world.lane_point_m, world.lane_heading_rad, world.lane_length_m, (centre, half), scale)
+    return made, scale
+
+
+def _draw_roads(
+    made: Canvas, point_m: Array, heading_rad: Array, length_m: Array, window_m: tuple[Array, Array], scale: float
+) -> None:
+    """Draw the lanes that come near the window (centre and half extents), the longest ones if there are many."""
+    centre, half = window_m
+    reach_m = 2 * float(np.abs(half).sum()) + float(np.hypot(*(point_m - centre).T).max(initial=0.0))
+    endless = np.isinf(length_m)
+    along = np.column_stack([np.cos(heading_rad), np.sin(heading_rad)])
+    start = point_m - np.where(endless, reach_m, 0.0)[:, None] * along
+    end = point_m + np.where(endless, reach_m, length_m)[:, None] * along
+    near = ~((np.maximum(start, end) < centre - half) | (np.minimum(start, end) > centre + half)).any(axis=1)
+    chosen = np.flatnonzero(near)
+    if len(chosen) > MOST_ROADS:
+        chosen = np.sort(chosen[np.argsort(-length_m[chosen], kind="stable")[:MOST_ROADS]])
+    _draw_lines(made, np.stack([start, end], axis=1)[chosen] * scale, GREY, 0.55, 0.8)
+
+
+def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: float) -> None:
+    """Draw lines (k, points, 2) as one path; NaN are gaps."""
+    if not len(lines):
+        return
+    codes = np.full(lines.shape[:2], Outline.LINETO, dtype=np.uint8)
+    codes[:, 0] = Outline.MOVETO
+    outline = Outline(lines.reshape(-1, 2), codes.ravel())
+    made.axes.add_patch(PathPatch(outline, fill=False, edgecolor=colour, alpha=opacity, linewidth=width))
+
+
+def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE) -> None:
+    made.axes.plot(*position.T, color=colour, linestyle="none", marker="o", markersize=5, markeredgewidth=0)
+
+
+def _draw_links(made: Canvas, source: Source, scale: float) -> str:
+    """Draw the links on which frames were delivered; returns what is drawn, in words."""
+    recorded = source.recorded
+    if not len(recorded.trace):
+        return "no link delivered a frame"
+    count = len(recorded.node_ids)
+    good = recorded.outcome_is("delivered")
+    one, other = recorded.sender[good], recorded.receiver[good]
+    pair = np.unique(np.minimum(one, other) * count + np.maximum(one, other))
+    shown = pair[:: max(1, -(-len(pair) // MOST_LINKS))]
+    position_m = recorded.places.position_m(0)
+    ends = np.stack([position_m[shown // count], position_m[shown % count]], axis=1)
+    _draw_lines(made, ends * scale, SKY, float(np.clip(30 / max(len(shown), 1), 0.12, 0.8)), 1.0)
+    part = f"{len(shown):,} of the " if len(shown) < len(pair) else "the "
+    return f"{part}{len(pair):,} links that delivered frames"
+
+
+def _draw_trajectories(made: Canvas, source: Source, scale: float) -> str:
+    """Draw the ways of the vehicles; returns what is drawn, in words."""
+    course_m = source.recorded.vectors("position_m")
+    periods, count, _ = course_m.shape
+    chosen = np.linspace(0, periods - 1, min(periods, POINTS_A_TRAJECTORY)).astype(int)
+    vehicles = np.arange(count)[:: max(1, -(-count // MOST_TRAJECTORIES))]
+    ways = course_m[chosen][:, vehicles].transpose(1, 0, 2)
+    pieces = np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 2)
+    pieces = pieces[np.isfinite(pieces).all(axis=(1, 2))]
+    _draw_lines(made, pieces * scale, SKY, 0.8, 1.4)
+    return f"{len(vehicles):,} of {count:,} vehicles" if len(vehicles) < count else f"{count:,} vehicles"
+
+
+def _last_positions(source: Source) -> Array:
+    """Return where each vehicle was last (N, 2); NaN of one that never was there."""
+    if not source.recorded.moves:
+        return source.recorded.places.position_m(0)
+    return np.stack([_last_values(source.recorded.vectors("position_m")[..., axis]) for axis in (0, 1)], axis=1)
+
+
+def _last_values(value: Array) -> Array:
+    """Return the last finite value (N,) of each column of (periods, N); NaN where there is none."""
+    known: Mask = np.isfinite(value)
+    index = len(value) - 1 - known[::-1].argmax(axis=0)
+    return np.asarray(np.where(known.any(axis=0), value[index, np.arange(value.shape[1])], np.nan))

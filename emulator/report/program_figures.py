@@ -1,0 +1,108 @@
+"""Charts of what programs report by names of their own: each value against time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from emulator.pages.canvas import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, canvas, legend
+from emulator.records.reported import is_text
+from emulator.report.drawing import DASHES, TIME, Drawing, Line, faults_note, time_figure
+from emulator.report.source import NothingToShow, Source
+from vnet.types import Array
+from vnet.units import title_of, unit_of
+
+MOST_TEXTS = 6
+"""Texts of one name that have a line; the others are counted together."""
+MOST_CHARTS = 24
+"""Values that have a chart."""
+_COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
+
+Drawers = dict[str, tuple[str, Callable[[], Drawing]]]
+
+
+def program_charts(source: Source) -> Drawers:
+    """Return title and drawing of each value's chart, by id."""
+    drawers: Drawers = {}
+    for number, name in enumerate(source.value_names[:MOST_CHARTS]):
+        kind = source.recorded.states.schema.field(name).type
+        draw = partial(_texts if is_text(kind) else _numbers, source, name)
+        drawers[f"own-{number}"] = (title_of(name), draw)
+    return drawers
+
+
+def label_of(name: str) -> str:
+    """Return the label of an axis: the name in words, with its unit."""
+    unit = unit_of(name)
+    return f"{title_of(name)} ({unit})" if unit else title_of(name)
+
+
+def _numbers(source: Source, name: str) -> Drawing:
+    """Draw mean and 5 to 95 % over the vehicles, and one vehicle; of a boolean the share that is true."""
+    value = source.values_of(name)
+    time_s = source.period_times_s(len(value))
+    if source.is_boolean(name):
+        share = 100 * _mean(value)
+        made = time_figure(
+            [Line("", time_s, share, BLUE)], f"{title_of(name)} (%)", source.end_s, source.spans, True
+        )
+        made.axes.set_ylim(0, 105)
+        text = "Share of the vehicles that report it that say true."
+        return Drawing(made, text + faults_note(made, source))
+    node = int(np.isfinite(value).sum(axis=0).argmax())
+    who = source.recorded.node_ids[node]
+    several = value.shape[1] > 1
+    lines = [Line("mean of the vehicles" if several else who, time_s, _mean(value), BLUE)]
+    if several:
+        lines.append(Line(who, time_s, value[:, node], RED, DASHES[1]))
+    made = time_figure(lines, label_of(name), source.end_s, source.spans, linear=True)
+    if several:
+        low, high = _band(value)
+        made.axes.fill_between(time_s, low, high, color=GREY, alpha=0.3, linewidth=0, zorder=0.7)
+    _fit(made.axes, value)
+    text = "Grey: 5 to 95 % of the vehicles." if several else ""
+    return Drawing(made, f"{text}{faults_note(made, source)}".strip())
+
+
+def _fit(axes: Axes, value: Array) -> None:
+    """Let the axis of values begin at zero, or below where values are negative."""
+    least, most = float(np.nanmin(value)), float(np.nanmax(value))
+    margin = 0.05 * (most - min(least, 0.0)) or 1.0
+    axes.set_ylim(least - margin if least < 0 else 0, most + margin)
+
+
+def _texts(source: Source, name: str) -> Drawing:
+    """Draw the share of the vehicles that report each text."""
+    shares, texts = source.text_shares(name)
+    if not texts:
+        raise NothingToShow("nothing was reported")
+    time_s = source.period_times_s(len(shares))
+    rows = (len(texts[:MOST_TEXTS]) + 2) // 3
+    made = canvas(TIME, f"{title_of(name)} (% of vehicles)", rows, source.spans, source.end_s)
+    for index, text in enumerate(texts[:MOST_TEXTS]):
+        made.axes.plot(time_s, 100 * shares[:, index], color=_COLOURS[index], label=text)
+    made.axes.set_ylim(0, 105)
+    legend(made)
+    more = f" {len(texts) - MOST_TEXTS} rarer ones are not shown." if len(texts) > MOST_TEXTS else ""
+    return Drawing(made, f"Share of the vehicles that report each text.{more}{faults_note(made, source)}")
+
+
+def _mean(value: Array) -> Array:
+    """Return the mean (periods,) of what is finite in each period; NaN where nothing is."""
+    known = np.isfinite(value)
+    count = known.sum(axis=1)
+    total = np.where(known, value, 0.0).sum(axis=1)
+    return np.asarray(np.where(count, total / np.maximum(count, 1), np.nan))
+
+
+def _band(value: Array) -> tuple[Array, Array]:
+    """Return the 5th and the 95th percentile (periods,) of what is finite in each period."""
+    low, high = np.full(len(value), np.nan), np.full(len(value), np.nan)
+    finite = np.where(np.isfinite(value), value, np.nan)
+    some = np.flatnonzero(np.isfinite(finite).any(axis=1))
+    if len(some):
+        low[some], high[some] = np.nanpercentile(finite[some], [5, 95], axis=1)
+    return low, high
