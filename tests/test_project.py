@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from tests.docs import commands
 from tests.docs.pages import check_workflow
 from tests.support.paths import ROOT
 
@@ -28,6 +29,33 @@ def test_the_workflow_can_be_run() -> None:
     check_workflow(WORKFLOW)
     (job,) = WORKFLOW["jobs"].values()
     assert [step["run"] for step in job["steps"] if "run" in step] == ["make test PYTHON=python"]
+
+
+def test_the_action_runs_a_campaign_with_its_inputs(tmp_path: Path) -> None:
+    action = yaml.safe_load((ROOT / ".github" / "actions" / "campaign" / "action.yml").read_text())
+    (step,) = [step for step in action["runs"]["steps"] if "vnet campaign" in step.get("run", "")]
+    given = {"scenario": "my town.toml", "runs": "3", "arguments": "--program chatty:main --duration 12"}
+    environment = {}
+    for name, value in step["env"].items():
+        match = re.fullmatch(r"\$\{\{ inputs\.(\w+) \}\}", value)
+        assert match and match[1] in action["inputs"]
+        environment[name] = given[match[1]]
+    stub = tmp_path / "vnet"
+    stub.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    stub.chmod(0o755)
+    command = ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", step["run"]]
+    done = subprocess.run(
+        command,
+        env={"PATH": f"{tmp_path}:/usr/bin:/bin", **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    words = done.stdout.splitlines()
+    assert words[:2] == ["campaign", "my town.toml"]
+    assert words[-4:] == ["--program", "chatty:main", "--duration", "12"]
+    commands.parse(["vnet", *words])
+    assert set(action["inputs"]) >= set(given)
 
 
 def test_the_supported_versions_of_python_are_the_same_everywhere() -> None:

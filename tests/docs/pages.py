@@ -182,7 +182,7 @@ def check_workflow(data: dict[Any, Any]) -> None:
         for step in job["steps"]:
             if ("uses" in step) == ("run" in step):
                 raise DocsError(f"job {name}: a step either uses or runs: {step}")
-            if "uses" in step and not re.fullmatch(r"[\w-]+/[\w.-]+@[\w.-]+", step["uses"]):
+            if "uses" in step and not re.fullmatch(r"[\w-]+/[\w.-]+(/[\w.-]+)*@[\w.-]+", step["uses"]):
                 raise DocsError(f"job {name}: {step['uses']}: is not owner/action@version")
             for words, _ in commands.commands(step.get("run", "")):
                 commands.parse(words)
