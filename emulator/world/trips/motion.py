@@ -92,7 +92,7 @@ def motion_of(trips: list[Trip], selection: Selection, rules: Rules) -> Motion:
 
 
 def _left_out(impossible: Sequence[ImpossibleTripError], of: int) -> tuple[str, ...]:
-    """Return the line that says which vehicles are left out, and why."""
+    """Return the line that says which vehicles are omitted, with the reason."""
     if not impossible:
         return ()
     reasons = first_names([error.reason for error in impossible], most=3, with_total=True)
