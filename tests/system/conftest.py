@@ -1,12 +1,14 @@
 """Whole runs: real routers on ports that the system chooses, real processes, through the commands users type."""
 
+import contextlib
+import io
 import json
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,8 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
+from emulator.cli.commands import app
+from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 
 VNET = [sys.executable, "-P", "-m", "emulator.cli"]
@@ -72,30 +76,56 @@ class Finished:
 Vnet = Callable[..., Finished]
 
 
+PATIENT = ["--set", f"run.join_timeout_s={TIMEOUT_S}", "--set", f"run.stall_timeout_s={TIMEOUT_S}"]
+"""Options of live runs, so that no verdict depends on the machine's speed."""
+APART = {"--log-format", "--quiet", "--rerun"}
+"""Options of simulations that need a standard output, or a process, of their own."""
+
+
 @pytest.fixture
 def vnet(tmp_path: Path) -> Vnet:
-    """Run a vnet command to its end: vnet("run", "scenarios/twelve.toml", "--seed", "3")."""
+    """Run a vnet command to its end: vnet("run", "scenarios/twelve.toml", "--seed", "3").
+
+    What starts processes is a process itself; a simulation runs in this one.
+    """
+    return command_in(tmp_path)
+
+
+def command_in(parent: Path) -> Vnet:
+    """A function that runs vnet commands to their end, each with a folder of its own in `parent`."""
     numbers = iter(range(100))
 
     def run(command: str, scenario: str, *options: str) -> Finished:
-        folder = tmp_path / f"run{next(numbers)}"
+        folder = parent / f"run{next(numbers)}"
         plain = ["--no-report"] if command in ("run", "simulate") and "--report" not in options else []
-        done = subprocess.run(
-            [*VNET, command, scenario, "--out", str(folder), *plain, *options],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-        )
+        if command == "run":
+            plain += PATIENT
+        words = [command, scenario, "--out", str(folder), *plain, *options]
+        if command == "simulate" and APART.isdisjoint(options):
+            return Finished(*_in_this_process(words), folder)
+        done = subprocess.run([*VNET, *words], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
         return Finished(done.returncode, done.stdout, done.stderr, folder)
 
     return run
 
 
+def _in_this_process(words: Sequence[str]) -> tuple[int, str, str]:
+    """A command's exit status, and what it writes on stdout and stderr."""
+    out, error, path = io.StringIO(), io.StringIO(), list(sys.path)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error), contextlib.chdir(ROOT):
+        try:
+            status = run_app(app, words)
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 1
+        finally:
+            sys.path[:] = path
+    return status, out.getvalue(), error.getvalue()
+
+
 def run_until(enough: Callable[[], bool], folder: Path, scenario: str, *options: str) -> Finished:
     """`vnet run`, ended by Ctrl-C once it is `enough`: what a run in real time shows in a fixed time depends on the
     machine. The run must be long."""
-    command = [*VNET, "run", scenario, "--out", str(folder), "--no-report", *options]
+    command = [*VNET, "run", scenario, "--out", str(folder), "--no-report", *PATIENT, *options]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             deadline = time.monotonic() + TIMEOUT_S

@@ -3,6 +3,7 @@
 import json
 import signal
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ LOSS = {"kind": "loss", "duration_s": 3000.0, "probability": 1.0}
 def ask_until(folder: Path, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Ask for the status until it is as wanted: emulated time passes meanwhile, at whatever pace."""
     while not wanted(status := ask(folder, "status")):
-        pass
+        time.sleep(0.05)
     return status
 
 

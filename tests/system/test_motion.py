@@ -52,7 +52,7 @@ def test_processes_that_come_and_go_do_the_same_as_their_simulation(vnet: Vnet, 
         assert comings_and_goings(run) == [("entered", "v4", 1_200_000_000), ("left", "v5", 2_200_000_000)]
     assert live.fingerprint == simulated.fingerprint
     assert not running_agents(live.folder)
-    again = vnet("run", str(live.folder / "scenario.toml"))
+    again = vnet("simulate", str(live.folder / "scenario.toml"))
     assert again.fingerprint == live.fingerprint
 
 

@@ -20,13 +20,14 @@ def test_processes_on_one_channel_do_the_same_as_their_simulation(vnet: Vnet) ->
 
 def test_whoever_answers_what_it_hears_is_woken_at_the_same_instant(vnet: Vnet) -> None:
     """Arrivals depend on what others send before: looking ahead must stop where anybody may answer."""
-    apart = vnet("run", SCENARIO, *SMALL, *ANSWERING)
-    together = vnet("run", SCENARIO, *SMALL, *ANSWERING, "--set", "run.nodes_per_process=3")
-    simulated = vnet("simulate", SCENARIO, *SMALL, *ANSWERING)
+    few = ("--set", "network.vehicles=4", "--duration", "0.8", *ANSWERING)
+    apart = vnet("run", SCENARIO, *few)
+    together = vnet("run", SCENARIO, *few, "--set", "run.nodes_per_process=2")
+    simulated = vnet("simulate", SCENARIO, *few)
     assert apart.status == together.status == simulated.status == 0, apart.stderr + apart.stdout
     assert simulated.fingerprint == apart.fingerprint == together.fingerprint
     answers = [row for row in simulated.trace() if row["size_bytes"] == 7]
-    assert len(answers) > 50
+    assert len(answers) > 20
 
 
 def test_on_the_wall_clock_frames_share_the_medium_too(tmp_path: Path) -> None:

@@ -4,9 +4,19 @@ import multiprocessing
 import os
 from multiprocessing.synchronize import Event
 
-from tests.system.conftest import Vnet
+import pytest
+
+from tests.system.conftest import Finished, Vnet, command_in
 
 SCENARIO = "scenarios/twelve.toml"
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The scenario in one process."""
+    done = command_in(tmp_path_factory.mktemp("simulated"))("simulate", SCENARIO)
+    assert done.status == 0, done.stderr + done.stdout
+    return done
 
 
 def _burn(stop: Event) -> None:
@@ -14,13 +24,7 @@ def _burn(stop: Event) -> None:
         sum(range(10_000))
 
 
-def test_twice_live_beside_a_busy_machine_and_simulated_are_one_run(vnet: Vnet) -> None:
-    first = vnet("run", SCENARIO)
-    assert first.status == 0, first.stderr + first.stdout
-    simulated = vnet("simulate", SCENARIO)
-    assert simulated.status == 0, simulated.stderr + simulated.stdout
-    assert simulated.fingerprint == first.fingerprint
-
+def test_a_live_run_beside_a_busy_machine_is_the_simulated_one(vnet: Vnet, simulated: Finished) -> None:
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     burners = [context.Process(target=_burn, args=(stop,)) for _ in range(2 * (os.cpu_count() or 1))]
@@ -33,14 +37,13 @@ def test_twice_live_beside_a_busy_machine_and_simulated_are_one_run(vnet: Vnet) 
         for burner in burners:
             burner.join()
     assert busy.status == 0, busy.stderr + busy.stdout
-    assert busy.fingerprint == first.fingerprint
+    assert busy.fingerprint == simulated.fingerprint
 
 
-def test_several_nodes_in_a_process_make_no_difference(vnet: Vnet) -> None:
-    alone = vnet("simulate", SCENARIO)
+def test_several_nodes_in_a_process_make_no_difference(vnet: Vnet, simulated: Finished) -> None:
     together = vnet("run", SCENARIO, "--set", "run.nodes_per_process=5")
     assert together.status == 0, together.stderr + together.stdout
-    assert together.fingerprint == alone.fingerprint
+    assert together.fingerprint == simulated.fingerprint
 
 
 def test_a_runs_own_scenario_file_reproduces_it(vnet: Vnet) -> None:
