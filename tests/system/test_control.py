@@ -97,7 +97,7 @@ def test_a_bad_query_gets_one_line_of_error_and_changes_nothing(
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("control") / "run"
-    with long_run(folder) as process:
+    with long_run(folder, "--pacing", "realtime") as process:  # in lockstep it would fill the memory meanwhile
         yield folder, json.loads((folder / CONTROL_FILE).read_text())
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)

@@ -15,7 +15,15 @@ from tests.support.paths import ROOT
 from tests.support.processes import has_ended
 from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, running_agents
 
-LONG = ["--program", "tests.system.programs:runs_long", "--duration", "3600", "--set", "network.vehicles=3"]
+LONG = [
+    "--program",
+    "tests.system.programs:runs_long",
+    "--duration",
+    "3600",
+    "--set",
+    "network.vehicles=3",
+    "--no-report",
+]
 
 
 @contextmanager
