@@ -15,11 +15,20 @@ from typing import Annotated
 import typer
 
 from vnet.errors import ProgramError, VnetError
+from vnet.runtime import interrupts
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
 from vnet.runtime.program_path import search_programs_in
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version  # slow to import, and no vehicle needs it
+
+        print(f"vnet-agent {version('vnet-emulator')}")
+        raise typer.Exit
 
 
 @app.command()
@@ -43,6 +52,12 @@ def agent(
             metavar="FOLDER", help="Look for the program here, before the current folder. May be repeated."
         ),
     ] = None,
+    show_version: Annotated[
+        bool,
+        typer.Option(
+            "--version", metavar="", callback=_print_version, is_eager=True, help="Show the version and exit."
+        ),
+    ] = False,
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
@@ -50,6 +65,7 @@ def agent(
     from vnet.transport.keys import is_segment
     from vnet.transport.session import quiet_zenoh
 
+    interrupts.raise_from_now_on()
     faulthandler.register(signal.SIGUSR1)
     # An emulator that is killed cannot continue the agents that it has paused; once continued, they find that they
     # are orphans, and end.
@@ -88,9 +104,10 @@ def _leave_terminal() -> None:
 
 def main() -> None:
     """The console script."""
+    interrupts.end_at_once()
     use_one_blas_thread()
     fix_hash_seed("agents.cli")
-    app()
+    app(prog_name="vnet-agent")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,8 @@ command tells the same with `--help`.
 """
 STATUSES = {
     **{verdict.exit_status: f"the run is {verdict}" for verdict in Verdict},
-    2: "wrong usage, or something that cannot be used: a scenario, a folder, a credentials file, a program",
+    2: "wrong usage, or what cannot be used: a scenario, a folder, a credentials file, a program, an output",
+    70: "a bug in vnet; the line of error says which file has its traceback",
     130: "interrupted by Ctrl-C",
 }
 AGENT = """

@@ -1,23 +1,31 @@
 """The command `vnet`, one file a group of commands; `python -m emulator` is the same command.
 
-Exit status: 0 valid, 1 invalid, 2 wrong usage or a wrong scenario, 3 unknown, 130 interrupted.
+Exit status: 0 valid, 1 invalid, 2 wrong usage, a wrong scenario or output that cannot be written, 3 unknown, 70 a
+bug of vnet's own, 130 interrupted.
 """
 
 import sys
 
-from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
-
 
 def main() -> None:
     """Run the command `vnet` with the arguments of this process; import only what that command needs."""
+    from vnet.runtime import interrupts
+
+    interrupts.end_at_once()
     from emulator.cli.table import find
+    from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
 
     use_one_blas_thread()
-    command = find(sys.argv[1:])
+    arguments = sys.argv[1:]
+    command = find(arguments)
     if command is not None and command.runs_programs:
         fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
-    from emulator.terminal.console import run_app, tolerate_any_sign
+    from emulator.terminal import console, standard_streams
 
-    tolerate_any_sign()
-    sys.exit(run_app(build_app([] if command is None else [command]), sys.argv[1:]))
+    standard_streams.tolerate_failures()
+    status = console.run_app(build_app([] if command is None else [command]), arguments)
+    interrupts.finish(status)
+    if failure := standard_streams.failure():
+        status = console.say_output_failed(failure, arguments)
+    sys.exit(status)

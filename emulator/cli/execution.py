@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,11 +28,11 @@ from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
 from emulator.drivers.program_check import program_check
 from emulator.drivers.router import SeparateRouter
-from emulator.drivers.signals import signals_ignored
+from emulator.drivers.signals import first_interrupt_told, signals_ignored
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import LogFormat
+from emulator.terminal.console import LogFormat, say_first
 from emulator.terminal.progress import Progress, show_progress
 from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
@@ -92,7 +93,8 @@ def run_in_this_process(request: Request) -> None:
         with ExitStack() as stack:
             if request.sinks is not None:
                 _record_here(emulation, request.sinks, stack)
-            wall_s, interrupted = run_simulation(emulation)
+            say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
+            wall_s, interrupted = run_simulation(emulation, on_interrupt=say)
         _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
 
 
@@ -167,7 +169,28 @@ def _finish(
     asked: OutputOptions,
     output: StandardOutput,
 ) -> None:
-    """Judge a run and print its summary; exits with the verdict's status."""
+    """Judge a run and print its summary; exits with the verdict's status. A second Ctrl-C ends that, too."""
+    say = partial(_say, asked, "the run is being judged and written; Ctrl-C again ends without")
+    with first_interrupt_told(say):
+        status = _conclude(emulation, progress, wall_s, interrupted, command, asked, output)
+    raise typer.Exit(status)
+
+
+def _say(asked: OutputOptions, line: str) -> None:
+    """Print a line on stderr for who has pressed Ctrl-C."""
+    if not asked.only_the_result:
+        say_first(f"vnet: {line}")
+
+
+def _conclude(
+    emulation: Emulation,
+    progress: Progress,
+    wall_s: float,
+    interrupted: bool,
+    command: str,
+    asked: OutputOptions,
+    output: StandardOutput,
+) -> int:
     progress.judging()
     judgement, verdict = conclude(emulation, wall_s, command)
     progress.close()
@@ -185,4 +208,4 @@ def _finish(
         print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
     if asked.report:
         report_at_end(folder)
-    raise typer.Exit(status)
+    return status

@@ -11,7 +11,8 @@ import typer
 from rich.console import Console
 
 from emulator.cli.options import LATEST, RunArgument
-from emulator.terminal.console import one_line_errors
+from emulator.records.run_folder import VERDICT_FILE
+from emulator.terminal.console import one_line_errors, tell
 from vnet.errors import VnetError
 
 
@@ -27,6 +28,8 @@ def report(
     with one_line_errors():
         path = _write_index(index) if index is not None else _write_report(run)
         print(path, flush=True)
+        if index is None and not (run / VERDICT_FILE).exists():
+            tell(f"{run}: has no verdict: the run is still going on, or was ended from outside")
         if show and not webbrowser.open(path.resolve().as_uri()):
             raise VnetError(f"--open: no browser was found here; open {path}")
 
@@ -35,7 +38,7 @@ def report_at_end(folder: Path) -> None:
     """Write the report of a run that has just ended. What goes wrong is said, and changes nothing."""
     try:
         _write_report(folder)
-    except (Exception, KeyboardInterrupt) as error:  # a verdict that stands must not fall by a picture
+    except Exception as error:  # a verdict that stands must not fall by a picture
         what = str(error) if isinstance(error, VnetError) else f"{folder}: {error!r}"
         print(f"vnet: the report could not be written: {what}", file=sys.stderr)
 

@@ -40,6 +40,7 @@ from emulator.terminal.console import LogFormat, one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
 from emulator.viewer.sinks import choose_sinks
 from vnet.errors import ScenarioError, VnetError
+from vnet.runtime.interrupts import ended_at_once
 
 
 class RouterKind(StrEnum):
@@ -81,7 +82,8 @@ def run(
         _check_restarts(loaded, router is RouterKind.SEPARATE)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         _announce(loaded, asked)
-        from emulator.cli.execution import Request, run_with_processes
+        with ended_at_once():
+            from emulator.cli.execution import Request, run_with_processes
 
         request = Request(loaded, scenario, out, sinks, asked, output)
         run_with_processes(request, separate_router=router is RouterKind.SEPARATE)
@@ -110,7 +112,8 @@ def simulate(
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
         _announce(loaded, asked)
-        from emulator.cli.execution import Request, run_in_this_process
+        with ended_at_once():
+            from emulator.cli.execution import Request, run_in_this_process
 
         run_in_this_process(Request(loaded, scenario, out, sinks, asked, output))
 
@@ -159,7 +162,8 @@ def emulator(
         _check_restarts(loaded, own_router=False)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         _announce(loaded, asked)
-        from emulator.cli.execution import Request, run_for_agents
+        with ended_at_once():
+            from emulator.cli.execution import Request, run_for_agents
 
         run_for_agents(Request(loaded, scenario, out, sinks, asked, output), listen, connect, access)
 

@@ -61,6 +61,27 @@ async def cancelled_by_signals() -> AsyncIterator[None]:
 
 
 @contextmanager
+def first_interrupt_told(tell: Callable[[], None]) -> Iterator[None]:
+    """Tell of the block's first Ctrl-C or SIGTERM, and go on; at the second raise KeyboardInterrupt."""
+    told = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal told
+        if told:
+            raise KeyboardInterrupt
+        told = True
+        tell_from_handler(tell)
+
+    with signals_handled(interrupt, *ENDING):
+        yield
+
+
+def tell_from_handler(tell: Callable[[], None]) -> None:
+    """Tell on another thread: a handler may have interrupted one that holds the lock of what is printed to."""
+    threading.Thread(target=tell, daemon=True).start()
+
+
+@contextmanager
 def signals_ignored() -> Iterator[None]:
     """Ignore Ctrl-C and SIGTERM within the block, but where a run in it handles them: records are kept."""
     with signals_handled(signal.SIG_IGN, *ENDING):

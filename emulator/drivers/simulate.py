@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.signals import tell_from_handler
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
@@ -33,20 +34,22 @@ def simulate(
     emulation: Emulation,
     before_horizon: Callable[[Lockstep], None] | None = None,
     stop: threading.Event | None = None,
+    on_interrupt: Callable[[], None] = lambda: None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
     it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
-    Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one.
+    Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
+    a thread of its own, at the first Ctrl-C.
     """
     simulation = _Simulation(emulation, before_horizon, stop or threading.Event())
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
     try:
-        with _ending_between_instants(simulation):
+        with _ending_between_instants(simulation, on_interrupt):
             simulation.run()
     except KeyboardInterrupt:
         interrupted = True
@@ -56,12 +59,13 @@ def simulate(
 
 
 @contextmanager
-def _ending_between_instants(simulation: _Simulation) -> Iterator[None]:
+def _ending_between_instants(simulation: _Simulation, on_interrupt: Callable[[], None]) -> Iterator[None]:
     """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
 
     def ask(number: int, frame: object) -> None:
         simulation.stop.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        tell_from_handler(on_interrupt)
 
     here = threading.current_thread() is threading.main_thread()
     if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # others see to it
@@ -111,6 +115,7 @@ class _Simulation:
         except _RunOverError:
             self._close(self._emulation.duration_ns)
         except KeyboardInterrupt:
+            self._host.forget_interrupt()
             self._close(self.loop.now_ns)
             raise
         finally:

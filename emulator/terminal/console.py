@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-import io
+import errno
 import json
+import shlex
 import sys
+import tempfile
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from enum import StrEnum
 from itertools import pairwise
+from typing import Any
 
 import typer
+import typer.main
 
 from vnet.errors import LONGEST_MESSAGE, VnetError, printable
+from vnet.runtime import interrupts
 
 WRONG_USAGE = 2
+BUG = 70
+"""Exit status for a bug of vnet's own: EX_SOFTWARE of sysexits.h."""
+REFUSED_BY_THE_SYSTEM = (
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.ENOMEM,
+)
+"""Errors that say something of the machine, and not of vnet."""
 
 
 class LogFormat(StrEnum):
@@ -48,29 +67,70 @@ def say_first(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
 
-def _say(message: str, log_format: LogFormat) -> None:
+def _say(message: str, log_format: LogFormat, status: int = WRONG_USAGE) -> None:
     if log_format is LogFormat.JSON:
-        print(json.dumps({"kind": "error", "message": message, "exit_status": WRONG_USAGE}), file=sys.stderr)
+        print(json.dumps({"kind": "error", "message": message, "exit_status": status}), file=sys.stderr)
     else:
         print(f"vnet: {message}", file=sys.stderr)
 
 
-def tolerate_any_sign() -> None:
-    """Have standard output print `?` for a sign that the terminal does not know, rather than fail."""
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")
-
-
 def run_app(app: typer.Typer, arguments: Sequence[str]) -> int:
-    """Run a command line to its end; returns its exit status. A line that makes no sense gets one line of error."""
+    """Run a command line to its end; returns its exit status.
+
+    A line that makes no sense, and whatever else goes wrong, gets one line of error.
+    """
     try:
-        return app(list(arguments), prog_name="vnet", standalone_mode=False) or 0
+        command: Any = typer.main.get_command(app)
+        with command.make_context("vnet", list(arguments)) as context:
+            interrupts.raise_from_now_on()
+            command.invoke(context)
+        return 0
+    except typer.Exit as end:
+        return end.exit_code
     except typer.TyperException as error:
         if type(error).__name__ == "NoArgsIsHelpError":
             print(error.format_message())
         else:
             _say(_in_one_line(error), _asked_for(arguments))
         return WRONG_USAGE
+    except KeyboardInterrupt:
+        return interrupts.INTERRUPTED
+    except Exception as error:
+        return _say_unexpected(error, arguments)
+
+
+def say_output_failed(error: OSError, arguments: Sequence[str]) -> int:
+    """Say that standard output could not be written; returns the exit status."""
+    _say(f"standard output: cannot be written: {error.strerror}", _asked_for(arguments))
+    return WRONG_USAGE
+
+
+def _say_unexpected(error: Exception, arguments: Sequence[str]) -> int:
+    """Say in one line what no command has foreseen; returns the exit status."""
+    chain: BaseException | None = error
+    while chain is not None:  # extension modules turn an interrupt during their import into an ImportError
+        if isinstance(chain, KeyboardInterrupt):
+            return interrupts.INTERRUPTED
+        chain = chain.__cause__ or chain.__context__
+    log_format = _asked_for(arguments)
+    if isinstance(error, OSError) and error.errno in REFUSED_BY_THE_SYSTEM:
+        where = "" if error.filename is None else f"{printable(str(error.filename))}: "
+        _say(f"{where}{error.strerror}", log_format)
+        return WRONG_USAGE
+    what = printable(f"{type(error).__name__}: {error}", LONGEST_MESSAGE)
+    _say(f"a bug in vnet: {what}; please report it with {_keep_traceback(error, arguments)}", log_format, BUG)
+    return BUG
+
+
+def _keep_traceback(error: Exception, arguments: Sequence[str]) -> str:
+    """Write a traceback into a file of its own; returns where it is."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix="vnet-bug-", suffix=".txt", delete=False) as file:
+            file.write(f"{shlex.join(['vnet', *arguments])}\nPython {sys.version}\n\n{text}")
+    except OSError:
+        return f"its traceback, which could not be written: {traceback.extract_tb(error.__traceback__)[-1]}"
+    return f"its traceback, {file.name}"
 
 
 def _in_one_line(error: typer.TyperException) -> str:

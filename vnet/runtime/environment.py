@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 
+from vnet.runtime import interrupts
 from vnet.runtime.own_packages import foreign_on_path
 
 ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -32,5 +33,6 @@ def fix_hash_seed(module: str) -> None:
     if foreign := foreign_on_path(package, sys.path if sys.flags.safe_path else sys.path[1:]):
         print(f"vnet: {foreign}", file=sys.stderr)
         sys.exit(2)
+    interrupts.hold()  # until the process that starts can end without a traceback
     arguments = [sys.executable, "-P", "-m", module, *sys.argv[1:]]
     os.execve(sys.executable, arguments, {**os.environ, "PYTHONHASHSEED": "0"})

@@ -277,6 +277,12 @@ class Host:
             task.cancel()
         return tasks
 
+    def forget_interrupt(self) -> None:
+        """Take note of the interrupt that has ended a task, of which asyncio would print a traceback otherwise."""
+        for task in list(self._tasks):
+            if task.done() and not task.cancelled():
+                task.exception()
+
     def close(self, loop: VirtualTimeLoop) -> None:
         """Cancel all programs and let their `finally` blocks run, as far as they do not wait (lockstep).
 

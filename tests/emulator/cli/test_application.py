@@ -1,5 +1,6 @@
 """The command line as a whole: what is imported for a command, and what help looks like."""
 
+import errno
 import json
 import os
 import subprocess
@@ -8,6 +9,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+import typer
 import typer.main
 
 from docs.generate.commands import contexts
@@ -135,3 +137,59 @@ def test_a_command_alone_shows_its_help(capsys: pytest.CaptureFixture[str]) -> N
     told = capsys.readouterr()
     assert "Run a scenario" in told.out
     assert told.err == ""
+
+
+def failing(error: Exception) -> typer.Typer:
+    """A command line whose only command fails."""
+    app = typer.Typer(add_completion=False)
+
+    @app.command()
+    def fail(log_format: str = "text") -> None:
+        raise error
+
+    return app
+
+
+def test_a_bug_is_one_line_with_its_traceback_in_a_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert run_app(failing(ZeroDivisionError("by zero")), []) == 70
+    (file,) = tmp_path.iterdir()
+    assert capsys.readouterr().err == (
+        f"vnet: a bug in vnet: ZeroDivisionError: by zero; please report it with its traceback, {file}\n"
+    )
+    assert "raise error\nZeroDivisionError: by zero" in file.read_text()
+
+
+def test_a_bug_on_a_full_disk_is_still_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "nowhere"))
+    assert run_app(failing(KeyError("x")), ["--log-format", "json"]) == 70
+    told = json.loads(capsys.readouterr().err)
+    assert (told["kind"], told["exit_status"]) == ("error", 70)
+    assert "which could not be written: <FrameSummary file" in told["message"]
+
+
+def test_what_the_system_refuses_is_no_bug(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(failing(OSError(errno.ENOSPC, "No space left on device", "runs/a")), []) == 2
+    assert capsys.readouterr().err == "vnet: runs/a: No space left on device\n"
+
+
+def test_an_interrupt_that_an_import_hides_is_one(capsys: pytest.CaptureFixture[str]) -> None:
+    hidden = ImportError("initialization failed")
+    hidden.__cause__ = KeyboardInterrupt()
+    assert run_app(failing(hidden), []) == 130
+    assert capsys.readouterr().err == ""
+
+
+def test_the_agent_says_its_name_and_version() -> None:
+    helped, version = (
+        subprocess.run(
+            [sys.executable, "-P", "-m", "agents.cli", option], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        for option in ("--help", "--version")
+    )
+    assert helped.startswith("Usage: vnet-agent [OPTIONS]")
+    assert version.startswith("vnet-agent ")

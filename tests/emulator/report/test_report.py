@@ -326,6 +326,19 @@ def test_compare_draws_the_delivery_ratio_of_short_runs_without_gaps(beacon_run:
     assert 80 < ratio.mean() < 100 and np.array_equal(ratio, np.asarray(second.get_ydata()))
 
 
+def test_a_report_of_an_unfinished_run_says_so(beacon: Path, tmp_path: Path) -> None:
+    finished = vnet(["report", str(beacon)])
+    unfinished = tmp_path / "unfinished"
+    shutil.copytree(beacon, unfinished)
+    (unfinished / "verdict.json").unlink()
+    done = vnet(["report", str(unfinished)])
+    assert (finished.exit_code, finished.stderr) == (0, "")
+    assert done.stdout == f"{unfinished / 'report.html'}\n"
+    assert done.stderr == (
+        f"vnet: note: {unfinished}: has no verdict: the run is still going on, or was ended from outside\n"
+    )
+
+
 def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> None:
     (beacon / "states.parquet").unlink()
     with pytest.raises(VnetError, match=r"states\.parquet"):

@@ -1,0 +1,108 @@
+"""Ctrl-C at any moment: status 130, and no traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+
+BEACON = str(ROOT / "scenarios" / "beacon.toml")
+# Imported at the start of Python: presses Ctrl-C, twice, when a module is about to be imported.
+AT_IMPORT = """
+import os, signal, sys
+
+class Presses:
+    def find_spec(self, name, path, target=None):
+        if name == "{module}":
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Presses())
+"""
+# The same before a command starts itself again, which it does before it imports anything.
+AT_EXECUTION = """
+import os, signal
+
+execve = os.execve
+
+def pressed(*arguments):
+    os.kill(os.getpid(), signal.SIGINT)
+    execve(*arguments)
+
+os.execve = pressed
+"""
+# A program that never yields, and presses Ctrl-C itself: again when the first has been answered.
+BUSY = """
+import os, signal
+
+async def main(node):
+    os.kill(os.getpid(), signal.SIGINT)
+    while not answered():
+        pass
+    os.kill(os.getpid(), signal.SIGINT)
+    while True:
+        pass
+
+def answered():
+    with open("stderr.txt") as file:
+        return "Ctrl-C again" in file.read()
+"""
+
+
+def vnet(folder: Path, *arguments: str, at_start: str = "") -> tuple[int, str, str]:
+    """Run a command in a folder; returns its status, its output and its standard error."""
+    (folder / "sitecustomize.py").write_text(at_start)
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    environment.pop("PYTHONHASHSEED", None)
+    command = [sys.executable, "-P", "-m", "emulator", *arguments]
+    errors = folder / "stderr.txt"
+    with errors.open("w") as stderr:
+        done = subprocess.run(
+            command, env=environment, cwd=folder, stdout=subprocess.PIPE, stderr=stderr, text=True
+        )
+    return done.returncode, done.stdout, errors.read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "module"),
+    [
+        (["run", BEACON], "vnet.runtime.environment"),
+        (["run", BEACON], "typer"),
+        (["run", BEACON], "pydantic"),
+        (["run", BEACON], "zenoh"),
+        (["report"], "emulator.report.write"),
+    ],
+)
+def test_while_a_module_is_imported(arguments: list[str], module: str, tmp_path: Path) -> None:
+    status, _, said = vnet(tmp_path, *arguments, at_start=AT_IMPORT.format(module=module))
+    assert status == 130
+    assert said == ("beacon: lockstep, seed 1, 10 s of emulated time\n" if module == "zenoh" else "")
+    assert not (tmp_path / "runs").exists()
+
+
+def test_while_a_command_starts_itself_again(tmp_path: Path) -> None:
+    status, _, said = vnet(tmp_path, "simulate", BEACON, at_start=AT_EXECUTION)
+    assert (status, said) == (130, "")
+
+
+@pytest.mark.slow
+def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> None:
+    (tmp_path / "busy.py").write_text(BUSY)
+    status, shown, said = vnet(tmp_path, "simulate", BEACON, "--program", "busy:main")
+    assert status == 130, said
+    assert "vnet: interrupted, as soon as the programs yield; Ctrl-C again: at once\n" in said
+    assert "Traceback" not in said
+    assert "verdict: unknown" in shown
+
+
+def test_a_process_in_the_background_goes_on_ignoring_it(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        status, shown, _ = vnet(tmp_path, "--version", at_start=AT_IMPORT.format(module="typer"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (status, shown.split()[0]) == (0, "vnet")
