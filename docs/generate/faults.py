@@ -20,7 +20,7 @@ writes.
 kind = "burst_loss"
 at_s = 10.0
 duration_s = 5.0
-senders = { ids = ["v01", "v02"] }   # what these two send
+senders = ["v01", "v02"]             # what these two send
 receivers = { fraction = 0.5 }       # and half of all vehicles receive
 loss_bad = 0.9
 ```
@@ -30,8 +30,8 @@ Faults of vehicles have `nodes` besides; those of links also have `senders` and 
 an end among `nodes`, from one of `senders`, to one of `receivers`. Each of the three is a selector.
 """
 SELECTORS = """
-A selector is a table with one of these keys; without it, all vehicles are meant. So `nodes = { random = 3 }`, or
-`--set nodes.random=3` at the command line.
+A selector is a table with one of these keys, or a list of ids: `nodes = { count = 3 }`, `nodes = ["v01", "v02"]`,
+or `--set nodes.count=3` at the command line. Without it, all vehicles are meant.
 """
 MISBEHAVIOUR = """
 Named as in VeReMi (van der Heijden, Lukaseder, Kargl 2018; Kamel et al. 2020). The emulator does not know what

@@ -44,7 +44,7 @@ def inject(
         typer.Option(
             "--set",
             metavar="KEY=VALUE",
-            help="A parameter, as in a scenario: probability=0.5, nodes.random=3. May be repeated.",
+            help="A parameter, as in a scenario: probability=0.5, nodes.count=3. May be repeated.",
         ),
     ] = None,
     run: RunOption = LATEST,

@@ -41,8 +41,8 @@ def select(selector: Selector, nodes: Nodes, rng: np.random.Generator) -> Mask:
         chosen[nodes.numbers(selector.ids)] = True
     elif selector.fraction is not None:
         chosen[rng.permutation(count)[: max(1, round(selector.fraction * count))]] = True
-    elif selector.random is not None:
-        chosen[rng.permutation(count)[: selector.random]] = True
+    elif selector.count is not None:
+        chosen[rng.permutation(count)[: selector.count]] = True
     elif selector.disc is not None:
         x, y, radius_m = selector.disc
         chosen = np.hypot(*(nodes.position_m - (x, y)).T) <= radius_m

@@ -22,7 +22,9 @@ from typing import Annotated, Any, ClassVar, get_args
 from pydantic import Field, model_validator
 
 from emulator.scenario.fault_draws import Chooser, Drawn
+from emulator.scenario.renamed import RENAMED_SELECTORS
 from emulator.scenario.sections import Section
+from vnet.errors import shown
 from vnet.types import Array, Mask
 
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -32,7 +34,7 @@ LONGEST_S = 86_400.0
 
 
 class Selector(Section):
-    """A choice of nodes: all, unless one of these keys says otherwise.
+    """A choice of nodes: all, unless one of these keys says otherwise. A list is short for `ids`.
 
     Positions are those at the start of the run where vehicles stand; docs/motion.md says which where they move.
     """
@@ -41,7 +43,7 @@ class Selector(Section):
     """The nodes with these names."""
     fraction: Annotated[float, Field(gt=0, le=1)] | None = None
     """This share of all nodes, drawn from the run's seed."""
-    random: Annotated[int, Field(ge=1)] | None = None
+    count: Annotated[int, Field(ge=1)] | None = None
     """This many nodes, drawn from the run's seed."""
     disc: tuple[float, float, Annotated[float, Field(gt=0)]] | None = None
     """The nodes in a disc: x, y and radius in m."""
@@ -57,9 +59,15 @@ class Selector(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_a_table(cls, given: Any) -> Any:
+    def _is_list_or_table(cls, given: Any) -> Any:
+        if isinstance(given, (list, tuple)):
+            return {"ids": given}
         if not isinstance(given, (dict, Selector)):
-            raise ValueError('a selector is a table, such as { ids = ["v01", "v02"] } or { random = 3 }')
+            raise ValueError('a selector is a list of ids, as ["v01", "v02"], or a table, as { count = 3 }')
+        if isinstance(given, dict):
+            for old, new in RENAMED_SELECTORS.items():
+                if old in given:
+                    raise ValueError(f"{old} is called {new}: write {{ {new} = {shown(given[old])} }}")
         return given
 
     @model_validator(mode="after")

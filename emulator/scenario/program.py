@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from emulator.scenario.sections import Section
 from vnet.errors import shown
@@ -53,7 +53,16 @@ class ProgramException(OneProgram):
     """`[[program.exceptions]]`: vehicles that run another program than all others, with options of its own."""
 
     nodes: tuple[str, ...] = Field(min_length=1)
-    """Ids of the vehicles."""
+    """Ids of the vehicles: a list, or a table as in faults, `{ ids = […] }`."""
+
+    @field_validator("nodes", mode="before")
+    @classmethod
+    def _are_ids(cls, given: Any) -> Any:
+        if isinstance(given, dict):
+            if given.keys() != {"ids"}:
+                raise ValueError('write the ids of the vehicles, as ["v01", "v02"] or { ids = ["v01", "v02"] }')
+            return given["ids"]
+        return given
 
 
 class Program(OneProgram):

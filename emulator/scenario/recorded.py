@@ -7,6 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from emulator.scenario.renamed import with_new_names
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sections import first_problem
 from emulator.scenario.shipped import find_scenario
@@ -23,7 +24,7 @@ def parse_recorded_scenario(text: str, path: Path) -> Scenario:
         data = parse_toml(text)
         for digests in ("inputs", "code"):
             data.pop(digests, None)
-        return Scenario.model_validate(data)
+        return Scenario.model_validate(with_new_names(data))
     except ValidationError as error:
         raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
     except ValueError as error:

@@ -19,6 +19,7 @@ from emulator.scenario.modules import with_modules
 from emulator.scenario.overrides import apply_override
 from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
+from emulator.scenario.renamed import with_new_names
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
@@ -316,6 +317,8 @@ def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[st
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}{_instead(path)}") from None
     except ValueError as error:
         raise ScenarioError(f"{path}: not valid TOML: {printable(str(error), 300)}") from None
+    if "inputs" in data:  # a run has recorded it
+        data = with_new_names(data)
     recorded_digests, _ = data.pop("inputs", {}), data.pop("code", None)
     if not isinstance(recorded_digests, dict):
         raise ScenarioError(f"{path}: inputs = {shown(recorded_digests)}: a table of digests is needed")

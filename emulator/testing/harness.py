@@ -28,7 +28,7 @@ from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
 from emulator.records.metrics import PeriodFigures
 from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
-from emulator.scenario.fault_families import LONGEST_S, Selector
+from emulator.scenario.fault_families import LONGEST_S
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
@@ -37,8 +37,6 @@ from vnet.errors import ScenarioError, VnetError
 from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 from vnet.units import NS_PER_S
-
-SELECTORS = ("nodes", "senders", "receivers")
 
 
 class RunHarness:
@@ -184,9 +182,6 @@ class RunHarness:
         `parameters` are the kind's, as in a scenario; lists of ids do for selectors. Raises ScenarioError.
         """
         self._must_be_on(f"fault {kind!r}")
-        for name in SELECTORS:
-            if isinstance(parameters.get(name), (list, tuple)):
-                parameters[name] = Selector(ids=tuple(parameters[name]))
         fault = parse_fault({"kind": kind, "duration_s": LONGEST_S, **parameters})
         if fault.kind == "router_restart" or (fault.kind == "emulator_restart" and not self.live):
             raise ScenarioError(f"fault {kind!r}: there is nothing here to restart")

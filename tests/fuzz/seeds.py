@@ -123,7 +123,7 @@ FAULT_SEEDS = (
 )
 FAULT_WORDS = tuple(
     f'"{word}"'.encode()
-    for word in (*KINDS, "kind", "nodes", "ids", "fraction", "random", "disc", "polygon", "degree")
+    for word in (*KINDS, "kind", "nodes", "ids", "fraction", "count", "disc", "polygon", "degree")
 )
 ACCESS = (
     b'{"run": "r", "processes": [["v01", "v02"]], '

@@ -31,7 +31,7 @@ NEEDED: dict[str, dict[str, Any]] = {
     "gnss_ramp": {"rate_m_s": [1.0, 0.0]},
     "skew": {"offset_ms": 30.0},
     "drift": {"rate_ppm": 20_000.0},
-    "block": {"senders": {"random": 3}},
+    "block": {"senders": {"count": 3}},
     "burst_loss": {"enter": 0.3, "leave": 0.3},
 }
 OF_LINKS = ("partition", "block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplicate", "corrupt")
@@ -49,7 +49,7 @@ async def hears(node: Node) -> None:
 def fault(kind: str, **more: Any) -> dict[str, Any]:
     described = {"kind": kind, "at_s": AT_S, "duration_s": DURATION_S, **NEEDED.get(kind, {}), **more}
     if kind not in (*OF_LINKS, *RESTARTS):
-        described.setdefault("nodes", {"random": 4})
+        described.setdefault("nodes", {"count": 4})
     return described
 
 
@@ -489,7 +489,7 @@ def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> Non
     recorded = with_fault("DataReplay")
     replayed = some(recorded, "delivered", "lost", cause="DataReplay-0", copies=True)
     original = recorded.sent_ns[(recorded.copy == 0) & (recorded.frame == recorded.frame[replayed[5]])][0]
-    other = parse_fault({"kind": "gnss_outage", "at_s": original / 1e9, "duration_s": 0.5, "nodes": {"random": 1}})
+    other = parse_fault({"kind": "gnss_outage", "at_s": original / 1e9, "duration_s": 0.5, "nodes": {"count": 1}})
     run = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     both = recorded.scenario.model_copy(update={"run": run, "fault": (*recorded.scenario.fault, other)})
     assert verdict(replace(recorded, scenario=both), "copies") is Verdict.VALID

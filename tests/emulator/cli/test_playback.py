@@ -29,7 +29,7 @@ def watched(tmp_path_factory: pytest.TempPathFactory) -> Watched:
             "run": {"duration_s": 2.0, "settle_s": 0.5, "name": "watched"},
             "network": {"vehicles": 4},
             "program": {"entry": "agents.cooperative:main", "options": {"particles": 40}},
-            "fault": [{"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"random": 1}}],
+            "fault": [{"kind": "kill", "at_s": 0.5, "duration_s": 0.5, "nodes": {"count": 1}}],
         }
     )
     watched = watch(scenario, tmp_path_factory.mktemp("cli") / "run")

@@ -52,12 +52,12 @@ def test_a_fraction_is_that_share_and_at_least_one(count: int, seed: int, fracti
 
 @given(counts, seeds, st.integers(1, 30))
 def test_random_is_so_many_or_all(count: int, seed: int, number: int) -> None:
-    assert len(chosen(some_nodes(count), seed, random=number)) == min(number, count)
+    assert len(chosen(some_nodes(count), seed, count=number)) == min(number, count)
 
 
 def test_everybody_is_drawn_as_often_as_the_others() -> None:
     nodes = some_nodes(8)
-    drawn = np.bincount([n for seed in range(2000) for n in chosen(nodes, seed, random=2)], minlength=8)
+    drawn = np.bincount([n for seed in range(2000) for n in chosen(nodes, seed, count=2)], minlength=8)
     assert drawn.sum() == 4000
     assert np.all(np.abs(drawn - 500) < 5 * math.sqrt(500)), drawn
 
@@ -107,7 +107,7 @@ def test_a_degree_is_between_the_least_and_the_most(seed: int, one: int, other: 
     assert chosen(nodes, degree=(least, most)) == [n for n in range(20) if least <= nodes.degree[n] <= most]
 
 
-KILL_ONE_OF_MANY = {"kind": "kill", "duration_s": 1, "nodes": {"random": 5}}
+KILL_ONE_OF_MANY = {"kind": "kill", "duration_s": 1, "nodes": {"count": 5}}
 
 
 def test_the_same_seed_and_place_make_the_same_choice_and_others_another() -> None:
@@ -121,7 +121,7 @@ def test_the_same_seed_and_place_make_the_same_choice_and_others_another() -> No
 
 @given(seeds, st.lists(st.sampled_from(["kill", "block", "partition", "swizzle"]), min_size=1, max_size=5))
 def test_one_more_fault_at_the_end_changes_nothing_before_it(seed: int, kinds: list[str]) -> None:
-    faults = [{"kind": k, "duration_s": 1} | ({} if k == "partition" else {"nodes": {"random": 3}}) for k in kinds]
+    faults = [{"kind": k, "duration_s": 1} | ({} if k == "partition" else {"nodes": {"count": 3}}) for k in kinds]
     fewer, more = planned(faults, 12, seed), planned([*faults, KILL_ONE_OF_MANY], 12, seed)
     for one, same in zip(fewer, more, strict=False):
         assert one.nodes.tolist() == same.nodes.tolist()
@@ -190,7 +190,7 @@ def test_on_a_ring_each_hears_a_majority_and_no_two_the_same_one(count: int, see
 def test_a_swizzle_cuts_all_off_one_by_one_and_has_them_back_by_its_end(
     count: int, seed: int, over_s: float, duration_s: float
 ) -> None:
-    fault = {"kind": "swizzle", "at_s": 0.5, "duration_s": duration_s, "over_s": over_s, "nodes": {"random": 5}}
+    fault = {"kind": "swizzle", "at_s": 0.5, "duration_s": duration_s, "over_s": over_s, "nodes": {"count": 5}}
     (one,) = planned([fault], count, seed)
     times = swizzle_times_ns(one, seed)
     half_ns = round(over_s * 1e9) // 2

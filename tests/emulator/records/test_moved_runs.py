@@ -34,7 +34,7 @@ async def main(node):
         node.report(fix.position_m, fix.covariance_m2, common_error_m=[0.5, 0.5], heard=len(node.radio.drain()))
 """
 FAULTS = [
-    {"kind": "kill", "at_s": 0.4, "duration_s": 0.5, "nodes": {"random": 1}},
+    {"kind": "kill", "at_s": 0.4, "duration_s": 0.5, "nodes": {"count": 1}},
     {"kind": "loss", "at_s": 0.3, "duration_s": 0.8, "probability": 0.5},
     {"kind": "gnss_jump", "at_s": 0.6, "duration_s": 0.5, "nodes": {"degree": [1, 4]}, "offset_m": [30.0, -5.0]},
 ]

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
 from emulator.scenario import faults
 from emulator.scenario.fault_families import Fault
 from emulator.scenario.faults import KINDS, parse_fault
+from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.scenario.scenario import Scenario, dump_scenario, load_scenario
 from vnet.errors import ScenarioError
 
@@ -84,12 +86,18 @@ WRONG = [
     ("kill", {"at_s": float("nan")}, ["kill.at_s = nan", "finite"]),
     ("kill", {"duration_s": "long"}, ["kill.duration_s = 'long'", "number"]),
     ("kill", {"senders": {}}, ["kill.senders: unknown key", "at_s, duration_s, kind, nodes"]),
-    ("kill", {"nodes": ["v1"]}, ["kill.nodes = ['v1']: a selector is a table, such as { ids = "]),
+    (
+        "kill",
+        {"nodes": "v1"},
+        ["kill.nodes = 'v1': a selector is a list of ids, as ", "or a table, as { count = 3 }"],
+    ),
+    ("kill", {"nodes": ["v1", 2]}, ["kill.nodes.ids.1 = 2", "string"]),
+    ("kill", {"nodes": {"random": 2}}, ["kill.nodes: random is called count: write { count = 2 }"]),
     ("kill", {"nodes": {"rando": 2}}, ["kill.nodes.rando: unknown key", "degree, disc, fraction, ids"]),
-    ("kill", {"nodes": {"ids": ["v1"], "random": 1}}, ["kill.nodes: ids and random exclude each other"]),
+    ("kill", {"nodes": {"ids": ["v1"], "count": 1}}, ["kill.nodes: ids and count exclude each other"]),
     ("kill", {"nodes": {"fraction": 0}}, ["kill.nodes.fraction = 0", "greater than 0"]),
     ("kill", {"nodes": {"fraction": 1.1}}, ["kill.nodes.fraction = 1.1", "less than or equal to 1"]),
-    ("kill", {"nodes": {"random": 0}}, ["kill.nodes.random = 0", "greater than or equal to 1"]),
+    ("kill", {"nodes": {"count": 0}}, ["kill.nodes.count = 0", "greater than or equal to 1"]),
     ("kill", {"nodes": {"disc": [0, 0, -1]}}, ["kill.nodes.disc.2 = -1", "greater than 0"]),
     ("kill", {"nodes": {"polygon": [[0, 0], [1, 1]]}}, ["kill.nodes.polygon", "at least 3"]),
     ("kill", {"nodes": {"degree": [3, 2]}}, ["kill.nodes: degree = [least, most] is upside down"]),
@@ -153,12 +161,33 @@ def test_what_is_no_fault_is_one_line(data: object, part: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_list_of_ids_is_a_selector() -> None:
+    listed, table = (parse_fault(minimal("block", receivers=ids)) for ids in (["v1", "v3"], {"ids": ["v1", "v3"]}))
+    assert listed == table
+    exception = {"entry": "a:b", "nodes": {"ids": ["v1"]}}
+    assert Scenario.model_validate({"program": {"exceptions": [exception]}}).program.of("v1").entry == "a:b"
+    with pytest.raises(ValidationError, match=r"write the ids of the vehicles, as"):
+        Scenario.model_validate({"program": {"exceptions": [{**exception, "nodes": {"count": 2}}]}})
+
+
+def test_what_a_run_has_recorded_is_read_under_its_new_name_and_all_else_refused(tmp_path: Path) -> None:
+    text = '[[fault]]\nkind = "kill"\nduration_s = 1.0\n[fault.nodes]\nrandom = 2\n'
+    (tmp_path / "own.toml").write_text(text)
+    with pytest.raises(ScenarioError, match=r"fault.0.kill.nodes: random is called count: write { count = 2 }"):
+        load_scenario(tmp_path / "own.toml")
+    recorded = tmp_path / "scenario.toml"
+    recorded.write_text(text + "[inputs]\n[code]\n")
+    for scenario in (load_scenario(recorded), parse_recorded_scenario(recorded.read_text(), recorded)):
+        (fault,) = scenario.fault
+        assert fault == parse_fault({"kind": "kill", "duration_s": 1.0, "nodes": {"count": 2}})
+
+
 points = st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6))
 selectors = st.one_of(
     st.just({}),
     st.fixed_dictionaries({"ids": st.lists(st.sampled_from(NODES.ids), max_size=4, unique=True)}),
     st.fixed_dictionaries({"fraction": st.floats(0, 1, exclude_min=True)}),
-    st.fixed_dictionaries({"random": st.integers(1, 9)}),
+    st.fixed_dictionaries({"count": st.integers(1, 9)}),
     st.fixed_dictionaries({"disc": st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(1e-3, 99))}),
     st.fixed_dictionaries({"polygon": st.lists(points, min_size=3, max_size=6)}),
     st.fixed_dictionaries({"degree": st.tuples(st.integers(0, 3), st.integers(3, 9))}),

@@ -27,14 +27,14 @@ from vnet.errors import VnetError
 from vnet.transport import wire
 
 FAULTS = [
-    {"kind": "kill", "at_s": 0.95, "duration_s": 0.65, "nodes": {"random": 1}},
-    {"kind": "kill", "at_s": 2.0, "duration_s": 0.3, "nodes": {"random": 2}},
+    {"kind": "kill", "at_s": 0.95, "duration_s": 0.65, "nodes": {"count": 1}},
+    {"kind": "kill", "at_s": 2.0, "duration_s": 0.3, "nodes": {"count": 2}},
     {"kind": "loss", "at_s": 0.5, "duration_s": 1.0, "probability": 0.5},
     {"kind": "delay", "at_s": 1.0, "duration_s": 0.777, "delay_ms": 130.0},
     {"kind": "duplicate", "at_s": 1.2, "duration_s": 0.5, "copies": 2},
-    {"kind": "gnss_jump", "at_s": 0.7, "duration_s": 0.5, "nodes": {"random": 2}, "offset_m": [30.0, -5.0]},
-    {"kind": "gnss_outage", "at_s": 1.5, "duration_s": 0.4, "nodes": {"random": 1}},
-    {"kind": "DoS", "at_s": 2.2, "duration_s": 0.1, "nodes": {"random": 1}},
+    {"kind": "gnss_jump", "at_s": 0.7, "duration_s": 0.5, "nodes": {"count": 2}, "offset_m": [30.0, -5.0]},
+    {"kind": "gnss_outage", "at_s": 1.5, "duration_s": 0.4, "nodes": {"count": 1}},
+    {"kind": "DoS", "at_s": 2.2, "duration_s": 0.1, "nodes": {"count": 1}},
 ]
 OPTIONS = {"particles": 60}
 NODES = 6
