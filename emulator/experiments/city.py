@@ -87,7 +87,7 @@ def city_cells(place: Mapping[str, Any], seeds: Sequence[int], duration_s: float
 
 
 def notes(place: Mapping[str, Any], duration_s: float) -> tuple[str, ...]:
-    """Lines for the user about the trips: which are omitted, with the reason. Raises ScenarioError for a bad file."""
+    """Lines for the user about the trips that are omitted, with the reason. Raises ScenarioError for a bad file."""
     data = {"run": {"duration_s": duration_s, "settle_s": 0.0}, **place}
     return build_world(_checked(data)).notes
 
