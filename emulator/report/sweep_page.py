@@ -12,6 +12,7 @@ import numpy as np
 
 from emulator.pages.canvas import BLUE, GREEN, GREY, NAVY, ORANGE, PURPLE, RED, SKY, Canvas, canvas, legend
 from emulator.pages.page import render, table
+from emulator.records.key_figures import KEY_FIGURES, estimates_differ
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import DASHES, Drawing, draw_charts
 from emulator.scenario.scenario import Scenario
@@ -21,8 +22,12 @@ CONFIDENCE = 0.95
 COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY, NAVY, GREY)
 """Colours of the curves; a ninth curve is not drawn."""
 MOST_CHARTS = 24
+ASIDE = 0.012
+"""Step between the intervals of two curves, as a share of the axis."""
 NO_FIGURES = ("seed", "vehicles", "emulated_s", "wall_s", "real_time_factor")
 """Numbers of a row that are no results."""
+OF_ESTIMATES = ("position_rmse_m", "fix_rmse_m", "position_anees")
+"""Figures of positions, shown only where a program estimates them."""
 Rows = Sequence[Mapping[str, Any]]
 
 
@@ -61,7 +66,7 @@ def sweep_page(scenario: Scenario, rows: Rows, varied: Sequence[str]) -> str:
         "sweep.html.j2",
         title=f"Sweep {scenario.run.name}",
         facts=[
-            f"{len(rows)} run{'s' if len(rows) != 1 else ''} of {scenario.run.duration_s:g} emulated seconds",
+            f"{len(rows)} run{'s' if len(rows) != 1 else ''} of {scenario.run.duration_s:g} s of emulated time",
             f"{seeds} seed{'s' if seeds != 1 else ''} for each combination of values",
             scenario.program.entry,
         ],
@@ -79,6 +84,8 @@ def figures_of(rows: Rows, varied: Sequence[str]) -> list[str]:
     names = dict.fromkeys(name for row in rows for name in row)
     found = [n for n in names if n not in (*NO_FIGURES, *varied) and not n.startswith("frames_")]
     numeric = [n for n in found if any(_is_number(row.get(n)) for row in rows)]
+    if not any(estimates_differ(row.get("position_rmse_m"), row.get("fix_rmse_m")) for row in rows):
+        numeric = [name for name in numeric if name not in OF_ESTIMATES]
     own = [name.removeprefix("last.") for name in numeric if name.startswith("last.")]
     return sorted(numeric, key=lambda name: name.removeprefix("last.") not in own)
 
@@ -93,7 +100,8 @@ def heading(name: str) -> str:
     last = name.startswith("last.")
     plain = name.removeprefix("last.")
     unit = unit_of(plain)
-    return f"{title_of(plain)}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
+    title = KEY_FIGURES.get(plain, title_of(plain))
+    return f"{title}{f' ({unit})' if unit else ''}{', at the end' if last else ''}"
 
 
 def _is_number(value: Any) -> bool:
@@ -135,11 +143,11 @@ def _draw(rows: Rows, varied: Sequence[str], name: str) -> Drawing:
     shown = dict(list(curves.items())[: len(COLOURS)])
     made = canvas(key, heading(name), -(-len(shown) // 3) if others else 0)
     ticks = None if _all_numbers(rows, key) else list(dict.fromkeys(str(row[key]) for row in rows))
-    for (values, curve), colour in zip(shown.items(), COLOURS, strict=False):
+    for number, ((values, curve), colour) in enumerate(zip(shown.items(), COLOURS, strict=False)):
         label = ", ".join(
             f"{other.rpartition('.')[2]} {value}" for other, value in zip(others, values, strict=True)
         )
-        _draw_curve(made, curve, key, name, colour, label, ticks)
+        _draw_curve(made, curve, key, name, colour, label, ticks, number - (len(shown) - 1) / 2)
     if ticks is not None:
         made.axes.set_xticks(range(len(ticks)), ticks)
     if others:
@@ -149,14 +157,24 @@ def _draw(rows: Rows, varied: Sequence[str], name: str) -> Drawing:
 
 
 def _draw_curve(
-    made: Canvas, rows: Rows, key: str, name: str, colour: str, label: str, ticks: Sequence[str] | None
+    made: Canvas,
+    rows: Rows,
+    key: str,
+    name: str,
+    colour: str,
+    label: str,
+    ticks: Sequence[str] | None,
+    aside: float,
 ) -> None:
+    """Draw a curve with its intervals; `aside` moves them by so many steps, so that none hides another."""
     points = [(values[0], mean) for values, group in _groups(rows, [key]).items() if (mean := _mean(group, name))]
     if not points:
         return
     if ticks is None:
         points.sort(key=lambda point: float(point[0]))
     at = [float(x) if ticks is None else ticks.index(str(x)) for x, _ in points]
+    step = ASIDE * ((max(at) - min(at)) or 1.0)
+    at = [x + aside * step for x in at]
     value = [mean.value for _, mean in points]
     half = [mean.half or 0.0 for _, mean in points]
     style: dict[str, Any] = {"color": colour, "marker": "o", "markersize": 3.5, "capsize": 3, "label": label}

@@ -83,7 +83,7 @@ def test_a_sweep_leaves_a_table_and_a_page_and_goes_on(tmp_path: Path, in_this_p
     assert set(WALL_CLOCK) <= set(table.column_names)
     assert pq.read_table(tmp_path / "sweep.parquet").equals(table)
     page = (tmp_path / "sweep.html").read_text()
-    assert "8 runs of 0.4 emulated seconds" in page and page.count("<figure") >= 3
+    assert "8 runs of 0.4 s of emulated time" in page and page.count("<figure") >= 3
     again = emulator.sweep(TINY, VARY | {"radio.loss": [0, 0.5, 1]}, seeds=2, out=tmp_path)
     assert len(in_this_process) == 12 == len(again), "what it shares with the first is not run again"
 
