@@ -263,10 +263,18 @@ def bench_maps() -> Figures:
     return maps.measure()
 
 
+def bench_startup() -> Figures:
+    """`vnet --help` and `--version` to their end, `vnet run` and `simulate` to their first line."""
+    from benchmarks import startup
+
+    return startup.measure()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
     "city_rbpf": bench_city_rbpf,
     "maps": bench_maps,
+    "startup": bench_startup,
     "dashboard": bench_dashboard,
     "estimators": bench_estimators,
     "quadratic_programs": bench_quadratic_programs,
