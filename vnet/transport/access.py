@@ -31,6 +31,10 @@ from vnet.transport.credentials import (
 
 Rule = dict[str, Any]
 
+MOST_SESSIONS = 10_100
+"""Most sessions of a router, and most that may log in at once: a run's processes and roles. Zenoh's defaults, 1000
+and 100, refuse agents that start together."""
+
 EMULATOR = "emulator"
 OBSERVER = "observer"
 OPERATOR = "operator"
@@ -219,6 +223,7 @@ def router_config(
         "transport": {
             "shared_memory": {"enabled": False},
             "auth": {"usrpwd": {"dictionary_file": str(dictionary)}},
+            "unicast": {"accept_pending": MOST_SESSIONS, "max_sessions": MOST_SESSIONS},
         },
         "access_control": access_control,
     }

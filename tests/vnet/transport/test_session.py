@@ -1,8 +1,10 @@
 """An embedded router and a client of it, on a port that the system chooses."""
 
 import os
+import socket
 import subprocess
 import sys
+from contextlib import ExitStack
 
 import pytest
 import zenoh
@@ -26,6 +28,17 @@ def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.Monke
                 client.put(key, bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
             sizes = [len(subscriber.recv().payload) for _ in range(2)]
     assert sizes == [2**20 - 1000, 7], "the session goes on without the one in between"
+
+
+def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:
+    """By Zenoh's defaults the 101st was refused, and tried again so long that a run of many did not start."""
+    access = Access.create("r", [["v01"]])
+    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router, ExitStack() as stack:
+        host, port = router_endpoint(router).removeprefix("tcp/").split(":")
+        for _ in range(150):
+            stack.enter_context(socket.create_connection((host, int(port))))
+        with open_client(f"tcp/{host}:{port}", access.credentials(node_user("v01")), LEASE_MS) as client:
+            assert list(client.info.routers_zid()) == [router.zid()]
 
 
 @pytest.mark.parametrize("wanted", [None, "off", "debug", "trace,zenoh::api::session=trace"])
