@@ -19,10 +19,13 @@ import select
 import signal
 import socket
 import sys
+from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy.random  # numpy itself imports it when it is first used, which would be in each agent
 
 import agents.cli
 import agents.host  # what every agent needs
@@ -120,13 +123,26 @@ def _be(agent: _Agent) -> None:
         return
     gc.enable()
     random.seed()
-    if numpy := sys.modules.get("numpy"):
-        numpy.random.seed()
+    numpy.random.seed()  # noqa: NPY002  # whoever uses the global generator must not draw what others draw
     sys.argv = [str(agents.cli.__file__), *agent.arguments, "--credentials", f"/dev/fd/{agent.credentials}"]
     sys.orig_argv = [sys.executable, "-P", "-m", "agents.cli", *sys.argv[1:]]
     sys.modules["__main__"] = agents.cli
     _show_arguments(sys.orig_argv)
-    agents.cli.app()
+    _call(sys.argv[1:])
+
+
+def _call(arguments: Sequence[str]) -> None:
+    """Call the command with these arguments of the emulator's: parsing a user's would take longer than the fork."""
+    given = defaultdict(list)
+    for name, value in zip(arguments[::2], arguments[1::2], strict=True):
+        given[name].append(value)
+    agents.cli.agent(
+        connect=given["--connect"][0],
+        run=given["--run"][0],
+        node=given["--node"],
+        credentials=Path(given["--credentials"][0]),
+        path=[Path(folder) for folder in given["--path"]],
+    )
 
 
 def _has_credentials(descriptor: int) -> bool:
