@@ -6,8 +6,31 @@ from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, get_args
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from vnet.errors import did_you_mean, printable, shown
+
+WORDS = {
+    **dict.fromkeys(("model_type", "model_attributes_type", "dict_type"), "a table is needed"),
+    **dict.fromkeys(("string_type", "string_unicode"), "text is needed"),
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float", "int_parsing_size"), "a whole number is needed"),
+    **dict.fromkeys(("float_type", "float_parsing"), "a number is needed"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "true or false is needed"),
+    **dict.fromkeys(("tuple_type", "list_type", "frozen_set_type", "set_type"), "a list is needed"),
+    "path_type": "a path is needed",
+    "finite_number": "a finite number is needed",
+    "missing": "is missing",
+    "greater_than": "must be greater than {gt}",
+    "greater_than_equal": "must be greater than or equal to {ge}",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be less than or equal to {le}",
+    "too_short": "{actual_length} entries, at least {min_length} are needed",
+    "too_long": "{actual_length} entries, at most {max_length} are allowed",
+    "string_too_short": "at least {min_length} characters are needed",
+    "string_too_long": "at most {max_length} characters are allowed",
+    "string_pattern_mismatch": "must match {pattern}",
+}
+"""What is allowed where a value is of a wrong type or out of bounds, by pydantic's type of error."""
 
 
 class Section(BaseModel):
@@ -40,13 +63,24 @@ def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]
         kinds = sorted(problem["ctx"]["expected_tags"].replace("'", "").split(", "))
         tag = problem["ctx"]["tag"]
         return f"{before}kind = {shown(tag)}{did_you_mean(tag, kinds)}: must be one of {', '.join(kinds)}"
-    message = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] in ("model_type", "model_attributes_type", "dict_type"):
-        message = "a table is needed"
-    message = message[0].lower() + message[1:]
+    message = _worded(problem)
+    if problem["type"] == "missing":
+        return f"{key}: {message}"
     if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
         return f"{key}: {message}" if path else message
     return f"{key} = {shown(problem['input'])}: {message}"
+
+
+def _worded(problem: ErrorDetails) -> str:
+    """Return what is allowed, in words for people; validators of vnet's own have said it themselves."""
+    kind, given = problem["type"], problem.get("ctx", {})
+    if kind == "literal_error":
+        known = given["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+        return f"must be {given['expected']}{did_you_mean(problem['input'], known)}"
+    if kind in WORDS:
+        return WORDS[kind].format_map({key: f"{v:.12g}" if isinstance(v, float) else v for key, v in given.items()})
+    message = problem["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    return message[:1].lower() + message[1:]
 
 
 def _allowed_keys(of: type[BaseModel] | TypeAdapter[Any], path: tuple[int | str, ...]) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import shlex
 import sys
 import tempfile
@@ -34,6 +35,8 @@ REFUSED_BY_THE_SYSTEM = (
     errno.ENOMEM,
 )
 """Errors that say something of the machine, and not of vnet."""
+_KINDS_OF_VALUES = {"integer": "a whole number", "number": "a number", "boolean": "true or false"}
+"""Values of options as pydantic names them, and as vnet does."""
 
 
 class LogFormat(StrEnum):
@@ -138,6 +141,9 @@ def _in_one_line(error: typer.TyperException) -> str:
     meant = getattr(error, "possibilities", None)
     text = f"{error.message}; did you mean {' or '.join(meant)}?" if meant else error.format_message()
     text = " ".join(text.replace("Value error, ", "").replace(". Did you", "; did you").split()).removesuffix(".")
+    for kind, needed in _KINDS_OF_VALUES.items():
+        text = re.sub(rf"Input should be a valid {kind}(, unable to .*)?$", f"{needed} is needed", text)
+    text = text.replace("Input should be ", "must be ")
     context = getattr(error, "ctx", None)
     command = "vnet" if context is None else context.command_path
     return printable(f"{text[:1].lower()}{text[1:]} ({command} --help says more)", LONGEST_MESSAGE)

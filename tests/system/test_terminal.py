@@ -175,7 +175,7 @@ def test_quiet(vnet: Vnet) -> None:
             "no such option: --sed; did you mean --seed or --set? (vnet run --help says more)",
         ),
         (["run", "x", "--xyz"], "no such option: --xyz (vnet run --help says more)"),
-        (["run", "x", "--seed", "y"], "invalid value for '--seed': Input should be a valid integer"),
+        (["run", "x", "--seed", "y"], "invalid value for '--seed': a whole number is needed"),
         (
             ["run", "x", "--pacing", "fast"],
             "invalid value for '--pacing': 'fast' is not one of 'lockstep', 'realtime' (vnet run --help says more)",

@@ -75,7 +75,7 @@ def test_each_kind_has_its_defaults_and_says_what_it_lacks(kind: str) -> None:
     for key in needed:
         less = minimal(kind)
         del less[key]
-        with pytest.raises(ScenarioError, match=rf"^fault: {kind}\.{key}: field required$"):
+        with pytest.raises(ScenarioError, match=rf"^fault: {kind}\.{key}: is missing$"):
             parse_fault(less)
 
 
@@ -111,9 +111,9 @@ WRONG = [
     ("burst_loss", {"leave": 0}, ["burst_loss.leave = 0", "greater than 0"]),
     ("delay", {"delay_ms": 0}, ["delay.delay_ms = 0", "greater than 0"]),
     ("duplicate", {"copies": 21}, ["duplicate.copies = 21", "less than or equal to 20"]),
-    ("corrupt", {"flips": 1.5}, ["corrupt.flips = 1.5", "integer"]),
+    ("corrupt", {"flips": 1.5}, ["corrupt.flips = 1.5", "whole number"]),
     ("throttle", {"bitrate_mbps": 0}, ["throttle.bitrate_mbps = 0", "greater than or equal to 0.0001"]),
-    ("gnss_jump", {"offset_m": [1]}, ["gnss_jump.offset_m.1", "required"]),
+    ("gnss_jump", {"offset_m": [1]}, ["gnss_jump.offset_m.1", "missing"]),
     ("gnss_jump", {"offset_m": [1, "east"]}, ["gnss_jump.offset_m.1 = 'east'", "number"]),
     ("skew", {"offset_ms": 1e9}, ["skew.offset_ms", "less than or equal to 3600000"]),
     ("drift", {"rate_ppm": -1e6}, ["drift.rate_ppm = -1000000.0", "greater than or equal to -500000"]),
