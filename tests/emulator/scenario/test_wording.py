@@ -19,7 +19,7 @@ WRONG: tuple[Any, ...] = (
 """Values of which each key refuses some."""
 PYDANTIC = re.compile(
     r"[Ii]nput should|[Ff]ield required|\bvalid (integer|number|string|dict|list|tuple|boolean|path)|instance of|"
-    r"class '|unable to|\berror\b|[Ss]tring should|should have|pydantic|discriminat|\btag\b|dictionary"
+    r"class '|unable to|\berror\b|string should|should have|pydantic|discriminat|\btag\b|dictionary"
 )
 """Words of pydantic's."""
 
