@@ -30,7 +30,7 @@ WORDS = {
     "string_too_long": "at most {max_length} characters are allowed",
     "string_pattern_mismatch": "must match {pattern}",
 }
-"""What is allowed where a value is of a wrong type or out of bounds, by pydantic's type of error."""
+"""Words for what is allowed where a value is of a wrong type or out of bounds, by pydantic's type of error."""
 
 
 class Section(BaseModel):
