@@ -127,7 +127,7 @@ class Campaign:
         self._plan = plan
         self._folder = folder
         self._progress = progress
-        self._workshop = TrialPool(plan.limit_s, [plan.scenario.program.entry.partition(":")[0]])
+        self._workshop = TrialPool(plan.limit_s, plan.scenario)
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 
@@ -159,6 +159,7 @@ class Campaign:
                 self.interrupted = True
                 self._workshop.close()
                 pool.shutdown(cancel_futures=True)
+        self._workshop.close()
         self._take_left(futures)
         self.write()
 

@@ -1,21 +1,20 @@
-"""One simulated run in a process of its own, with a time limit: whatever the run does, its campaign goes on."""
+"""One simulated run in a worker process, with a time limit: whatever the run does, its campaign goes on."""
 
 from __future__ import annotations
 
 import faulthandler
-import multiprocessing
 import os
-import signal
+import sys
 import time
 import traceback
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow.compute as pc
 
+from emulator.cells.executors import WorkerPool
+from emulator.cells.worker import Place, WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
@@ -27,13 +26,6 @@ from emulator.world.world import build_world
 GREATEST = 1e6
 """No number that a vehicle reports grows beyond it: metres, and their squares, of vehicles in one town."""
 HUNG, EMULATOR, GROWTH = "hung", "emulator", "growth"
-PRELOADED = (
-    "emulator.testing.campaign",
-    "emulator.cli.experiment",
-    "emulator.drivers.live",
-    "emulator.terminal.progress",
-)
-POLL_S = 0.1
 STDOUT = 1
 """Descriptor of standard output."""
 STACKS_AT = 0.9
@@ -88,73 +80,58 @@ def _greatest(emulation: Emulation) -> float:
     return float(np.max(np.abs(numbers), initial=0.0, where=np.isfinite(numbers)))
 
 
-@dataclass
 class TrialPool:
-    """Runs trials in processes of their own, forked from a server that has imported everything, `limit_s` each.
+    """Runs trials in worker processes, each of which serves many, `limit_s` seconds each.
 
-    May be used from several threads at once. `close` ends all that are left.
+    May be used from several threads at once, each with a worker of its own. `close` ends all that are left.
     """
 
-    limit_s: float
-    modules: Sequence[str] = ()
-    closed: bool = field(default=False, init=False)
-
-    def __post_init__(self) -> None:
-        self._context = multiprocessing.get_context("forkserver")
-        # All that the main module imports, which each process does anew, but not that itself.
-        self._context.set_forkserver_preload([*PRELOADED, *self.modules])
+    def __init__(self, limit_s: float, scenario: Scenario) -> None:
+        """Trials of changes of `scenario`, which have its programs and checks."""
+        self.limit_s = limit_s
+        self.closed = False
+        self._place = Place.here(scenario)
+        self._pool = WorkerPool()
 
     def run(self, scenario: Scenario, folder: Path) -> Trial:
         """A trial; one that hangs, or ends its process, has failed. Once closed: one that nothing is known of."""
-        if self.closed:
-            return UNKNOWN
-        receiver, sender = self._context.Pipe(duplex=False)
-        arguments = (scenario, folder, sender, self.limit_s)
-        process = self._context.Process(target=_apart, args=arguments, daemon=True)
-        process.start()
-        sender.close()
         try:
-            return self._await(receiver)
-        except EOFError:
-            process.join()
-            if self.closed:
-                return UNKNOWN
-            return Trial.failure(EMULATOR, f"the process ended with status {process.exitcode}")
-        finally:
-            process.kill()
-            process.join()
-            receiver.close()
-
-    def _await(self, receiver: Connection) -> Trial:
-        deadline = time.monotonic() + self.limit_s
-        while not receiver.poll(POLL_S):
-            if self.closed:
-                return UNKNOWN
-            if time.monotonic() > deadline:
-                text = f"not over within {self.limit_s:g} s of wall clock; logs/stacks.txt says where it stood"
-                return Trial.failure(HUNG, text)
-        trial = receiver.recv()
-        assert isinstance(trial, Trial)
-        return trial
+            if not self.closed:
+                self._pool.call(self._place, _get_ready)
+                return self._pool.call(
+                    self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s
+                )
+        except WorkerTimeoutError as error:
+            return Trial.failure(HUNG, f"{error}; logs/stacks.txt says where it stood")
+        except WorkerDiedError as error:
+            if not self.closed:
+                return Trial.failure(EMULATOR, str(error))
+        return UNKNOWN
 
     def close(self) -> None:
         """Have every trial that is on given up."""
         self.closed = True
+        self._pool.close()
 
 
-def _apart(scenario: Scenario, folder: Path, sender: Connection, limit_s: float) -> None:
-    """The process of a trial."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # they are the campaign's, which kills this process if it must
-        signal.signal(number, signal.SIG_IGN)
+def _get_ready() -> None:
+    """Have a worker import all of this module before the time of a trial is measured."""
+
+
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:
+    """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
     run_folder = RunFolder.create(folder, scenario)
-    with (run_folder.logs / PROGRAMS_LOG).open("ab") as log:
+    with (run_folder.logs / PROGRAMS_LOG).open("ab") as log, (run_folder.logs / "stacks.txt").open("w") as stacks:
+        before = os.dup(STDOUT)
         os.dup2(log.fileno(), STDOUT)
-    with (run_folder.logs / "stacks.txt").open("w") as stacks:
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            trial = run_trial(scenario, run_folder)
+            return run_trial(scenario, run_folder)
         except BaseException as error:
             traceback.print_exc(file=stacks)
-            trial = Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")
-        faulthandler.cancel_dump_traceback_later()
-    sender.send(trial)
+            return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            sys.stdout.flush()
+            os.dup2(before, STDOUT)
+            os.close(before)
