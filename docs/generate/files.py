@@ -180,7 +180,7 @@ VERDICT = {
     "figures": "means of some metrics, after the first fifth of the run",
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
-    "reproduce": "the command that has the run again",
+    "reproduce": "the command that runs it again, from any folder of the machine",
     "versions": "of vnet, Python and numpy",
 }
 

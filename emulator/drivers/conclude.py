@@ -72,7 +72,7 @@ def conclude(
     folder.put(WORLD_FILE, world.write)
     recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
     judgement = judge(recorded, _own_findings(recorded, folder))
-    reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path))}"
+    reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
     if replay:
         judgement.put(NotExercised("replay", replay))
         reproduce += " --program MODULE:FUNCTION"

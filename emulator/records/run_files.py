@@ -219,12 +219,12 @@ class RunFiles:
 
 
 def _from_here(command: str, folder: Path) -> str:
-    """The command that runs a run again, with the path of its scenario as the folder is called now."""
+    """The command that runs a run again, from any folder, with the path of its scenario as it is called now."""
     try:
         words = shlex.split(command)
     except ValueError:
         return command
-    named = [str(folder / SCENARIO_FILE) if Path(word).name == SCENARIO_FILE else word for word in words]
+    named = [str(folder.absolute() / SCENARIO_FILE) if Path(word).name == SCENARIO_FILE else word for word in words]
     return command if named == words else shlex.join(named)
 
 

@@ -234,9 +234,9 @@ def _scenario(source: Source) -> dict[str, Any]:
 
 
 def _commands(source: Source, record: Record | None) -> list[str]:
-    """Commands that reproduce the run, its verdict and this page."""
-    folder = shlex.quote(str(source.folder))
-    first = record.reproduce if record else f"vnet run {shlex.quote(str(source.folder / SCENARIO_FILE))}"
+    """Commands that reproduce the run, its verdict and this page, from any folder of the machine."""
+    folder = shlex.quote(str(source.folder.absolute()))
+    first = record.reproduce if record else f"vnet run {shlex.quote(str(source.folder.absolute() / SCENARIO_FILE))}"
     return [first, f"vnet check {folder}", f"vnet report {folder}"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
 from collections import Counter
@@ -47,10 +48,11 @@ def print_summary(
         _print_table("receptions: one for each frame and receiver in range", _frames(counts), console)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
-    following = {verdict["reproduce"]: "the same run again", f"vnet check {folder}": "judge it again"}
-    following[f"vnet report {folder} --open"] = f"read {folder / REPORT}" if report else "have a report of it"
+    quoted = shlex.quote(str(folder))
+    following = {verdict["reproduce"]: "the same run again", f"vnet check {quoted}": "judge it again"}
+    following[f"vnet report {quoted} --open"] = f"read {folder / REPORT}" if report else "have a report of it"
     if (recording := folder / RECORDING).exists():
-        following[f"vnet view {folder}"] = "look at it"
+        following[f"vnet view {quoted}"] = "look at it"
         if not is_closed(recording):
             following[repair_command(recording)] = "repair the recording, whose observer was killed"
     for number, (command, why) in enumerate(following.items()):
@@ -59,12 +61,20 @@ def print_summary(
 
 
 def as_typed(command: str) -> str:
-    """A command as this user must type it: with its folder where that is not on the PATH."""
-    program, _, rest = command.partition(" ")
+    """A command as this user must type it here: with its folder where that is not on the PATH."""
+    try:
+        program, *rest = shlex.split(command)
+    except ValueError:
+        return command
     if shutil.which(program) is None:
-        beside = Path(sys.executable).parent / program
-        program = str(beside.relative_to(Path.cwd())) if beside.is_relative_to(Path.cwd()) else str(beside)
-    return f"{program} {rest}"
+        program = str(Path(sys.executable).parent / program)
+    return shlex.join(_from_here(word) for word in [program, *rest])
+
+
+def _from_here(word: str) -> str:
+    """A path inside the current folder as it is called there; any other word as it is."""
+    inside = Path(word).is_absolute() and Path(word).is_relative_to(Path.cwd())
+    return str(Path(word).relative_to(Path.cwd())) if inside else word
 
 
 def print_checks(judgement: Judgement, console: Console, reproduce: str, verbose: bool = True) -> None:

@@ -234,7 +234,7 @@ class Campaign:
             "seed": outcome.seed,
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
-            "command": f"vnet simulate {shlex.quote(str(outcome.folder / SCENARIO_FILE))}",
+            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
             "folder": f"failures/{outcome.folder.name}",
         }
 

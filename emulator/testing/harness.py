@@ -111,7 +111,7 @@ class RunHarness:
     @property
     def reproduce(self) -> str:
         """The command that reproduces the run."""
-        return f"vnet {self._run.command} {shlex.quote(str(self.folder / SCENARIO_FILE))}"
+        return f"vnet {self._run.command} {shlex.quote(str(self.folder.absolute() / SCENARIO_FILE))}"
 
     # Its course.
 

@@ -1,5 +1,7 @@
 """Programs and checks are found beside the scenario first, then in the current folder, as modules or as files."""
 
+import json
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -110,6 +112,25 @@ def test_a_run_is_repeated_from_any_folder(here: Path, monkeypatch: pytest.Monke
     assert simulate("../first/scenario.toml", "--out", "again") == (0, "verdict: valid  again\n")
     first, again = (RecordedRun.open(Path(name)).record.trace_sha256 for name in ("../first", "again"))
     assert first == again
+
+
+def test_the_stored_command_works_from_any_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program(here / "scenarios" / "pp_hello.py", b"here")
+    simulate("scenarios/own.toml", "--program", "pp_hello.py", "--out", "my first")
+    stored = json.loads((here / "my first" / "verdict.json").read_text())
+    (here / "elsewhere").mkdir()
+    monkeypatch.chdir(here / "elsewhere")
+    del sys.modules["pp_hello"]
+    vnet, verb, *words = shlex.split(stored["reproduce"])
+    assert (vnet, verb) == ("vnet", "simulate")
+    assert simulate(*words, "--out", "again")[0] == 0
+    assert RecordedRun.open(Path("again")).record.trace_sha256 == stored["trace_sha256"]
+    moved = (here / "my first").rename(here / "moved")
+    assert (
+        RecordedRun.open(Path("../moved")).record.reproduce
+        == f"vnet simulate {here}/elsewhere/../moved/scenario.toml"
+    )
+    assert RecordedRun.open(moved).record.reproduce == f"vnet simulate {moved}/scenario.toml"
 
 
 def test_the_digest_of_a_program_is_that_of_its_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

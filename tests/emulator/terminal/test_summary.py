@@ -1,0 +1,39 @@
+"""Commands of a summary can be typed where they are shown: quoted, and relative to the current folder inside it."""
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+
+from emulator.terminal.summary import as_typed
+
+
+@pytest.mark.parametrize(
+    ("command", "typed"),
+    [
+        ("vnet run {here}/runs/one-1/scenario.toml", "vnet run runs/one-1/scenario.toml"),
+        ("vnet run '{here}/my runs/scenario.toml' --program a:b", "vnet run 'my runs/scenario.toml' --program a:b"),
+        ("vnet check '/far away/run'", "vnet check '/far away/run'"),
+        ("vnet check runs/one-1", "vnet check runs/one-1"),
+        ("vnet check 'not closed", "vnet check 'not closed"),
+        ("vnet run 'a;b' $c", "vnet run 'a;b' '$c'"),
+    ],
+)
+def test_paths_are_quoted_and_relative(
+    command: str, typed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("shutil.which", lambda program: f"/bin/{program}")
+    assert as_typed(command.format(here=tmp_path)) == typed
+
+
+def test_a_program_that_is_not_on_the_path_is_named_with_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("shutil.which", lambda program: None)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
+    assert as_typed("vnet check run") == ".venv/bin/vnet check run"
+    monkeypatch.setattr(sys, "executable", "/opt/my env/bin/python")
+    assert as_typed("vnet check run") == f"{shlex.quote('/opt/my env/bin/vnet')} check run"
