@@ -102,9 +102,7 @@ class Attachment:
         self._publishers[self.nodes[0]].put(wire.encode(message))
 
     def publish(self, traffic: wire.Traffic) -> None:
-        """Put a copy of each report on its key, where somebody listens; log how programs ended."""
-        for ending in traffic.endings:
-            print(f"{ending.node} {ending.kind}\n{ending.details}", file=sys.stderr)
+        """Put a copy of each report on its key, where somebody listens."""
         for report in traffic.reports:
             publisher = self._reports[report.node]
             if publisher.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
@@ -216,3 +214,8 @@ class Attachment:
 
 def no_wake(payload: bytes) -> None:
     """In lockstep the program's thread waits on the queue itself."""
+
+
+def write_line(node: str, line: str) -> None:
+    """Write a line of a node's log to that of its process."""
+    print(line, file=sys.stderr, flush=True)

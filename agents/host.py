@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 
-from agents.attachment import Attachment, Found, RunOverError, no_wake
+from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.programs import Programs
@@ -75,7 +75,7 @@ def _run_lockstep(attachment: Attachment, welcomes: Sequence[wire.Welcome], prog
         return message.time_ns
 
     loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
-    host = Host(welcomes, lambda: loop.now_ns)
+    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line)
     asyncio.set_event_loop(loop)
     try:
         loop.start_at(next_grant())
@@ -119,7 +119,7 @@ class _RealTimeAgent:
         self._programs = programs
         self._boot_id = welcomes[0].boot_id
         self._origin_ns = time.monotonic_ns()
-        self._host = Host(welcomes, self._now_ns, self._schedule_flush)
+        self._host = Host(welcomes, self._now_ns, self._schedule_flush, write_line)
         self._wake_pending = False
         self._flush_pending = False
         self._started = False

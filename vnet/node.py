@@ -32,6 +32,10 @@ Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[floa
 
 COVARIANCE_TOLERANCE = 1e-6
 """Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
+LEVELS = ("debug", "info", "warning", "error", "critical")
+"""Levels of a line of a node's log."""
+NoteDetail = bool | int | float | str
+"""Value of a detail of an event."""
 INBOX_LIMIT = 4096
 """Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
 
@@ -83,6 +87,10 @@ class NodeTransport(Protocol):
 
     def send_report(self, report: Report) -> None:
         """Send a report to the emulator's metrics."""
+        ...
+
+    def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
+        """Send a line of the log (kind "log"), or an event named `text` (kind "event")."""
         ...
 
 
@@ -279,6 +287,27 @@ class Node:
             )
         )
 
+    def log(self, text: str, level: str = "info") -> None:
+        """Write a line to this vehicle's log, with the emulated time and a level.
+
+        Levels are "debug", "info", "warning", "error" and "critical". The line stands in `logs/NODE.log` and in
+        `events.jsonl` (event `log`). So does what the program gives to the standard `logging`, from the level of
+        its loggers on ("warning" by default). Raise ValueError for another level.
+        """
+        if level not in LEVELS:
+            raise ValueError(f"log(level={level!r}): allowed are {', '.join(LEVELS)}")
+        self._transport.send_note(self.id, "log", level, str(text), {})
+
+    def event(self, name: str, **details: NoteDetail) -> None:
+        """Record that something happened, at the present time: event `event` of `events.jsonl`.
+
+        `details` are numbers, booleans or texts. Raise ValueError for any other value, or an empty name.
+        """
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"event({name!r}): a name is expected")
+        values = {key: _detail(key, value) for key, value in details.items()}
+        self._transport.send_note(self.id, "event", "info", name, values)
+
 
 class _Disconnected:
     """The transport of a node whose process has ended: it discards all frames and reports."""
@@ -294,6 +323,22 @@ class _Disconnected:
 
     def send_report(self, report: Report) -> None:
         pass
+
+    def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
+        pass
+
+
+def _detail(name: str, value: object) -> NoteDetail:
+    """A detail of an event as plain Python; numbers of numpy are taken, and what is not finite becomes a text."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if not isinstance(value, (bool, int, float, str)):
+        raise ValueError(f"event({name}={value!r}): a number, a boolean or a text is expected")
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return str(value)
+    return value
 
 
 def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]:

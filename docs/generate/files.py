@@ -136,6 +136,8 @@ EVENTS = {
         "its program raised and nobody handled it: at that instant, so that the line may come after later ones; "
         "where, and the traceback",
     ),
+    "log": ("vehicle", "`level`, `text`", "a line of `node.log`, or of the standard `logging` of its program"),
+    "event": ("vehicle", "`name`, `details`", "an event of its program: `node.event`"),
     "left_out": ("vehicle", "`what`, `count`", "how many events of this kind are not here: there were too many"),
     "spun": (
         "vehicle",

@@ -59,7 +59,7 @@ def conclude(
     """
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
-    emulation.tell_left_out(emulation.emulated_ns)
+    emulation.log_book.tell_left_out(emulation.emulated_ns)
     folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
     trace = emulation.engine.trace.to_table()
     states = emulation.metrics.states_table()

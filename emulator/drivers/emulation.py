@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.drivers.log_book import LogBook
 from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
@@ -28,9 +29,6 @@ from emulator.world.world import Instant, World, components
 from vnet.node import Report
 from vnet.transport import wire
 from vnet.units import NS_PER_S
-
-MOST_EXCEPTIONS = 20
-"""Unhandled exceptions of a node that are written down, with their tracebacks; further ones are counted."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ class Emulation:
         self._finished = False
         self._reports: list[Report] = []
         self._arrived: list[Delivery] = []
-        self._exceptions = dict.fromkeys(world.node_ids, 0)
+        self.log_book = LogBook(folder, self.number)
 
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""
@@ -161,39 +159,28 @@ class Emulation:
         frames: dict[str, list[bytes]] = {}
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
+        notes: list[wire.Note] = []
         for part in traffic:
             for frame in part.frames:
                 frames.setdefault(frame.node, []).append(frame.payload)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
             unhandled.extend(part.unhandled)
+            notes.extend(part.notes)
         if frames:
             self._place(time_ns // self.world.period_ns)
         for node in sorted(frames, key=self.number.__getitem__):
             if self.up[node]:
                 self.engine.transmit(time_ns, self.number[node], frames[node])
-        self._tell_unhandled(time_ns, unhandled)
+        self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)
 
     def take_final(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
         """Take what programs told as they were ended at `time_ns`; of frames, reports and endings nobody hears."""
-        self._tell_unhandled(time_ns, [each for part in traffic for each in part.unhandled])
-
-    def _tell_unhandled(self, time_ns: int, unhandled: Iterable[wire.Unhandled]) -> None:
-        """Write down exceptions that nobody handled, in the order in which they were raised."""
-        raised = [(min(time_ns, each.time_ns if each.time_ns is not None else time_ns), each) for each in unhandled]
-        for raised_ns, each in sorted(raised, key=lambda pair: (pair[0], self.number[pair[1].node])):
-            self._exceptions[each.node] += 1
-            if self._exceptions[each.node] <= MOST_EXCEPTIONS:
-                details = {"error": each.error, "place": each.place, "where": each.details}
-                self.folder.event(raised_ns, "exception", each.node, **details)
-
-    def tell_left_out(self, time_ns: int) -> None:
-        """Write down how many exceptions of each node were not, because there were too many."""
-        for node, count in self._exceptions.items():
-            if count > MOST_EXCEPTIONS:
-                self.folder.event(time_ns, "left_out", node, what="exception", count=count - MOST_EXCEPTIONS)
+        parts = list(traffic)
+        notes = [note for part in parts for note in part.notes]
+        self.log_book.tell(time_ns, notes, [each for part in parts for each in part.unhandled])
 
     def _place(self, period: int) -> None:
         """Frames are sent from where vehicles are at the start of the period."""

@@ -15,7 +15,7 @@ class ProtocolError(VnetError):
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled)
+    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes)
     named = [part.node for parts in kinds for part in parts]
     for node in [*named, *waiting]:
         if node not in nodes:

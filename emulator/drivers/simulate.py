@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.signals import tell_from_handler
+from emulator.records.node_logs import NodeLogs
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
@@ -96,7 +97,8 @@ class _Simulation:
         search_programs_in(emulation.scenario.program.folders)
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
-        self._host = Host(welcomes, lambda: self.loop.now_ns)
+        logs = NodeLogs(emulation.folder.logs)
+        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write)
 
     def run(self) -> None:
         """From the first grant to the last."""

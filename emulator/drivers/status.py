@@ -30,8 +30,8 @@ FIGURES = ("common_error_rmse_m", "deviation_m", "position_rmse_m", "fix_rmse_m"
 EVENTS_KEPT = 8
 EVENTS_LOOKED_AT = 200
 """Last events among which those of one kind of failure are told as one."""
-FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total")
-"""Kinds of events that hold measurements, and are no news."""
+FOR_THE_CHECKS = ("memory", "late_deliveries", "refused_total", "log", "event")
+"""Kinds of events that hold measurements, or what programs say, and are no news."""
 
 
 @dataclass(frozen=True)

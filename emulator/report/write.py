@@ -25,6 +25,10 @@ from emulator.report.source import Source, maybe, why_not
 from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
+MOST_SAID = 2000
+"""Lines of logs and events of programs that are shown."""
+SAID = ("log", "event")
+"""Events that programs tell of."""
 MOST_SCENARIO = 50_000
 """Characters of a scenario that are shown; one with a matrix of links may have millions."""
 MOST_ROWS = 50
@@ -70,6 +74,7 @@ def report_page(source: Source) -> str:
         charts=draw(source),
         radio=radio_section(source),
         events=_events(source),
+        log=_log(source),
         scenario=_scenario(source),
         commands=_commands(source, record),
         identity=_identity(record) if record else {},
@@ -199,11 +204,27 @@ def _events(source: Source) -> dict[str, Any] | str:
         events = [event for event in source.events if event.kind not in SAMPLES]
     except VnetError as error:
         return str(error)
+    events = [event for event in events if event.kind not in SAID]
     if not events:
         return "None."
     half = MOST_EVENTS // 2
     shown = events[:half] + events[max(half, len(events) - half) :]
     return {"count": len(events), "rows": table(list(map(_event, shown)))}
+
+
+def _log(source: Source) -> dict[str, Any] | None:
+    """The number of lines and events of programs, and the rows that are shown; None if there are none."""
+    said = [event for event in maybe(lambda: source.events) or () if event.kind in SAID]
+    return {"count": len(said), "rows": table(list(map(_said, said[:MOST_SAID])))} if said else None
+
+
+def _said(event: Event) -> dict[str, Any]:
+    """A row of the table of log lines and events of programs."""
+    text = str(event.details.get("text") or event.details.get("name", ""))
+    if isinstance(details := event.details.get("details"), dict) and details:
+        text += ": " + ", ".join(f"{name} {value}" for name, value in details.items())
+    level = str(event.details.get("level", event.kind))
+    return {"time (s)": f"{event.time_ns / 1e9:.3f}", "node": event.node or "", "level": level, "text": text}
 
 
 def _event(event: Event) -> dict[str, Any]:

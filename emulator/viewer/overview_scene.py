@@ -49,6 +49,8 @@ LIMIT_VEHICLES = 100
 """Most vehicles for which the bound is computed: its cost grows with their number."""
 WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "refused", "interrupted",
             "observer_ended"}  # fmt: skip
+LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
+"""Rerun's names of the levels of a program's log."""
 LONGEST_DETAIL = 60
 NAMED_DOWN = 6
 ACTING, NOBODY = "acting", "none"
@@ -199,11 +201,15 @@ class OverviewScene:
         for event in events:
             self._canvas.at(event["time_ns"])
             level = "WARN" if event["kind"] in WARNINGS else "INFO"
+            if event["kind"] == "log":
+                level = LOG_LEVELS.get(str(event["details"].get("level")), level)
             self._canvas.log("events", rr.TextLog(in_words(event), level=level))
 
 
 def in_words(event: Mapping[str, Any]) -> str:
     """An event in a line: `v03 died: how SIGKILL`."""
+    if event["kind"] == "log":
+        return drawable(f"{event['node']}: {event['details'].get('text', '')}")
     details = [f"{key} {_short(value)}" for key, value in event["details"].items()]
     who = f"{event['node']} " if event["node"] else ""
     what = event["kind"].replace("_", " ")

@@ -35,6 +35,7 @@ PARTS = {
     "Frame": wire.Frame,
     "Ending": wire.Ending,
     "Unhandled": wire.Unhandled,
+    "Note": wire.Note,
     "Lateness": wire.Lateness,
     "Packet": wire.WirePacket,
     "Fix": wire.WireFix,
@@ -142,7 +143,7 @@ def fields(kinds: dict[str, Any]) -> list[tuple[str, int, Field]]:
 
 def example(kind: str) -> list[Any]:
     """Values of a message that are as the page says, always the same."""
-    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[], [], [], []]}
+    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[], [], [], [], []]}
 
     def value(field: Field) -> Any:
         first = split(field.type, " or ")[0]

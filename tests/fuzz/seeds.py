@@ -41,6 +41,7 @@ TRAFFIC = wire.Traffic(
     [Report(5, "v01", (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), {"mean_m": [0.5, 0.5], "n": 3.0})],
     [wire.Ending("v01", "crashed", "boom", "Traceback")],
     [wire.Unhandled("v01", 5, "boom", "in a task", "Traceback")],
+    [wire.Note("v01", 5, "event", "info", "turned", {"left": True, "n": 1})],
 )
 PACKET = wire.WirePacket("v01", "v02", 5, 6, b"payload")
 FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5)

@@ -10,20 +10,29 @@ import asyncio
 import contextlib
 import contextvars
 import inspect
+import logging
 import traceback
 import weakref
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from vnet.node import Node, Report
+from vnet.node import Node, NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
+from vnet.runtime.log_handler import NodeLogHandler
 from vnet.runtime.programs import Program, Programs, error_line, load_program
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
+from vnet.units import NS_PER_S
+
+LONGEST_NOTE = 4000
+"""Characters of a line of a log that are told to the emulator."""
+MOST_LINES = 100_000
+"""Lines of a node's log that are written by one process, so that a flood fills no disk."""
 
 
 def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
@@ -35,7 +44,7 @@ class Host:
     """The nodes of one process and their programs; see the module's text.
 
     `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
-    puts it at once; lockstep takes it at the next yield).
+    puts it at once; lockstep takes it at the next yield). `on_line` is called with a node and a line of its log.
     """
 
     def __init__(
@@ -43,9 +52,14 @@ class Host:
         welcomes: Sequence[wire.Welcome],
         clock: Callable[[], int],
         on_traffic: Callable[[], None] = lambda: None,
+        on_line: Callable[[str, str], None] = lambda node, line: None,
     ) -> None:
         self._clock = clock
         self._on_traffic = on_traffic
+        self._on_line = on_line
+        self._notes: list[wire.Note] = []
+        self._lines: Counter[str] = Counter()
+        self._log_handler = NodeLogHandler(lambda node: self.nodes.get(node.id) is node)
         self._frames: list[wire.Frame] = []
         self._reports: list[Report] = []
         self._endings: list[wire.Ending] = []
@@ -58,7 +72,7 @@ class Host:
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
-        self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)))
+        self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)), on_line)
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -91,12 +105,28 @@ class Host:
             self._reports.append(report)
             self._on_traffic()
 
+    def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
+        """Take a line of a log or an event of a program; the line is written at once."""
+        self._notes.append(wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details))  # type: ignore[arg-type]
+        said = ", ".join(f"{key}={value}" for key, value in details.items())
+        self._line(node, level, f"{text} {said}".rstrip() if kind == "log" else f"event {text} {said}".rstrip())
+        self._on_traffic()
+
+    def _line(self, node: str, level: str, text: str) -> None:
+        """Write a line to a node's log, unless there were too many."""
+        self._lines[node] += 1
+        if self._lines[node] <= MOST_LINES:
+            self._on_line(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {text}")
+        elif self._lines[node] == MOST_LINES + 1:
+            self._on_line(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
+
     # What the transport asks of the host.
 
     def start(self, loop: SkewedLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""
         self._loop = loop
         self._unhandled.attach(loop)
+        logging.getLogger().addHandler(self._log_handler)
         self._programs = programs
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
@@ -193,8 +223,8 @@ class Host:
 
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
-        traffic = wire.Traffic(self._frames, self._reports, self._endings, self._unhandled.take())
-        self._frames, self._reports, self._endings = [], [], []
+        traffic = wire.Traffic(self._frames, self._reports, self._endings, self._unhandled.take(), self._notes)
+        self._frames, self._reports, self._endings, self._notes = [], [], [], []
         return traffic
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
@@ -216,6 +246,7 @@ class Host:
             return
         self._active[node] = False
         self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         running = asyncio.current_task(self._loop)
         for task in self._tasks_of(self.nodes[node]):
             if task is not running:
@@ -305,6 +336,7 @@ class Host:
         self._settle_stopped()
         self._unhandled.settle()
         self._unhandled.close()
+        logging.getLogger().removeHandler(self._log_handler)
 
     async def _run(self, node: Node, program: Program) -> None:
         try:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import gc
-import logging
 import sysconfig
 import traceback
 import weakref
@@ -40,7 +39,6 @@ _NOT_THE_PROGRAM = (
 )
 """Folders of code that is no program: vnet, the standard library, installed packages."""
 _NO_CONTEXT = contextvars.Context()
-_logger = logging.getLogger("asyncio")
 _SHIELDED = "exception in shielded future"
 """End of asyncio's message, from Python 3.14 on, about a future whose caller was cancelled: that is legal."""
 
@@ -71,10 +69,16 @@ class UnhandledExceptions:
     """The exceptions of one loop's programs that nobody has handled.
 
     `now_ns` gives the emulated time to be told for a node, and None while its program is ended; `fallback` is the
-    node that answers for code on nobody's behalf.
+    node that answers for code on nobody's behalf; `on_line` is called with a node and what its log is to have.
     """
 
-    def __init__(self, now_ns: Callable[[Node | None], int | None], fallback: str) -> None:
+    def __init__(
+        self,
+        now_ns: Callable[[Node | None], int | None],
+        fallback: str,
+        on_line: Callable[[str, str], None],
+    ) -> None:
+        self._on_line = on_line
         self._loop: SkewedLoop | None = None
         self._now_ns = now_ns
         self._fallback = fallback
@@ -121,7 +125,6 @@ class UnhandledExceptions:
             if owner not in (None, failure.owner):
                 self._held.append((failure, error))
                 continue
-            _logger.error("Exception %s was never retrieved", failure.place, exc_info=error)
             self._ready_unless_silenced(failure, error)
 
     def silence(self, owner: Node) -> None:
@@ -156,7 +159,7 @@ class UnhandledExceptions:
         self._most = 2 * len(self._failures) + FIRST_CLEANING
 
     def _unhandled(self, context: dict[str, Any]) -> bool:
-        """Asyncio's exception handler was called; returns whether asyncio is to log it now."""
+        """Asyncio's exception handler was called; returns whether asyncio is to log it."""
         error = context.get("exception")
         if error is None or str(context.get("message")).endswith(_SHIELDED):
             return True
@@ -165,7 +168,7 @@ class UnhandledExceptions:
             self._ready_unless_silenced(failure, error)
         elif len(self._held) < MOST_HELD and failure.owner not in self._silenced:
             self._held.append((failure, error))
-        return not _collector.runs
+        return False
 
     def _failure_of(self, context: dict[str, Any], error: BaseException) -> _Failure:
         future = context.get("future")
@@ -184,7 +187,9 @@ class UnhandledExceptions:
 
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
         if failure.owner not in self._silenced and not isinstance(error, KeyboardInterrupt):
-            self._ready.append(self._of(failure, error))
+            unhandled = self._of(failure, error)
+            self._ready.append(unhandled)
+            self._on_line(unhandled.node, f"{unhandled.node} exception {unhandled.place}\n{unhandled.details}")
 
     def _of(self, failure: _Failure, error: BaseException) -> Unhandled:
         node = self._fallback if failure.owner is None else failure.owner.id

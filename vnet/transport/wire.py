@@ -101,13 +101,25 @@ class Unhandled(msgspec.Struct, frozen=True, array_like=True):
     details: str = ""
 
 
+class Note(msgspec.Struct, frozen=True, array_like=True):
+    """A line of a node's log, or an event of its program, which `text` then names, with its `details`."""
+
+    node: str
+    time_ns: TimeNs
+    kind: Literal["log", "event"]
+    level: Literal["debug", "info", "warning", "error", "critical"]
+    text: str
+    details: dict[str, bool | int | float | str] = {}
+
+
 class Traffic(msgspec.Struct, frozen=True, array_like=True):
-    """Frames, reports, endings and exceptions of the nodes of one process, in the order of their creation."""
+    """Frames, reports, endings, exceptions and notes of the nodes of one process, in the order they were made."""
 
     frames: Sequence[Frame] = ()
     reports: Sequence[Report] = ()
     endings: Sequence[Ending] = ()
     unhandled: Sequence[Unhandled] = ()
+    notes: Sequence[Note] = ()
 
 
 class Hello(Message, frozen=True):

@@ -35,12 +35,22 @@ reports = st.builds(
 frames = st.builds(wire.Frame, names, st.binary(max_size=64))
 endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
 unhandled = st.builds(wire.Unhandled, names, st.none() | times, names, names, names)
+notes = st.builds(
+    wire.Note,
+    names,
+    times,
+    st.sampled_from(["log", "event"]),
+    st.sampled_from(["debug", "info", "warning", "error", "critical"]),
+    names,
+    st.dictionaries(names, st.booleans() | times | reals | names, max_size=2),
+)
 traffic = st.builds(
     wire.Traffic,
     st.lists(frames, max_size=3),
     st.lists(reports, max_size=3),
     st.lists(endings, max_size=2),
     st.lists(unhandled, max_size=2),
+    st.lists(notes, max_size=2),
 )
 histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(

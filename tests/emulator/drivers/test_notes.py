@@ -1,0 +1,121 @@
+"""Logs and events of programs have time, node and level, are the same in both drivers, and are bounded."""
+
+import asyncio
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.log_book import MOST_NOTES
+from emulator.records.node_logs import NodeLogs
+from emulator.records.recorded_run import RecordedRun
+from emulator.report.source import Source
+from emulator.report.write import report_page
+from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from vnet.node import Node
+
+logger = logging.getLogger("my.program")
+
+
+async def talks(node: Node) -> None:
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x")
+        if fix.time_ns == 400_000_000:
+            node.log("half way", level="warning")
+            node.event("turned", left=True, by=np.float64(0.5), where="here", odd=float("nan"))
+            logger.error("no way, %s", node.id)
+            logger.debug("below the level of the logger")
+            await asyncio.gather(in_a_task())
+
+
+async def in_a_task() -> None:
+    await asyncio.sleep(0.1)
+    logger.warning("in a task")
+
+
+async def floods(node: Node) -> None:
+    for number in range(MOST_NOTES + 7):
+        node.log(f"line {number}")
+    await asyncio.sleep(9)
+
+
+def told(emulation: Emulation) -> list[tuple[Any, ...]]:
+    return [
+        (event.time_ns, event.kind, event.node, event.details)
+        for event in emulation.folder.events
+        if event.kind in ("log", "event")
+    ]
+
+
+@pytest.mark.parametrize("nodes_per_process", [1, 2])
+def test_logs_and_events_are_the_same_live_and_simulated(nodes_per_process: int) -> None:
+    scenario = scenario_of([], f"{__name__}:talks", vehicles=2, run={"nodes_per_process": nodes_per_process})
+    together, apart = run_together(scenario), run_apart(scenario)
+    assert told(together) == told(apart)
+    assert [each for each in told(together) if each[2] == "v01"] == [
+        (400_000_000, "log", "v01", {"level": "warning", "text": "half way"}),
+        (
+            400_000_000,
+            "event",
+            "v01",
+            {"name": "turned", "details": {"left": True, "by": 0.5, "where": "here", "odd": "nan"}},
+        ),
+        (400_000_000, "log", "v01", {"level": "error", "text": "my.program: no way, v01"}),
+        (500_000_000, "log", "v01", {"level": "warning", "text": "my.program: in a task"}),
+    ]
+    lines = (together.folder.logs / "v01.log").read_text().splitlines()
+    assert lines == [
+        "0.400000 v01 warning: half way",
+        "0.400000 v01 info: event turned left=True, by=0.5, where=here, odd=nan",
+        "0.400000 v01 error: my.program: no way, v01",
+        "0.500000 v01 warning: my.program: in a task",
+    ]
+    conclude(together, 1.0, "simulate")
+    assert RecordedRun.open(together.folder.path).event("event")[0].details["name"] == "turned"
+    page = report_page(Source(together.folder.path))
+    assert '<section id="log">' in page
+    assert "turned: left True, by 0.5, where here, odd nan" in page
+    assert ">half way<" in page
+
+
+def test_a_flood_is_cut_and_counted() -> None:
+    emulation = run_together(scenario_of([], f"{__name__}:floods", vehicles=2))
+    conclude(emulation, 1.0, "simulate")
+    assert len(told(emulation)) == 2 * MOST_NOTES
+    left_out = [(e.node, e.details) for e in emulation.folder.events if e.kind == "left_out"]
+    assert left_out == [("v01", {"what": "log", "count": 7}), ("v02", {"what": "log", "count": 7})]
+
+
+def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulator.records.node_logs.LARGEST_LOG_BYTES", 20)
+    logs = NodeLogs(tmp_path)
+    for number in range(5):
+        logs.write("v01", f"line {number:03}")
+    assert (tmp_path / "v01.log").read_text() == (
+        "line 000\nline 001\n(the log is full: further lines are left out after 20 bytes)\n"
+    )
+
+
+def test_wrong_levels_and_details_are_refused() -> None:
+    class Transport:
+        def now_ns(self, node: str) -> int:
+            return 0
+
+        def send_frame(self, node: str, payload: bytes) -> None: ...
+
+        def send_report(self, report: object) -> None: ...
+
+        def send_note(self, *note: object) -> None: ...
+
+    node = Node("v01", Transport(), lane_map=None, seed=1, options={}, period_ns=1, max_payload=1)  # type: ignore[arg-type]
+    with pytest.raises(
+        ValueError, match=r"^log\(level='loud'\): allowed are debug, info, warning, error, critical$"
+    ):
+        node.log("x", level="loud")
+    with pytest.raises(ValueError, match=r"^event\(''\): a name is expected$"):
+        node.event("")
+    with pytest.raises(ValueError, match=r"^event\(y=\[1\]\): a number, a boolean or a text is expected$"):
+        node.event("x", y=[1])  # type: ignore[arg-type]

@@ -1,0 +1,47 @@
+"""The standard `logging` of programs: a record becomes a line of the log of the node on whose behalf it is made."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from vnet.node import Node
+from vnet.runtime.current_node import current_node
+
+
+class NodeLogHandler(logging.Handler):
+    """Hands records to `Node.log` of the nodes that are `its_own`.
+
+    Records on nobody's behalf, and asyncio's own, go the way of `logging.lastResort`, as without this handler.
+    """
+
+    def __init__(self, its_own: Callable[[Node], bool]) -> None:
+        super().__init__()
+        self._its_own = its_own
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take a record."""
+        node = current_node.get()
+        if node is None or record.name == "asyncio":
+            last = logging.lastResort
+            alone = logging.getLogger().handlers == [self]
+            if alone and last is not None and record.levelno >= last.level:
+                last.handle(record)
+        elif self._its_own(node):
+            try:
+                node.log(f"{record.name}: {self.format(record)}", level_name(record.levelno))
+            except Exception:
+                self.handleError(record)
+
+
+_NAMES = (
+    (logging.CRITICAL, "critical"),
+    (logging.ERROR, "error"),
+    (logging.WARNING, "warning"),
+    (logging.INFO, "info"),
+)
+
+
+def level_name(number: int) -> str:
+    """Return the level that `Node.log` has for one of `logging`."""
+    return next((name for least, name in _NAMES if number >= least), "debug")
