@@ -5,20 +5,37 @@ from __future__ import annotations
 import rerun.blueprint as rrb
 
 from emulator.viewer.drawing import TIMELINE
+from emulator.viewer.layout import EVERYTHING, Content
+from emulator.viewer.program_scene import titled
 from emulator.viewer.radio_scene import WINDOW_S
 
 COMMON_VIEW_M, POSITION_VIEW_M = 1.15, 5.6
 
 
-def blueprint(vehicle: str, tab: int = 0) -> rrb.Blueprint:
-    """All tabs, following what comes in, open at number `tab`; `vehicle` is the one that is looked at closely."""
-    tabs = rrb.Tabs(overview(), radio(), one_vehicle(vehicle), active_tab=tab)
+def blueprint(vehicle: str, tab: int = 0, content: Content = EVERYTHING) -> rrb.Blueprint:
+    """All tabs, following what comes in, open at number `tab`; `vehicle` is the one that is looked at closely.
+
+    Views are laid out for the `content` of the run alone.
+    """
+    shown = [overview(content), radio(content), one_vehicle(vehicle, content)]
+    if content.values or content.texts:
+        shown.append(program(vehicle, content))
+    tabs = rrb.Tabs(*shown, active_tab=tab)
     time = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following")
     return rrb.Blueprint(tabs, time, collapse_panels=True)
 
 
-def overview() -> rrb.Vertical:
+def overview(content: Content) -> rrb.Vertical:
     """The network: map, beliefs, figures, faults, events."""
+    beliefs = _beliefs(content)
+    main: list[rrb.Spatial2DView | rrb.Vertical] = [
+        rrb.Spatial2DView(origin="map", name="Map (east →, north ↑): vehicles and links of this period")
+    ]
+    below = [rrb.StateTimelineView(origin="faults", name="Faults acting, vehicles down"), _events()]
+    if beliefs:
+        main.append(rrb.Vertical(*beliefs))
+    if content.weights:
+        below.insert(0, _matrix("weights", "Weights of the fusion (brighter: more)"))
     return rrb.Vertical(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="about", name="About", titlebar=False),
@@ -31,34 +48,62 @@ def overview() -> rrb.Vertical:
             column_shares=[4, 5],
         ),
         rrb.Horizontal(
-            rrb.Spatial2DView(origin="map", name="Map (east →, north ↑): vehicles and links of this period"),
-            rrb.Vertical(
-                _around_truth("common", "Common error − truth (m), with 95 % ellipses", COMMON_VIEW_M),
-                _around_truth("position", "Position − truth (m)", POSITION_VIEW_M),
-            ),
-            rrb.Vertical(
-                _against_time("figures/common", "Common error (m)"),
-                rrb.Tabs(
-                    _against_time("figures/consensus", "Consensus (m)"),
-                    _against_time("figures/position", "RMSE of position (m)"),
-                ),
-                _against_time("radio/frames", "Frames a period by outcome, stacked"),
-                row_shares=[4, 2, 3],
-            ),
-            column_shares=[4, 2.4, 3.6],
+            *main,
+            rrb.Vertical(*_curves(content)),
+            column_shares=[4, 2.4, 3.6] if beliefs else [4, 4],
         ),
-        rrb.Horizontal(
-            _matrix("weights", "Weights of the fusion (brighter: more)"),
-            rrb.StateTimelineView(origin="faults", name="Faults acting, vehicles down"),
-            _events(),
-            column_shares=[2, 3, 4],
-        ),
-        row_shares=[1.4, 7, 2.8],
+        rrb.Horizontal(*below, column_shares=[2, 3, 4] if content.weights else [3, 4]),
+        row_shares=[1.6, 7, 2.8],
         name="Overview",
     )
 
 
-def radio() -> rrb.Vertical:
+def _beliefs(content: Content) -> list[rrb.Spatial2DView]:
+    """Errors around the truth, of what programs estimate."""
+    views = []
+    if content.common:
+        views.append(_around_truth("common", "Common error − truth (m), with 95 % ellipses", COMMON_VIEW_M))
+    if content.position:
+        views.append(_around_truth("position", "Position − truth (m)", POSITION_VIEW_M))
+    return views
+
+
+def _curves(content: Content) -> list[rrb.TimeSeriesView | rrb.Tabs]:
+    """Figures against time, frames last."""
+    curves: list[rrb.TimeSeriesView | rrb.Tabs] = []
+    if content.common:
+        curves.append(_against_time("figures/common", "Common error (m)"))
+    more = [_against_time("figures/consensus", "Consensus (m)")] if content.consensus else []
+    more += [_against_time("figures/position", "RMSE of position (m)")] if content.position else []
+    if not content.common:
+        more += [_against_time(f"program/curve/{name}", titled(name)) for name in content.values]
+    if more:
+        curves.append(rrb.Tabs(*more))
+    return [*curves, _against_time("radio/frames", "Frames a period by outcome, stacked")]
+
+
+def program(vehicle: str, content: Content) -> rrb.Vertical:
+    """Values that programs report: each against time, and on a map."""
+    each = [
+        rrb.Horizontal(
+            _against_time(f"program/curve/{name}", f"{titled(name)}: mean, 5 to 95 %, {vehicle}"),
+            rrb.Spatial2DView(
+                origin=f"program/map/{name}",
+                contents=["$origin/**", "/map/lanes"],
+                name=f"{titled(name)}: light least, dark most, grey not reported",
+            ),
+            column_shares=[3, 2],
+            name=titled(name),
+        )
+        for name in content.values
+    ]
+    parts: list[rrb.Tabs | rrb.StateTimelineView] = [rrb.Tabs(*each)] if each else []
+    if content.texts:
+        parts.append(rrb.StateTimelineView(origin="program/texts", name=f"{vehicle} reports"))
+    return rrb.Vertical(*parts, row_shares=[4, 1][: len(parts)], name="Program")
+
+
+def radio(content: Content) -> rrb.Vertical:
     """Views of the outcomes of frames."""
     last = f"last {WINDOW_S:g} s"
     return rrb.Vertical(
@@ -73,10 +118,7 @@ def radio() -> rrb.Vertical:
             _against_time("radio/age", "Age of information, time between receptions (ms)"),
         ),
         rrb.Horizontal(
-            rrb.Tabs(
-                _against_time("radio/load", "Load of a vehicle (kB/s)"),
-                _against_time("radio/busy", "Busy ratio of the medium (%)"),
-            ),
+            rrb.Tabs(*_loads(content)),
             rrb.Tabs(
                 _bars("radio/heard", f"Delivered by receiver (%), {last}"),
                 _bars("radio/ages", "Age by receiver (ms)"),
@@ -88,19 +130,28 @@ def radio() -> rrb.Vertical:
     )
 
 
-def one_vehicle(vehicle: str) -> rrb.Vertical:
+def _loads(content: Content) -> list[rrb.TimeSeriesView]:
+    """Load, and how busy the medium is where vehicles share one."""
+    busy = [_against_time("radio/busy", "Busy ratio of the medium (%)")] if content.busy else []
+    return [_against_time("radio/load", "Load of a vehicle (kB/s)"), *busy]
+
+
+def one_vehicle(vehicle: str, content: Content) -> rrb.Vertical:
     """One vehicle."""
+    around = [rrb.Spatial2DView(origin="vehicle/hears", name=f"{vehicle} hears (around it, east →, north ↑)")]
+    if content.position:
+        name = f"{vehicle}: position − truth (m), 95 % ellipse"
+        around.append(_around_truth("vehicle/position", name, POSITION_VIEW_M))
+    if content.common:
+        name = f"{vehicle}: common error − truth (m), 95 % ellipse"
+        around.append(_around_truth("vehicle/common", name, COMMON_VIEW_M))
+    curves = [_against_time("vehicle/frames", f"Frames to {vehicle} a period")]
+    if content.position or content.common:
+        curves.insert(0, _against_time("vehicle/errors", f"{vehicle}: distance from the truth (m)"))
     return rrb.Vertical(
+        rrb.Horizontal(*around),
         rrb.Horizontal(
-            rrb.Spatial2DView(origin="vehicle/hears", name=f"{vehicle} hears (around it, east →, north ↑)"),
-            _around_truth("vehicle/position", f"{vehicle}: position − truth (m), 95 % ellipse", POSITION_VIEW_M),
-            _around_truth("vehicle/common", f"{vehicle}: common error − truth (m), 95 % ellipse", COMMON_VIEW_M),
-        ),
-        rrb.Horizontal(
-            rrb.Vertical(
-                _against_time("vehicle/errors", f"{vehicle}: distance from the truth (m)"),
-                _against_time("vehicle/frames", f"Frames to {vehicle} a period"),
-            ),
+            rrb.Vertical(*curves),
             rrb.TextDocumentView(origin="vehicle/table", name=f"Whom {vehicle} hears and weighs"),
             column_shares=[2, 1],
         ),

@@ -128,6 +128,14 @@ class Period:
         """Hypotheses of the common error by node, (k, 2)."""
         return {node: unpack(cloud, 2) for node, cloud in self.message["clouds"].items()}
 
+    def values(self) -> dict[str, Floats]:
+        """Numbers that programs report by names of their own, (n,) by name; none from an older vnet."""
+        return {name: unpack(value)[:, 0] for name, value in self.message.get("values", {}).items()}
+
+    def texts(self) -> dict[str, list[str]]:
+        """Texts that programs report by names of their own, one a vehicle by name."""
+        return {name: list(texts) for name, texts in self.message.get("texts", {}).items()}
+
     def weights(self) -> dict[str, Floats]:
         """Weights of the fusion by node, (n,)."""
         return {node: unpack(weights)[:, 0] for node, weights in self.message["weights"].items()}
@@ -363,7 +371,7 @@ def nice_length(at_most: float) -> float:
 
 def in_length(length_m: float) -> str:
     """A length in words: 500 m, 2 km."""
-    return f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+    return f"{length_m / 1000:.4g} km" if length_m >= 1000 else f"{length_m:.4g} m"
 
 
 def flipped(position: ArrayLike) -> Floats:

@@ -72,6 +72,7 @@ class OverviewScene:
         self._faults: set[str] = set()
         self._known_faults: set[str] = set()
         self._down: list[str] | None = None
+        self._up: bytes | None = None
         self._clouds: dict[str, Floats] = {}  # each vehicle's latest
         self._trusted = False  # whether any weights have been reported
         self._next_ellipses_s = self._next_clouds_s = self._next_weights_s = 0.0
@@ -188,10 +189,13 @@ class OverviewScene:
             state = ACTING if label in acting else ""  # an empty state ends the one before
             self._canvas.log(f"faults/{label}", rr.StateChange(state=state))
         self._faults = acting
-        down = period.down
-        if down != self._down:
+        up = period.up.tobytes()
+        if up != self._up:  # as vehicles enter and leave, too: who is down may be the same then
             colours = np.where(period.up[:, None], np.array(SKY, dtype=np.uint8), np.array(RED, dtype=np.uint8))
             self._canvas.log("map/true", rr.Points2D.from_fields(colors=colours))
+            self._up = up
+        down = period.down
+        if down != self._down:
             shown = first_names(down, NAMED_DOWN)
             self._canvas.log("faults/down", rr.StateChange(state=f"{len(down)}: {shown}" if down else NOBODY))
             self._down = down

@@ -17,7 +17,9 @@ import rerun as rr
 
 from emulator.viewer.blueprints import blueprint
 from emulator.viewer.drawing import Canvas, Period
+from emulator.viewer.layout import Content
 from emulator.viewer.overview_scene import OverviewScene
+from emulator.viewer.program_scene import ProgramScene
 from emulator.viewer.radio_scene import RadioScene
 from emulator.viewer.sinks import CLOSE_TIMEOUT_S, Sinks, open_recording
 from emulator.viewer.vehicle_scene import VehicleScene
@@ -41,6 +43,8 @@ class Recorder:
         self._vehicle = sinks.vehicle
         self._overview: OverviewScene | None = None
         self._parts: list[OverviewScene | RadioScene | VehicleScene] = []
+        self._program: ProgramScene | None = None
+        self._content = Content()
         self._node_ids: list[str] = []
         self._waiting: deque[Period] = deque()
         self._last: int | None = None
@@ -81,7 +85,9 @@ class Recorder:
             RadioScene(self._canvas, scene),
             VehicleScene(self._canvas, scene, vehicle),
         ]
-        self._recording.send_blueprint(blueprint(vehicle))
+        self._vehicle = vehicle
+        self._program = ProgramScene(self._canvas, scene, vehicle)
+        self._recording.send_blueprint(blueprint(vehicle, content=self._content))
         self._recording.flush(timeout_sec=CLOSE_TIMEOUT_S)  # whatever happens now, it can be looked at
 
     def draw(self) -> None:
@@ -94,7 +100,17 @@ class Recorder:
             self._last = period.number
             for part in self._parts:
                 part.period(period)
+            self._lay_out(period)
         self._canvas.send()
+
+    def _lay_out(self, period: Period) -> None:
+        """Draw what programs report, and lay out views for what the run has shown for the first time."""
+        assert self._program is not None and self._vehicle is not None
+        self._program.period(period)
+        content = self._content.after(period, self._program.names, self._program.texts)
+        if content != self._content:
+            self._content = content
+            self._recording.send_blueprint(blueprint(self._vehicle, content=content))
 
     def _tell_gap(self, count: int) -> None:
         self.missed += count

@@ -21,6 +21,7 @@ from emulator.viewer.drawing import (
     ellipses,
     flipped,
     link_states,
+    nice_length,
     outcome_colours,
 )
 from emulator.viewer.radio_scene import WINDOW_S, Window, next_charts_s
@@ -29,6 +30,12 @@ SLOW_EVERY_S = 1.0
 """Interval at which ellipses and neighbours are drawn."""
 LABELLED = 40
 """As many neighbours have their names written beside them."""
+
+
+def range_rings_m(reach_m: float) -> list[float]:
+    """Return the radii of rings around a vehicle: two or more at round lengths, and the range of its radio."""
+    step_m = nice_length(reach_m / 2)
+    return [*np.arange(step_m, 0.95 * reach_m, step_m).tolist(), reach_m]
 
 
 class VehicleScene:
@@ -48,7 +55,7 @@ class VehicleScene:
         canvas.rings("vehicle/common", COMMON_RINGS_M)
         reach_m: float | None = scene["range_m"]
         if reach_m is not None:
-            canvas.rings("vehicle/hears", (reach_m / 3, reach_m * 2 / 3, reach_m), cross=False)
+            canvas.rings("vehicle/hears", range_rings_m(reach_m), cross=False)
         canvas.series("vehicle/errors", (("position", SKY, 2.0), ("common error", RED, 2.0)))
         canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
 

@@ -1,0 +1,96 @@
+"""Recording of what programs report: curves, maps, texts, and views for nothing else."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.observers import Messages
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.viewer.recorder import Recorder
+from emulator.viewer.sinks import Sinks
+from emulator.world.world import build_world
+from tests.emulator.viewer.test_recorder import views
+from tests.support.recordings import Entity, read_back
+from vnet import Node
+
+
+async def program(node: Node) -> None:
+    """Report the vehicle's number, sometimes more; positions are the raw fixes."""
+    number = int(node.id.removeprefix("v"))
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"here")
+        values: dict[str, Any] = {"delay_ms": 10.0 * number, "state": "late" if fix.time_ns >= 5e8 else "early"}
+        if fix.time_ns >= 3e8:
+            values["warned"] = number > 2
+        node.report(fix.position_m, fix.covariance_m2, **values)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def strict() -> Iterator[None]:
+    """Turn Rerun's warnings into errors."""
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recording of a run of one second."""
+    folder = tmp_path_factory.mktemp("run")
+    scenario = Scenario.model_validate(
+        {
+            "run": {"duration_s": 1.0, "settle_s": 0.1},
+            "network": {"vehicles": 4, "layout": "dense"},
+            "program": {"entry": f"{__name__}:program"},
+        }
+    )
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder / "run", scenario))
+    messages = Messages(emulation)
+    with Recorder(Sinks(save=folder / "recording.rrd", vehicle="v02"), "run") as recorder:
+        recorder.take("scene", messages.scene())
+        emulation.watch(lambda view: recorder.take("period", messages.period(view)))
+        simulate(emulation)
+    return folder / "recording.rrd"
+
+
+@pytest.fixture(scope="module")
+def entities(path: Path) -> dict[str, Entity]:
+    """Entities of the recording."""
+    return read_back(path)
+
+
+def test_a_value_is_a_curve_of_mean_band_and_vehicle(entities: dict[str, Entity]) -> None:
+    delay = entities["/program/curve/delay_ms"]
+    numbers = list(delay.at["Scalars:scalars"].values())
+    assert len(numbers) == 10
+    high, low = np.percentile([10, 20, 30, 40], [95, 5])
+    assert np.allclose(numbers, [high, low, 25.0, 20.0])
+    assert next(iter(entities["/program/curve/warned"].at["Scalars:scalars"])) == pytest.approx(0.3)
+
+
+def test_vehicles_are_coloured_by_a_value(entities: dict[str, Entity]) -> None:
+    colours = entities["/program/map/delay_ms"].at["Points2D:colors"][0.0]
+    assert len(set(colours)) == 4
+    assert len(entities["/program/map/delay_ms"].at["Points2D:positions"][0.0]) == 4
+
+
+def test_a_text_is_a_state_of_the_vehicle(entities: dict[str, Entity]) -> None:
+    assert entities["/program/texts/state"].at["StateChange:state"] == {0.0: ["early"], 0.5: ["late"]}
+
+
+def test_no_view_is_laid_out_for_what_the_program_does_not_do(path: Path) -> None:
+    names, origins = views(path)
+    assert "Program" in names
+    assert {"program/curve/delay_ms", "program/curve/warned", "program/texts", "map", "radio/frames"} <= set(
+        origins
+    )
+    estimates = {"common", "position", "weights", "figures/common", "figures/position", "figures/consensus"}
+    assert not estimates & set(origins)
+    assert not {"vehicle/position", "vehicle/common", "vehicle/errors", "radio/busy"} & set(origins)
