@@ -76,6 +76,7 @@ def test_a_curve_counts_every_pair_at_its_distance() -> None:
     assert found.share[:2].tolist() == [1.0, 3 / 5]
 
 
+@pytest.mark.slow
 def test_without_ns3_it_says_in_one_line_how_to_get_it(tmp_path: Path) -> None:
     environment = {**os.environ, "PATH": str(tmp_path), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", "-m", "benchmarks.ns3", "--out", str(tmp_path / "out")]

@@ -73,7 +73,7 @@ def test_every_kind_of_message_is_on_the_page() -> None:
 # An independent reader.
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(agent_messages | emulator_messages | welcomes)
 def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
     kind, *values = msgpack.unpackb(wire.encode(message))
@@ -122,7 +122,7 @@ def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
 def test_vnet_accepts_what_a_plain_writer_encodes(kind: str) -> None:
     decode = wire.decode_tx if kind in OF_AGENTS else wire.decode_rx
 
-    @settings(max_examples=50, deadline=None)
+    @settings(max_examples=20, deadline=None)
     @given(PAGE.values(kind))
     def check(values: list[Any]) -> None:
         message = decode(msgpack.packb([kind, *values]))

@@ -333,7 +333,8 @@ schedules = st.lists(
 )
 
 
-@settings(max_examples=20, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=15, deadline=None)
 @given(
     faults=schedules,
     seed=st.integers(0, 1000),

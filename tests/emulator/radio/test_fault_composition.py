@@ -51,6 +51,7 @@ def test_with_everything_at_once_each_reception_has_one_outcome_and_all_are_coun
     assert causes == {f["kind"] for f in EVERYTHING} - {"delay", "jitter", "reorder", "throttle"}
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_one_more_fault_changes_no_reception_it_does_not_touch(seed: int, data: st.DataObject) -> None:
@@ -90,6 +91,7 @@ def test_copies_of_one_fault_do_not_depend_on_how_many_another_made() -> None:
     assert max(row["copy"] for row in other.rows()) > max(row["copy"] for row in one.rows())
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.lists(st.sampled_from(EVERYTHING), max_size=5))
 def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, faults: list[dict[str, Any]]) -> None:
@@ -105,6 +107,7 @@ def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, fau
     assert one.rows() == other.rows()
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_after_all_have_ended_the_engine_is_as_one_that_never_had_faults(seed: int, data: st.DataObject) -> None:

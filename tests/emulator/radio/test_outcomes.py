@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from emulator.pages.palette import PALETTE
 from emulator.radio.outcomes import DRAWN, Outcome, Stage, decided_at
 from tests.support.paths import ROOT
@@ -28,6 +30,7 @@ def test_outcomes_are_told_apart_by_colour_and_by_sign() -> None:
     assert len({outcome.facts.sign for outcome in DRAWN}) == len(DRAWN)
 
 
+@pytest.mark.slow
 def test_an_outcome_is_added_in_the_table_alone(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONHASHSEED": "0", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-P", "-m", "tests.support.added_outcome", str(tmp_path / "run")]

@@ -77,6 +77,7 @@ def on_roads(folder: Path) -> Scenario:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [with_files, on_roads])
 def test_a_moved_run_reads_the_same_without_its_inputs(make: object, inputs: Path, tmp_path: Path) -> None:
     assert callable(make)
@@ -110,6 +111,7 @@ def take_away(run: Path, inputs: Path, tmp_path: Path) -> Path:
     return moved
 
 
+@pytest.mark.slow
 def test_a_run_of_sumo_reads_the_same_where_sumo_is_not_installed(
     tmp_path: Path, sumo: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,6 +87,7 @@ def test_the_reference_page_describes_it(spike: type[Fault]) -> None:
     assert "| `longest_ms` | number | `300` | ms | > 1, ≤ 60000 | Longest extra latency" in page
 
 
+@pytest.mark.slow
 def test_campaigns_draw_it_with_its_parameters(spike: Any) -> None:
     plan = Plan.of(Scenario.model_validate(SMALL), "random", 300, 1)
     drawn = [fault for n in range(300) for fault in plan.draw(n).fault if isinstance(fault, spike)]

@@ -19,6 +19,8 @@ from tests.support.paths import ROOT
 from vnet.errors import VnetError
 from vnet.transport import wire
 
+pytestmark = pytest.mark.slow
+
 VALUES = ["--connect", "{endpoint}", "--run", "{run}", "--node", "{node}", "--credentials", "{credentials}"]
 FOREIGN = [sys.executable, "-P", "docs/examples/foreign_agent.py", *VALUES]
 VNET_AGENT = [sys.executable, "-P", "-m", "agents.cli", *VALUES]
