@@ -67,7 +67,7 @@ class _Modules:
         except (OSError, ValueError):
             found = None
         if found is None:
-            where = " or in ".join(str(folder) for folder in self._searched)
+            where = " or in ".join(dict.fromkeys(str(folder.resolve()) for folder in self._searched))
             raise ScenarioError(f"{problem}: no such file in {where}")
         if not found.stem.isidentifier():
             raise ScenarioError(f"{problem}: not importable: name the file with letters, digits and _ only")

@@ -169,7 +169,7 @@ def test_given_folders_come_first_and_are_relative_to_the_scenario(here: Path) -
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ('program.entry="pp_no.py"', r"program.entry = 'pp_no.py': no such file in scenarios or in /"),
+        ('program.entry="pp_no.py"', r"program.entry = 'pp_no.py': no such file in /.*/scenarios or in /"),
         ('program.entry="pp-odd.py:main"', r"program.entry = 'pp-odd.py:main': not importable: name the file with"),
         ('program.folders=["nowhere"]', r"program.folders: 'nowhere': no such folder"),
         (

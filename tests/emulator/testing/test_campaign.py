@@ -22,6 +22,7 @@ from emulator.testing import campaign
 from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.matrix import column_of, count_verdicts, page
+from emulator.testing.scenarios import make_scenario
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError, ScenarioError, VnetError
 
@@ -75,6 +76,27 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
     text = (folder / "campaign.html").read_text()
     assert f"<h2>Failures: {len(failed)}</h2>" in text
     assert "vnet simulate" in text
+
+
+def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(tmp_path: Path) -> None:
+    (tmp_path / "own_campaign_checks.py").write_text(
+        "def paused(run):\n"
+        "    pauses = [fault for fault in run.scenario.fault if fault.kind == 'pause']\n"
+        "    yield 'unpaused', 'invalid' if pauses else 'valid', f'{len(pauses)} pauses'\n\n"
+        "def broken(run):\n    raise ValueError(run.nodes[0])\n"
+    )
+    checks = [f"{tmp_path}/own_campaign_checks.py:{function}" for function in ("paused", "broken")]
+    scenario = make_scenario(planted("proud"), {"program": "agents.beacon:main"})
+    status, said = run(
+        Plan.of(make_scenario(scenario, {"checks": checks}), "pause", 1, seed=1), tmp_path / "paused"
+    )
+    assert status == 1
+    (row,) = results_of(tmp_path / "paused")
+    assert row["failed"] == {"own:unpaused": "1 pauses"}
+    assert row["shrunk"].count("[[fault]]") == 1
+    assert "unknown in 1 run: own:own_campaign_checks.broken: raises ValueError: v01" in said
+    status, said = run(Plan.of(make_scenario(scenario, {"checks": checks}), "none", 1, seed=1), tmp_path / "none")
+    assert (status, "1 run, 0 failed" in said) == (3, True)
 
 
 def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path) -> None:
