@@ -90,7 +90,7 @@ def program(vehicle: str, content: Content) -> rrb.Vertical:
             rrb.Spatial2DView(
                 origin=f"program/map/{name}",
                 contents=["$origin/**", "/map/lanes"],
-                name=f"{titled(name)}: light least, dark most, grey not reported",
+                name=f"{titled(name)}: blue least, yellow most, grey not reported",
             ),
             column_shares=[3, 2],
             name=titled(name),

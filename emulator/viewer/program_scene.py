@@ -14,8 +14,8 @@ from vnet.units import title_of, unit_of
 
 MOST_VALUES = 16
 """Names of values that are drawn, in the order in which they are first reported."""
-LOW, HIGH = np.array((225, 225, 90), dtype=float), np.array((70, 10, 100), dtype=float)
-"""Colours of the least and of the largest value so far, light and dark."""
+LOW, HIGH = np.array((40, 90, 220), dtype=float), np.array((255, 205, 40), dtype=float)
+"""Colours of the least and of the largest value so far, blue and yellow: both are seen on dark and on light."""
 
 
 def titled(name: str) -> str:
