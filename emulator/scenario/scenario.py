@@ -56,7 +56,7 @@ class Run(Section):
     """`lockstep` is virtual time, `realtime` the wall clock."""
     nodes_per_process: int = Field(1, ge=1, le=1000)
     """Vehicles that share an agent process; they start, pause and die together."""
-    start: Literal["fork", "spawn"] = "spawn"
+    start: Literal["fork", "spawn"] = "fork"
     """Agent processes: `fork` them from one that has imported what they need (on Linux) or `spawn` interpreters."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
     """Time for agents to join, or to come back after a fault (wall clock)."""

@@ -165,6 +165,7 @@ def running_agents(of: Path) -> list[int]:
 def zygote_of(emulator: int) -> int:
     """Pid of the process from which the agents of an emulator are forked; 0 if there is none just now."""
     for child in Path(f"/proc/{emulator}/task/{emulator}/children").read_text().split():
-        if b"agents.zygote" in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
-            return int(child)
+        with contextlib.suppress(OSError):  # it has just ended
+            if b"agents.zygote" in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                return int(child)
     return 0

@@ -15,7 +15,7 @@ import tomli_w
 
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import TIMEOUT_S, VNET, Vnet, heard_by, run_until
+from tests.system.conftest import TIMEOUT_S, VNET, Vnet, heard_by, run_until, zygote_of
 
 PROGRAM = "tests.support.fault_programs:minds_the_order"
 
@@ -104,17 +104,17 @@ def started(scenario: str, folder: Path, *options: str, after: str) -> Iterator[
 
 
 @pytest.mark.parametrize(
-    ("together", "router", "faults"),
+    ("together", "router", "start", "faults"),
     [
-        (1, "embedded", [*EVERY_SORT, {"kind": "emulator_restart", "at_s": 1.1, "down_s": 0.3}]),
-        (1, "separate", [*EVERY_SORT, {"kind": "router_restart", "at_s": 1.1, "down_s": 0.3}]),
-        (2, "embedded", IN_PAIRS),
+        (1, "embedded", "fork", [*EVERY_SORT, {"kind": "emulator_restart", "at_s": 1.1, "down_s": 0.3}]),
+        (1, "separate", "spawn", [*EVERY_SORT, {"kind": "router_restart", "at_s": 1.1, "down_s": 0.3}]),
+        (2, "embedded", "fork", IN_PAIRS),
     ],
 )
 def test_a_run_with_faults_of_every_sort_replays_live_and_simulated(
-    vnet: Vnet, tmp_path: Path, together: int, router: str, faults: list[dict[str, Any]]
+    vnet: Vnet, tmp_path: Path, together: int, router: str, start: str, faults: list[dict[str, Any]]
 ) -> None:
-    scenario = write(tmp_path, faults, run={"nodes_per_process": together})
+    scenario = write(tmp_path, faults, run={"nodes_per_process": together, "start": start})
     live = vnet("run", scenario, "--router", router)
     simulated = vnet("simulate", scenario)
     assert live.check("progress")["verdict"] == "valid", live.stdout + live.stderr
@@ -129,6 +129,16 @@ def test_a_run_with_faults_of_every_sort_replays_live_and_simulated(
     assert processes_of(live.folder) == {}
 
 
+def kill_zygote(emulator: subprocess.Popen[str]) -> int:
+    """Kill the process from which a run's agents are forked; returns the one that takes its place."""
+    former = zygote_of(emulator.pid)
+    os.kill(former, signal.SIGKILL)
+    while (zygote := zygote_of(emulator.pid)) in (0, former):
+        assert emulator.poll() is None
+        time.sleep(0.02)
+    return zygote
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_vehicles_that_stand_still_do_not_outlive_the_run(tmp_path: Path, number: signal.Signals) -> None:
     pause = {"kind": "pause", "at_s": 0.3, "duration_s": 3600, "nodes": {"ids": ["v01", "v03"]}}
@@ -138,8 +148,11 @@ def test_vehicles_that_stand_still_do_not_outlive_the_run(tmp_path: Path, number
         while sorted(processes_of(folder).values()).count("T") < 2:
             assert process.poll() is None
         assert len(processes_of(folder)) == 4
+        zygote = kill_zygote(process)
+        assert sorted(processes_of(folder).values()).count("T") == 2, "they are paused without their zygote, too"
         process.send_signal(number)
         process.communicate(timeout=TIMEOUT_S)
+        assert has_ended(zygote, TIMEOUT_S)
         assert number == signal.SIGKILL or processes_of(folder) == {}
         wait_until_all_are_gone(folder)
 
