@@ -1,4 +1,4 @@
-"""How long commands take to begin, beside a Python that does nothing: all of them in turns, medians."""
+"""Time that commands take to begin, beside a Python that does nothing: all of them in turns, medians."""
 
 from __future__ import annotations
 
