@@ -69,6 +69,7 @@ def comparison(text: str) -> str:
         difference_rows=rows,
         scenario=rows,
         key_figures=rows,
+        reported=rows,
         outcomes=rows,
         checks=rows,
         charts=[Chart("key", text, drawing(text), text)],
