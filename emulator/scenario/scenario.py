@@ -140,7 +140,8 @@ class CommonError(Section):
     """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process."""
 
     sigma_m: float = Field(3.0, ge=0, le=WILD_M)
-    """Its standard deviation in each axis."""
+    """Its standard deviation in each axis: by default that of ionosphere and orbits, so that all fixes are some
+    metres off in the same direction. For studies that are not about positioning: 0."""
     tau_s: float = Field(600.0, gt=0)
     """Its correlation time."""
 
