@@ -47,7 +47,7 @@ def test_what_behaves_is_valid_and_the_same_live_and_simulated(vnet: Vnet, tmp_p
 def test_a_program_that_raises_is_named_with_its_traceback(vnet: Vnet, command: str) -> None:
     done = run(vnet, command, "raises")
     assert done.status == 1
-    assert "v02 crashed at 0.500 s" in done.check("agents_alive")["text"]
+    assert "v02 crashed at 0.5 s" in done.check("agents_alive")["text"]
     (crash,) = done.events_of("crashed")
     assert crash["node"] == "v02"
     assert "the battery is flat" in crash["error"]
