@@ -39,7 +39,7 @@ def make_scenario(minutes: float, seed: int) -> Scenario:
     at_s = 5.0
     while (at_s := at_s + rng.exponential(EVERY_S)) < duration_s - SETTLE_S - LONGEST_S:
         kind, parameters = KINDS[rng.integers(len(KINDS))]
-        where = {} if kind == "partition" else {"nodes": {"random": int(rng.integers(1, VEHICLES // 4))}}
+        where = {} if kind == "partition" else {"nodes": {"count": int(rng.integers(1, VEHICLES // 4))}}
         lasting_s = rng.uniform(SHORTEST_S, LONGEST_S)
         times = {"at_s": round(at_s, 2), "duration_s": round(lasting_s, 2)}
         faults.append(parse_fault({"kind": kind, **times, **where, **parameters}))

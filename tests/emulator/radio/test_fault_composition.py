@@ -13,7 +13,7 @@ from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, S, fault, link
 
 EVERYTHING = [
     fault("partition", 1.0, 5.0, groups="ring"),
-    fault("block", 2.0, 1.0, senders={"random": 2}),
+    fault("block", 2.0, 1.0, senders={"count": 2}),
     fault("loss", 0.5, 4.0, probability=0.2),
     fault("burst_loss", 1.5, 4.0),
     fault("delay", 2.0, 1.0, delay_ms=300.0),
@@ -21,13 +21,13 @@ EVERYTHING = [
     fault("reorder", 0.0, 6.0),
     fault("duplicate", 0.2, 6.0, probability=0.5, copies=3),
     fault("corrupt", 0.7, 5.0, probability=0.5, flips=3),
-    fault("throttle", 1.2, 3.0, nodes={"random": 2}, bitrate_mbps=0.002),
+    fault("throttle", 1.2, 3.0, nodes={"count": 2}, bitrate_mbps=0.002),
     fault("range", 0.2, 0.7, nodes={"ids": ["v0", "v4"]}, range_m=150.0),
-    fault("swizzle", 1.0, 5.0, nodes={"random": 3}),
-    fault("DataReplay", 0.4, 5.0, nodes={"random": 2}, age_s=0.5),
-    fault("StaleMessages", 1.4, 4.0, nodes={"random": 2}, age_s=0.3),
-    fault("DoS", 1.0, 4.0, nodes={"random": 2}, factor=5),
-    fault("Sybil", 2.0, 4.0, nodes={"random": 2}, ghosts=3),
+    fault("swizzle", 1.0, 5.0, nodes={"count": 3}),
+    fault("DataReplay", 0.4, 5.0, nodes={"count": 2}, age_s=0.5),
+    fault("StaleMessages", 1.4, 4.0, nodes={"count": 2}, age_s=0.3),
+    fault("DoS", 1.0, 4.0, nodes={"count": 2}, factor=5),
+    fault("Sybil", 2.0, 4.0, nodes={"count": 2}, ghosts=3),
 ]
 ENDED_NS = 6_200_000_000
 

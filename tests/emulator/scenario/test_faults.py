@@ -91,7 +91,7 @@ WRONG = [
         {"nodes": "v1"},
         ["kill.nodes = 'v1': a selector is a list of ids, as ", "or a table, as { count = 3 }"],
     ),
-    ("kill", {"nodes": ["v1", 2]}, ["kill.nodes.ids.1 = 2", "string"]),
+    ("kill", {"nodes": ["v1", 2]}, ["kill.nodes.ids.1 = 2", "text is needed"]),
     ("kill", {"nodes": {"random": 2}}, ["kill.nodes: random is called count: write { count = 2 }"]),
     ("kill", {"nodes": {"rando": 2}}, ["kill.nodes.rando: unknown key", "degree, disc, fraction, ids"]),
     ("kill", {"nodes": {"ids": ["v1"], "count": 1}}, ["kill.nodes: ids and count exclude each other"]),
