@@ -13,7 +13,9 @@ virtual loop spins for ever (cpython#116342).
 from __future__ import annotations
 
 import asyncio
+import os
 import selectors
+import sys
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from concurrent.futures import Executor, Future
@@ -120,6 +122,7 @@ class VirtualTimeLoop(SkewedLoop):
     """
 
     def __init__(self, exchange: Exchange, spin_limit: int = 100_000) -> None:
+        self._process = os.getpid()
         self._exchange = exchange
         self._spin_limit = spin_limit
         self._rounds = 0
@@ -175,6 +178,8 @@ class VirtualTimeLoop(SkewedLoop):
 
     def _wait(self, timeout: float | None, poll: Callable[[float | None], list[Any]]) -> list[Any]:
         """Yield, in place of the selector's sleep."""
+        if os.getpid() != self._process:
+            _end_fork()
         if timeout is not None and timeout <= 0:
             self._count_round()
             return poll(0)
@@ -294,6 +299,13 @@ def _copy_result(job: Future[Any], outer: asyncio.Future[Any]) -> None:
         outer.set_exception(error)
     else:
         outer.set_result(job.result())
+
+
+def _end_fork() -> NoReturn:
+    """End a process that a program has forked and that comes back: there is one run, and it is the parent's."""
+    sys.stderr.write("vnet: a process that a program forked came back to the event loop; it ends here\n")
+    sys.stderr.flush()
+    os._exit(70)  # nothing of the parent's is to be flushed or closed twice
 
 
 def _nothing() -> None:

@@ -1,6 +1,7 @@
 """asyncio in virtual time: what programs may rely on, and what they are refused."""
 
 import asyncio
+import os
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
@@ -33,6 +34,25 @@ def loop() -> Iterator[VirtualTimeLoop]:
 
 def run(loop: VirtualTimeLoop, program: Callable[[], Awaitable[Any]]) -> Any:
     return loop.run_until_complete(program())
+
+
+def test_a_fork_that_comes_back_to_the_loop_ends(loop: VirtualTimeLoop, capfd: pytest.CaptureFixture[str]) -> None:
+    async def program() -> int:
+        child = os.fork()
+        if child == 0:
+            try:
+                await asyncio.sleep(1)
+            finally:
+                os._exit(1)  # where the loop lets it come back, it must not run the tests a second time
+        await asyncio.sleep(1)
+        return child
+
+    _, status = os.waitpid(run(loop, program), 0)
+    assert os.waitstatus_to_exitcode(status) == 70
+    assert (
+        capfd.readouterr().err
+        == "vnet: a process that a program forked came back to the event loop; it ends here\n"
+    )
 
 
 def test_sleep_takes_exactly_the_time_asked_for(loop: VirtualTimeLoop) -> None:
