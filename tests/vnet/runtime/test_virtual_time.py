@@ -38,10 +38,11 @@ def run(loop: VirtualTimeLoop, program: Callable[[], Awaitable[Any]]) -> Any:
 
 def test_a_fork_that_comes_back_to_the_loop_ends(loop: VirtualTimeLoop, capfd: pytest.CaptureFixture[str]) -> None:
     async def program() -> int:
+        never = loop.create_future()
         child = os.fork()
         if child == 0:
             try:
-                await asyncio.sleep(1)
+                await never
             finally:
                 os._exit(1)  # where the loop lets it come back, it must not run the tests a second time
         await asyncio.sleep(1)
