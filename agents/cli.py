@@ -52,6 +52,14 @@ def agent(
             metavar="FOLDER", help="Look for the program here, before the current folder. May be repeated."
         ),
     ] = None,
+    files: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Vehicles have their disks (node.folder) here, in FOLDER/ID, and find them again after a restart; "
+            "a temporary folder if left out.",
+        ),
+    ] = None,
     show_version: Annotated[
         bool,
         typer.Option(
@@ -61,6 +69,7 @@ def agent(
 ) -> None:
     """Join a run as one or more vehicles and run the scenario's program until the run ends."""
     from agents.host import run_agent  # these import numpy, before which `main` sets its number of threads
+    from vnet.runtime.disks import Disks
     from vnet.transport.credentials import Credentials
     from vnet.transport.keys import is_segment
     from vnet.transport.session import quiet_zenoh
@@ -79,7 +88,7 @@ def agent(
             if not is_segment(name):
                 raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
         login = None if credentials is None else Credentials.load(credentials)
-        run_agent(connect, run, node, login, join_timeout_s)
+        run_agent(connect, run, node, login, join_timeout_s, Disks(files))
     except VnetError as error:
         print(f"vnet-agent: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, ProgramError) else 3)

@@ -15,6 +15,7 @@ from contextlib import ExitStack
 
 from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
+from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.programs import Programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
@@ -28,9 +29,16 @@ LEASE_MS = 60_000
 
 
 def run_agent(
-    endpoint: str, run: str, nodes: Sequence[str], credentials: Credentials | None, join_timeout_s: float
+    endpoint: str,
+    run: str,
+    nodes: Sequence[str],
+    credentials: Credentials | None,
+    join_timeout_s: float,
+    disks: Disks | None = None,
 ) -> None:
     """Join `run` at `endpoint` as `nodes` and run their programs to the end of the run.
+
+    `disks` has the folders of the nodes, by default temporary ones.
 
     Raises TransportError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
@@ -49,12 +57,14 @@ def run_agent(
         gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
-            _run_lockstep(attachment, welcomes, programs)
+            _run_lockstep(attachment, welcomes, programs, disks)
         else:
-            _run_realtime(attachment, welcomes, programs)
+            _run_realtime(attachment, welcomes, programs, disks)
 
 
-def _run_lockstep(attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
+def _run_lockstep(
+    attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs, disks: Disks | None
+) -> None:
     """Run the programs on a virtual-time loop until the emulator ends the run."""
     seq = 0
 
@@ -75,7 +85,7 @@ def _run_lockstep(attachment: Attachment, welcomes: Sequence[wire.Welcome], prog
         return message.time_ns
 
     loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
-    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line)
+    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line, disks=disks)
     asyncio.set_event_loop(loop)
     try:
         loop.start_at(next_grant())
@@ -94,10 +104,12 @@ def _run_lockstep(attachment: Attachment, welcomes: Sequence[wire.Welcome], prog
         loop.close()
 
 
-def _run_realtime(attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
+def _run_realtime(
+    attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs, disks: Disks | None
+) -> None:
     """Run the programs on an ordinary loop, on the wall clock."""
     with asyncio.Runner(loop_factory=_WallClockLoop) as runner:
-        runner.run(_RealTimeAgent(attachment, welcomes, programs).main())
+        runner.run(_RealTimeAgent(attachment, welcomes, programs, disks).main())
 
 
 class _WallClockLoop(SkewedLoop):
@@ -114,12 +126,14 @@ class _WallClockLoop(SkewedLoop):
 class _RealTimeAgent:
     """Real time: frames go out as they are sent, batches come in when they are due."""
 
-    def __init__(self, attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs) -> None:
+    def __init__(
+        self, attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs, disks: Disks | None
+    ) -> None:
         self._attachment = attachment
         self._programs = programs
         self._boot_id = welcomes[0].boot_id
         self._origin_ns = time.monotonic_ns()
-        self._host = Host(welcomes, self._now_ns, self._schedule_flush, write_line)
+        self._host = Host(welcomes, self._now_ns, self._schedule_flush, write_line, disks)
         self._wake_pending = False
         self._flush_pending = False
         self._started = False

@@ -142,6 +142,7 @@ def _call(arguments: Sequence[str]) -> None:
         node=given["--node"],
         credentials=Path(given["--credentials"][0]),
         path=[Path(folder) for folder in given["--path"]],
+        files=Path(given["--files"][0]) if given["--files"] else None,
     )
 
 

@@ -12,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -236,6 +237,7 @@ class Node:
         period_ns: int,
         max_payload: int,
         incarnation: int = 0,
+        disk: Callable[[], Path] | None = None,
     ) -> None:
         self.id = node_id
         self.radio = Radio(node_id, transport, max_payload)
@@ -246,11 +248,25 @@ class Node:
         self.period_ns = period_ns
         self.incarnation = incarnation
         self._transport = transport
+        self._disk = disk
 
     @property
     def now_ns(self) -> int:
         """Emulated time in nanoseconds since the start of the run, by the vehicle's own clock."""
         return self._transport.now_ns(self.id)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of this vehicle's disk, on the machine of its process: empty at the start of the run.
+
+        What was written there survives kills and restarts, as far as it has left the program's buffers: close or
+        flush what must last. At the end of the run regular files are copied to `files/NODE/` in the run's folder,
+        up to `run.files_max_mb`, if the emulator has started the process. The path differs from run to run: a
+        program that sends it does not replay. Raise OSError where the disk refuses.
+        """
+        if self._disk is None:
+            raise OSError(f"{self.id}: this node has no disk")
+        return self._disk()
 
     def disconnect(self) -> None:
         """Disconnect the rest of the program from the world, after the vehicle's process has ended."""

@@ -5,6 +5,7 @@ Times are integer nanoseconds from the start of a run, except in files and texts
 
 NS_PER_S = 1_000_000_000
 NS_PER_MS = 1_000_000
+BYTES_PER_MB = 1_000_000
 
 UNITS = {
     "m_s2": "m/s²",

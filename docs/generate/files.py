@@ -38,6 +38,8 @@ FOLDER = {
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
     "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append. `programs.log`: "
     "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign",
+    "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
+    "each. Only regular files of processes that the emulator has started; during a run they are in `disks/`",
     "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
@@ -139,6 +141,11 @@ EVENTS = {
     "log": ("vehicle", "`level`, `text`", "a line of `node.log`, or of the standard `logging` of its program"),
     "event": ("vehicle", "`name`, `details`", "an event of its program: `node.event`"),
     "left_out": ("vehicle", "`what`, `count`", "how many events of this kind are not here: there were too many"),
+    "files_left_out": (
+        "vehicle",
+        "`count`, `which`",
+        "how many files of its disk are not in `files/`, and of the first three the name and the reason",
+    ),
     "spun": (
         "vehicle",
         "`error`, `where`",

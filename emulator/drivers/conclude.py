@@ -25,6 +25,7 @@ from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
 from emulator.records.metrics import summarize
+from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
 from emulator.records.run import Run
@@ -60,6 +61,8 @@ def conclude(
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
     emulation.log_book.tell_left_out(emulation.emulated_ns)
+    for node, left_out in collect(folder, emulation.world.node_ids, emulation.scenario.run.files_max_mb).items():
+        folder.event(emulation.emulated_ns, "files_left_out", node, count=left_out.count, which=left_out.which)
     folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
     trace = emulation.engine.trace.to_table()
     states = emulation.metrics.states_table()

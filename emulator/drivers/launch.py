@@ -59,6 +59,8 @@ class Launcher:
     def __init__(self, logs: Path, folders: Sequence[Path] = (), zygote: Zygote | None = None) -> None:
         """Processes with logs in `logs`; agents look for their programs in `folders` too."""
         self.logs = logs
+        self.disks: Path | None = None
+        """Folder of the disks of vehicles, if agents are to have them in one place."""
         self._folders = folders
         self._zygote = zygote
         self._processes: dict[str, Process] = {}
@@ -93,6 +95,8 @@ class Launcher:
         arguments = ["--connect", endpoint, "--run", run]
         for node in nodes:
             arguments += ["--node", node]
+        if self.disks is not None:
+            arguments += ["--files", str(self.disks.absolute())]
         for folder in self._folders:
             arguments += ["--path", str(folder)]
         return arguments

@@ -19,6 +19,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.signals import tell_from_handler
 from emulator.records.node_logs import NodeLogs
+from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
@@ -98,7 +99,8 @@ class _Simulation:
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         logs = NodeLogs(emulation.folder.logs)
-        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write)
+        disks = Disks(emulation.folder.disks)
+        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write, disks=disks)
 
     def run(self) -> None:
         """From the first grant to the last."""

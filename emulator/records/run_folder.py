@@ -36,6 +36,8 @@ REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
 """Names of a run's report and recording, and of the list of the runs in a folder."""
 PROGRAMS_LOG = "programs.log"
 """File in `logs` of what programs print where standard output is for the result alone."""
+FILES = "files"
+"""The folder, in a run's own, of what vehicles have left on their disks."""
 AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
 FORMAT = 2
@@ -103,6 +105,11 @@ class RunFolder:
     def logs(self) -> Path:
         """The folder of the logs of the run's processes."""
         return self.path / "logs"
+
+    @property
+    def disks(self) -> Path:
+        """The folder of the vehicles' disks while the run is on."""
+        return self.path / "disks"
 
     @property
     def code(self) -> dict[str, str]:

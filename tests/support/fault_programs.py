@@ -23,6 +23,8 @@ async def minds_the_order(node: Node) -> None:
 
     One node in three never waits on its radio, and one waits with a timeout only.
     """
+    with (node.folder / "incarnations").open("a") as file:
+        file.write(f"{node.incarnation}\n")
     diary = Diary(node)
     manner = int(node.id[1:]) % 3
 

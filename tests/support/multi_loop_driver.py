@@ -21,6 +21,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
@@ -108,6 +109,7 @@ class _Process:
         decoded = [wire.decode_rx(welcome) for welcome in encoded]
         self._welcomes = [message for message in decoded if isinstance(message, wire.Welcome)]
         assert len(self._welcomes) == len(nodes)
+        self._disks = Disks(emulation.folder.disks)
         self._seq = 0
         self._final: wire.Traffic | None = None
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -153,7 +155,7 @@ class _Process:
 
     def _host_programs(self) -> None:
         loop = self._loop = VirtualTimeLoop(self._exchange, self._welcomes[0].spin_limit)
-        self._host = Host(self._welcomes, lambda: loop.now_ns)
+        self._host = Host(self._welcomes, lambda: loop.now_ns, disks=self._disks)
         asyncio.set_event_loop(loop)
         try:
             loop.start_at(self._next_grant())

@@ -126,6 +126,10 @@ def test_a_run_with_faults_of_every_sort_replays_live_and_simulated(
     assert live.verdict["verdict"] == simulated.verdict["verdict"] == "valid", live.stdout
     assert live.outcomes["fault"] > 0
     assert live.outcomes["receiver_down"] > 0
+    for node in ("v01", "v02", "v03", "v04"):
+        place = Path("files") / node / "incarnations"
+        entries = (live.folder / place).read_text()
+        assert len(entries.split()) > 1 and entries == (simulated.folder / place).read_text()
     assert processes_of(live.folder) == {}
 
 

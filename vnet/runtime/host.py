@@ -16,12 +16,14 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from vnet.node import Node, NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
+from vnet.runtime.disks import Disks
 from vnet.runtime.log_handler import NodeLogHandler
 from vnet.runtime.programs import Program, Programs, error_line, load_program
 from vnet.runtime.unhandled import UnhandledExceptions
@@ -45,6 +47,7 @@ class Host:
 
     `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
     puts it at once; lockstep takes it at the next yield). `on_line` is called with a node and a line of its log.
+    `disks` has the nodes' folders, by default temporary ones.
     """
 
     def __init__(
@@ -53,7 +56,9 @@ class Host:
         clock: Callable[[], int],
         on_traffic: Callable[[], None] = lambda: None,
         on_line: Callable[[str, str], None] = lambda node, line: None,
+        disks: Disks | None = None,
     ) -> None:
+        self._disks = disks or Disks()
         self._clock = clock
         self._on_traffic = on_traffic
         self._on_line = on_line
@@ -84,6 +89,7 @@ class Host:
             period_ns=welcome.period_ns,
             max_payload=welcome.max_payload,
             incarnation=welcome.incarnation,
+            disk=partial(self._disks.of, welcome.node),
         )
 
     # What nodes ask of their link.

@@ -81,7 +81,7 @@ async def run_live(
             session = LiveSession(emulation, options, launcher, before_horizon)
             stack.callback(session.close)
             on_open()
-            launcher.logs = emulation.folder.logs
+            launcher.logs, launcher.disks = emulation.folder.logs, emulation.folder.disks
             stack.enter_context(
                 control_endpoint(emulation.folder.path, session.endpoint, options.access, options.record)
             )
