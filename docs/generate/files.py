@@ -189,6 +189,9 @@ VERDICT = {
     "figures": "means of some metrics, after the first fifth of the run",
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
+    "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
+    "`process`), `cpu_s`, `wake_ups`, `payload`, and the same of up to 100 `vehicles`, the slowest first. The "
+    "machine decides `cpu_s`: no hash and no comparison has it",
     "reproduce": "the command that runs it again, from any folder of the machine",
     "versions": "of vnet, Python and numpy",
 }

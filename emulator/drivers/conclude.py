@@ -24,6 +24,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
+from emulator.records.costs import run_cost
 from emulator.records.metrics import summarize
 from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
@@ -79,6 +80,7 @@ def conclude(
     if replay:
         judgement.put(NotExercised("replay", replay))
         reproduce += " --program MODULE:FUNCTION"
+    cost = run_cost(emulation.costs, emulation.world.node_ids, *emulation.engine.trace.sizes())
     verdict = {
         "format": FORMAT,
         **_judged(judgement),
@@ -93,6 +95,7 @@ def conclude(
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
         "reported": {name: asdict(figure) for name, figure in reported_figures(states).items()},
+        "cost": asdict(cost),
         "reproduce": reproduce,
         "versions": {
             "vnet": version("vnet-emulator"),

@@ -20,6 +20,7 @@ from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
+from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
@@ -90,6 +91,7 @@ class Emulation:
         self._finished = False
         self._reports: list[Report] = []
         self._arrived: list[Delivery] = []
+        self.costs = Costs()
         self.log_book = LogBook(folder, self.number)
 
     def _nodes_at(self, period: int) -> Nodes:

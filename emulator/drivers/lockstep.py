@@ -246,6 +246,7 @@ class Lockstep:
             packets, clocks = process.take_packets(), process.take_clocks()
             grants[process_id] = wire.Grant(process.seq, self.now_ns, packets, fixes, clocks)
             self.owed[process_id] = process.seq
+            self._emulation.costs.wake_ups[process_id] += 1
             process.seq += 1
         return grants
 

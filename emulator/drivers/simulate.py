@@ -19,6 +19,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.signals import tell_from_handler
 from emulator.records.node_logs import NodeLogs
+from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.program_path import search_programs_in
@@ -98,6 +99,8 @@ class _Simulation:
         search_programs_in(emulation.scenario.program.folders)
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
+        self._meter = CpuMeter()
+        self.loop.measure(self._meter)
         logs = NodeLogs(emulation.folder.logs)
         disks = Disks(emulation.folder.disks)
         self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write, disks=disks)
@@ -125,6 +128,7 @@ class _Simulation:
         finally:
             asyncio.set_event_loop(None)
             self.loop.close()
+            self._emulation.costs.take_programs(self._meter.cpu_ns, self._meter.wake_ups)
 
     def _close(self, time_ns: int) -> None:
         self._host.close(self.loop)

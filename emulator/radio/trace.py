@@ -155,6 +155,11 @@ class Trace:
         """Return a column of the trace so far, as numbers."""
         return np.asarray(self.rows(slice(None))[name])
 
+    def sizes(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return the senders' numbers (K,) and payload sizes in bytes (K,) of all frames sent, copies left out."""
+        frames = self._frames.records[self._frames.records["copy"] == 0]
+        return frames["sender"], frames["size_bytes"]
+
     def name_cause(self, number: int, name: str) -> None:
         """Set the name of fault `number`."""
         missing = number + 2 - len(self._causes)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
+from emulator.records.costs import RunCost
 from emulator.records.reported import ReportedFigure
 from emulator.records.verdicts import CheckResult, Judgement, NotExercised, Verdict
 from emulator.scenario.sections import first_problem
@@ -39,6 +40,7 @@ class Record:
     start_up_s: float | None = None
     metrics_sha256: str = ""
     reported: dict[str, ReportedFigure] = field(default_factory=dict)
+    cost: RunCost | None = None
     versions: dict[str, str] = field(default_factory=dict)
 
     @property

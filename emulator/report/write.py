@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
+from emulator.records.costs import HEADS
 from emulator.records.key_figures import shown_figures
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE, Event
 from emulator.records.verdict_file import Record
@@ -35,6 +36,8 @@ MOST_ROWS = 50
 """Rows of a check's figures that are shown."""
 MOST_TEXTS = 3
 """Texts of several lines, as tracebacks, that are shown of a check's rows."""
+SLOWEST = 10
+"""Vehicles in the table of what a run cost."""
 SAMPLES = {"memory"}
 """Events that are series of measurements, and would drown the others."""
 WORST_FIRST = (Verdict.INVALID, Verdict.UNKNOWN, Verdict.VALID)
@@ -73,6 +76,7 @@ def report_page(source: Source) -> str:
         reported=_reported(record) if record else None,
         charts=draw(source),
         radio=radio_section(source),
+        cost=_cost(record) if record else None,
         events=_events(source),
         log=_log(source),
         scenario=_scenario(source),
@@ -193,6 +197,15 @@ def _reported(record: Record) -> Table | None:
     heads = ("figure", "mean", "5 – 95 %", "at the end")
     rows = [dict(zip(heads, figure.words(name), strict=True)) for name, figure in record.reported.items()]
     return table(rows, "all reports of all vehicles; at the end: the mean of each vehicle's last") if rows else None
+
+
+def _cost(record: Record) -> dict[str, Any] | None:
+    """The costs of the run in a line, and a table of its slowest vehicles; None if nothing is known."""
+    if record.cost is None or not (line := record.cost.line()):
+        return None
+    rows = [dict(zip(HEADS, vehicle.words(), strict=True)) for vehicle in record.cost.vehicles[:SLOWEST]]
+    caption = f"CPU time of each vehicle's {record.cost.measured}, the slowest first"
+    return {"line": f"{line[0].upper()}{line[1:]}.", "rows": table(rows, caption)}
 
 
 # Events, the scenario, and how to reproduce the run.

@@ -17,12 +17,15 @@ from rich.text import Text
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import cell
+from emulator.records.costs import HEADS, RunCost, read_cost
 from emulator.records.key_figures import shown_figures
 from emulator.records.reported import ReportedFigure
 from emulator.records.run_folder import RECORDING, REPORT
 from emulator.records.verdicts import CheckResult
 from emulator.viewer.sinks import is_closed, repair_command
 
+SLOWEST = 10
+"""Vehicles in the table of what a run cost."""
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 
 
@@ -36,7 +39,8 @@ def print_summary(
 ) -> None:
     """Print the summary of a run that has just ended; with `report`, its report is about to be written.
 
-    Checks are one line, and those that are not valid; with `verbose` they are all listed.
+    Checks are one line, and those that are not valid, and costs are one; `verbose` lists all checks, and the costs
+    of the slowest vehicles.
     """
     print_checks(judgement, console, verdict["reproduce"], verbose)
     if verdict["reported"]:
@@ -46,6 +50,7 @@ def print_summary(
     if any(verdict["frames_by_outcome"].values()):
         counts = verdict["frames_by_outcome"]
         _print_table("receptions: one for each frame and receiver in range", _frames(counts), console)
+    _print_cost(read_cost(verdict["cost"]), console, verbose)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     quoted = shlex.quote(str(folder))
@@ -149,6 +154,19 @@ def _print_table(title: str, table: Table, console: Console) -> None:
     """Print a table below its title, which may be wider."""
     console.print(Text(title, style="italic"))
     console.print(table)
+
+
+def _print_cost(cost: RunCost, console: Console, verbose: bool) -> None:
+    """Print what a run cost: one line, and with `verbose` the slowest vehicles."""
+    if line := cost.line():
+        console.print(Text(f"cost         {line}"), soft_wrap=True)
+    if verbose and cost.vehicles:
+        table = Table(*HEADS[:1])
+        for head in HEADS[1:]:
+            table.add_column(head, justify="right")
+        for vehicle in cost.vehicles[:SLOWEST]:
+            table.add_row(*map(Text, vehicle.words()))
+        _print_table(f"cost by vehicle: CPU time of its {cost.measured}, the slowest first", table, console)
 
 
 def _reported(reported: Mapping[str, Mapping[str, Any]]) -> Table:

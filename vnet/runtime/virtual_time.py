@@ -26,6 +26,7 @@ from typing import Any, NoReturn
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NumberedTimer
+from vnet.runtime.cpu_meter import CpuMeter
 from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
 
@@ -130,6 +131,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._ending = False
         self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
         self._timers = count()
+        self._meter: CpuMeter | None = None
         super().__init__(_YieldingSelector(self._wait))
         asyncio_internals.set_clock_resolution(self, 0.5 / NS_PER_S)  # no timer fires before its nanosecond
 
@@ -141,6 +143,13 @@ class VirtualTimeLoop(SkewedLoop):
     def start_at(self, time_ns: int) -> None:
         """Set the clock before anything runs: a process that is started again joins late."""
         self._now_ns = time_ns
+
+    def measure(self, meter: CpuMeter) -> None:
+        """Let `meter` measure what the callbacks cost, from the next round on."""
+        ready = _HoldingQueue(asyncio_internals.ready_queue(self))
+        ready.on_taken = meter.begin
+        asyncio_internals.replace_ready_queue(self, ready)
+        self._meter = meter
 
     def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
         """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
@@ -180,6 +189,8 @@ class VirtualTimeLoop(SkewedLoop):
         """Yield, in place of the selector's sleep."""
         if os.getpid() != self._process:
             _end_fork()
+        if self._meter is not None:
+            self._meter.end()
         if timeout is not None and timeout <= 0:
             self._count_round()
             return poll(0)
@@ -192,6 +203,8 @@ class VirtualTimeLoop(SkewedLoop):
             self._count_round()
             return []
         self._rounds = 0
+        if self._meter is not None:
+            self._meter.end_instant()
         self._now_ns = self._exchange(next_timer_ns)
         return []
 
@@ -252,7 +265,12 @@ class VirtualTimeLoop(SkewedLoop):
 
 
 class _HoldingQueue(deque[asyncio.Handle]):
-    """The loop's queue of callbacks that are ready, but for those of programs that are paused."""
+    """The loop's queue of callbacks that are ready, but for those of programs that are paused.
+
+    `on_taken` is called with each callback that is about to run.
+    """
+
+    on_taken: Callable[[asyncio.Handle], None] | None = None
 
     def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
         super().__init__(ready)
@@ -264,6 +282,12 @@ class _HoldingQueue(deque[asyncio.Handle]):
             self._held.append(handle)
         else:
             super().append(handle)
+
+    def popleft(self) -> asyncio.Handle:
+        handle = super().popleft()
+        if self.on_taken is not None:
+            self.on_taken(handle)
+        return handle
 
     def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
         """Hold what `holds` says, and release the rest in the order in which it came; returns its timers."""

@@ -19,6 +19,7 @@ import zenoh
 
 from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.control import answer, control_endpoint
+from emulator.drivers.cpu_watch import CpuWatch
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import Launcher
@@ -121,6 +122,7 @@ class LiveSession:
         self._driver: Driver | None = None
         self._status = Course(emulation)
         self._memory = MemoryWatch(emulation.duration_ns)
+        self._cpu = CpuWatch()
         self._changes = ChangeSignal()
         self._members = Membership(node_ids, later, emulation.world.has_traffic)
         self._refusals = Refusals(options.access.run, emulation.folder, self._time_ns)
@@ -194,7 +196,8 @@ class LiveSession:
             processes = await self._joining.join(on_state, tell_missing)
             folder.event(0, "started", start_up_s=round(time.monotonic() - started_s, 3))
             self._emulation.watch(self._feed.period)
-            self._emulation.watch(self._look_at_memory)
+            self._emulation.watch(self._look_at_processes)
+            self._cpu.look(self._launcher.pids)
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started_s = time.monotonic()
             self._feed.begin()
@@ -209,6 +212,8 @@ class LiveSession:
             self._emulation.finish(self._time_ns())
         finally:
             wall_s = time.monotonic() - started_s
+            self._cpu.look(self._launcher.pids)
+            self._emulation.costs.take_processes(self._cpu.cpu_ns)
             await self._shut_down(completed)
             self._memory.write(folder, self._time_ns())
             self._refusals.write_totals()
@@ -274,6 +279,7 @@ class LiveSession:
             except VnetError as error:
                 query.reply_err(str(error))
 
-    def _look_at_memory(self, view: PeriodView) -> None:
+    def _look_at_processes(self, view: PeriodView) -> None:
+        self._cpu.look(self._launcher.pids)
         processes = {**self._launcher.pids, EMULATOR_PROCESS: os.getpid()}
         self._memory.look(view.instant.time_ns, processes)

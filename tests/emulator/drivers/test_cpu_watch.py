@@ -1,0 +1,35 @@
+"""CPU time of the processes of a live run."""
+
+import os
+import sys
+import time
+
+import pytest
+
+from emulator.drivers import cpu_watch
+from emulator.drivers.cpu_watch import CpuWatch, cpu_time_ns
+
+
+def test_a_process_that_is_started_again_adds_to_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks: dict[int, int | None] = {}
+    monkeypatch.setattr(cpu_watch, "cpu_time_ns", clocks.get)
+    watch = CpuWatch()
+    clocks |= {7: 100, 8: 1000}
+    watch.look({"v01": 7, "v02": 8})
+    clocks |= {7: 150, 8: 1001}
+    watch.look({"v01": 7, "v02": 8})
+    clocks |= {7: None, 9: 500}
+    watch.look({"v01": 7, "v02": 8})  # it has just been killed
+    watch.look({"v01": 9, "v02": 8})
+    clocks |= {9: 520}
+    watch.look({"v01": 9, "v02": 8})
+    assert watch.cpu_ns == {"v01": 50 + 20, "v02": 1}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the CPU time of another process")
+def test_the_clock_of_a_process_is_read() -> None:
+
+    before, seen, after = time.process_time_ns(), cpu_time_ns(os.getpid()), time.process_time_ns()
+    assert seen is not None
+    assert before <= seen <= after
+    assert cpu_time_ns(2**22 + 1) is None, "there is no such process"
