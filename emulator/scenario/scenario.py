@@ -83,7 +83,7 @@ class Network(Section):
     """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
     CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
     vehicles: int = Field(38, ge=1, le=10_000)
-    """Number of generated vehicles; their ids are v01, v02, …"""
+    """Number of generated vehicles; their ids are v01, v02, …, of 100 or more v001, v002, …"""
     layout: Literal["urban", "dense"] = "urban"
     """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
     size_m: float = Field(3000.0, ge=1000, le=10_000)

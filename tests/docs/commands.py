@@ -57,6 +57,8 @@ EXPENSIVE = ("quickstart.toml", "dense.toml", "faults.toml")
 """Scenarios that take many seconds: only parsed, but for short runs."""
 MOST_RUNS = 10
 """Campaigns of more are only parsed."""
+MOST_SEEDS = 5
+"""Sweeps of more are only parsed."""
 SHORT_S = 3.0
 _STATUS = re.compile(r"#.*\bstatus (\d+)\b")
 
@@ -103,6 +105,7 @@ def _expensive(arguments: list[str]) -> bool:
     given = dict(pairwise(arguments))
     short = float(given.get("--duration", "inf")) <= SHORT_S
     many = arguments[0] == "campaign" and int(given.get("--runs", "200")) > MOST_RUNS
+    many = many or (arguments[0] == "sweep" and int(given.get("--seeds", "1")) > MOST_SEEDS)
     slow = any(argument.endswith(EXPENSIVE) for argument in arguments)
     return (
         many

@@ -39,7 +39,7 @@ class Options(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Hazard(msgspec.Struct, array_like=True, tag="hazard", forbid_unknown_fields=True):
-    """What a frame holds: number and time of the warning, and the position of whoever sent this frame."""
+    """Content of a frame: number and time of the warning, and the position in m of the sender of this frame."""
 
     number: int
     since_ns: int
