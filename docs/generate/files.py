@@ -13,6 +13,7 @@ from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
 from emulator.records.metrics import METRICS, PeriodFigures
+from emulator.records.payloads import PAYLOADS
 from emulator.records.recorded_world import ARRAYS
 from emulator.records.reported import MOST_COLUMNS
 from emulator.records.states import STATES
@@ -33,6 +34,7 @@ FOLDER = {
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
+    "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
@@ -92,6 +94,12 @@ WORLD = {
     "lane_heading_rad": "its direction of travel, counter-clockwise from east",
     "lane_length_m": "its length; infinite for a lane that is a straight line through its point",
     "links": "with `radio.links` only: whether the row's vehicle hears the column's",
+}
+PAYLOAD = {
+    "time_ns": "when the program handed it to the radio",
+    "sender": "id of the vehicle",
+    "seq": "number of the frame, as in the trace",
+    "payload": "what the program sent; faults may let something else arrive",
 }
 BUSY = {
     "time_ns": "when the 100 ms began",
@@ -211,6 +219,7 @@ def page() -> str:
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))
     parts += ["## `scenario.toml`", SCENARIO, "## `world.npz`", WORLD_ABOUT, table(WORLD_COLUMNS, world_rows())]
     parts += ["## `states.parquet`", columns(STATES, STATE), STATES_ABOUT]
+    parts += ["## `payloads.parquet`", "No hash depends on it.", columns(PAYLOADS, PAYLOAD)]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += [
         "## `metrics.parquet`",

@@ -150,7 +150,7 @@ def _write(path: Path, recorded: OpenedRun, writer: Callable[[OpenedRun, BinaryI
         return writer(recorded, file)
 
 
-def _write_folder(path: Path, recorded: RecordedRun) -> list[str]:
+def _write_folder(path: Path, recorded: OpenedRun) -> list[str]:
     _refuse_existing(path)
     with atomically(path) as part:
         part.mkdir(parents=True)

@@ -61,6 +61,7 @@ COMMANDS = (
     Command(
         "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
     ),
+    Command("trace", Panel.LOOK, "trace", "trace", "Show who sent what to whom, and what became of it."),
     Command("view", Panel.LOOK, "viewing", "view", "Open a run's recording in Rerun, or serve it."),
     Command("play", Panel.LOOK, "playback", "play", "Play a finished run in Rerun."),
     Command("fault", Panel.BREAK, "fault", "app", "Inject faults into a run that is on, and heal them."),

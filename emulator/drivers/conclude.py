@@ -35,6 +35,7 @@ from emulator.records.run_folder import (
     BUSY_FILE,
     FORMAT,
     METRICS_FILE,
+    PAYLOADS_FILE,
     STATES_FILE,
     TRACE_FILE,
     VERDICT_FILE,
@@ -73,6 +74,8 @@ def conclude(
     for name, table in tables.items():
         if table is not None:
             folder.put_table(name, table)
+    if emulation.payloads is not None:
+        folder.put_table(PAYLOADS_FILE, emulation.payloads.to_table())
     folder.put(WORLD_FILE, world.write)
     recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
     judgement = judge(recorded, _own_findings(recorded, folder))

@@ -22,6 +22,7 @@ from emulator.radio.connectivity import connectivity_of, distances_m
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics, PeriodFigures
+from emulator.records.payloads import PayloadRecorder
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
 from emulator.scenario.scenario import Scenario
@@ -74,6 +75,9 @@ class Emulation:
         self.folder = folder
         self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
         self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
+        self.payloads = PayloadRecorder(world.node_ids) if scenario.run.keep_payloads else None
+        if self.payloads is not None:
+            self.engine.on_payload = self.payloads.add
         self._placed = 0  # the period in which vehicles are where the engine has them
         self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
         self.gnss = FaultyGnss(world, self.faults.faults, scenario.run.seed)

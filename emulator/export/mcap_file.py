@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 import json
 import math
+from base64 import b64encode
 from collections.abc import Iterator, Sequence
 from typing import Any, BinaryIO
 
@@ -61,6 +62,7 @@ _FRAME = _object(
     copy=INTEGER,
     size_bytes=INTEGER,
     payload_digest=TEXT,
+    payload={"type": "string", "contentEncoding": "base64"},
     cause=TEXT,
     outcomes={"type": "object", "additionalProperties": _list(TEXT)},
 )
@@ -104,7 +106,7 @@ def write_mcap(recorded: OpenedRun, file: BinaryIO) -> int:
     return count
 
 
-def _streams(recorded: RecordedRun) -> list[Iterator[Message]]:
+def _streams(recorded: OpenedRun) -> list[Iterator[Message]]:
     """Return the streams of messages, each in the order of time."""
     return [_periods(recorded), _metrics(recorded), _frames(recorded), _events(recorded)]
 
@@ -187,7 +189,7 @@ def _events(recorded: RecordedRun) -> Iterator[Message]:
         yield event.time_ns, "/events", {"kind": event.kind, "node": event.node or "", "details": event.details}
 
 
-def _frames(recorded: RecordedRun) -> Iterator[Message]:
+def _frames(recorded: OpenedRun) -> Iterator[Message]:
     order = np.lexsort((recorded.receiver, recorded.emission, recorded.sent_ns))
     edges = np.flatnonzero(np.diff(recorded.emission[order])) + 1
     outcomes = recorded.trace["outcome"].cast(pa.string()).to_pylist()
@@ -198,15 +200,19 @@ def _frames(recorded: RecordedRun) -> Iterator[Message]:
         for row in rows.tolist():
             by_outcome.setdefault(outcomes[row], []).append(recorded.node_ids[int(recorded.receiver[row])])
         first = int(rows[0])
+        sender, seq = recorded.node_ids[int(recorded.sender[first])], int(recorded.seq[first])
+        kept = recorded.payloads
+        payload = None if kept is None else kept.of(sender, seq, recorded.digest[rows].tolist())
         yield (
             int(recorded.sent_ns[first]),
             "/frames",
             {
-                "sender": recorded.node_ids[int(recorded.sender[first])],
-                "seq": int(recorded.seq[first]),
+                "sender": sender,
+                "seq": seq,
                 "copy": int(recorded.copy[first]),
                 "size_bytes": int(sizes[first]),
                 "payload_digest": f"{int(recorded.digest[first]):016x}",
+                **({} if payload is None else {"payload": b64encode(payload).decode()}),
                 "cause": causes[first],
                 "outcomes": by_outcome,
             },

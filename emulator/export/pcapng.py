@@ -3,9 +3,9 @@
 Each vehicle is an interface, with the frames that it sent (outbound, at the time they were enqueued or, with
 `[radio.mac]`, went on air) and those delivered to it (inbound, at their arrival). A packet consists of radiotap, a
 QoS data frame of 802.11 outside a BSS (as in 802.11p), LLC and SNAP with the ethertype 0x88B5 for local
-experiments, and the payload. A run does not keep payloads: they are truncated (captured length < length), and their
-digest is in the packet's comment. Frames without a node in range have no rows in the trace and are missing. Times
-are nanoseconds from the start of the run.
+experiments, and the payload. Payloads that the run has not kept, or that a fault has altered, are truncated
+(captured length < length); the digest is in the packet's comment. Frames without a node in range have no rows in
+the trace and are missing. Times are nanoseconds from the start of the run.
 
 Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with radiotap.
 """
@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_run import OpenedRun, RecordedRun
 
 LINKTYPE_RADIOTAP = 127
 """Link type of the interfaces: 802.11 with radiotap."""
@@ -53,7 +53,7 @@ class _Packet:
     row: int
 
 
-def write_pcapng(recorded: RecordedRun, file: BinaryIO) -> int:
+def write_pcapng(recorded: OpenedRun, file: BinaryIO) -> int:
     """Write a run's frames; return the number of packets."""
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
     for node in recorded.node_ids:
@@ -67,7 +67,11 @@ def write_pcapng(recorded: RecordedRun, file: BinaryIO) -> int:
     for packet in _packets(recorded):
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
         header = radiotap + _frame_header(sender, seq)
-        file.write(_packet_block(packet, header, size_bytes, comments.of(packet)))
+        kept = recorded.payloads
+        payload = None
+        if kept is not None:
+            payload = kept.of(recorded.node_ids[sender], seq, comments.digests(packet))
+        file.write(_packet_block(packet, header, payload or b"", size_bytes, comments.of(packet)))
         count += 1
     return count
 
@@ -116,9 +120,20 @@ class _Comments:
         text += f"; {self._cause[row]}" if self._cause[row] else ""
         return text if packet.direction == _INBOUND else f"{text}; {self._outcomes(int(recorded.emission[row]))}"
 
-    def _outcomes(self, emission: int) -> str:
+    def digests(self, packet: _Packet) -> list[int]:
+        """Return the digest of what a packet's receiver got or, if it is outbound, those of all receivers."""
+        rows = (
+            [packet.row] if packet.direction == _INBOUND else self._rows(int(self._recorded.emission[packet.row]))
+        )
+        digests: list[int] = self._recorded.digest[rows].tolist()
+        return digests
+
+    def _rows(self, emission: int) -> NDArray[np.intp]:
         first, end = np.searchsorted(self._emission, (emission, emission + 1))
-        outcomes, counts = np.unique(self._outcome[self._order[first:end]], return_counts=True)
+        return self._order[first:end]
+
+    def _outcomes(self, emission: int) -> str:
+        outcomes, counts = np.unique(self._outcome[self._rows(emission)], return_counts=True)
         return ", ".join(f"{outcome} {count}" for outcome, count in zip(outcomes, counts.tolist(), strict=True))
 
 
@@ -143,11 +158,12 @@ def _frame_header(sender: int, seq: int) -> bytes:
     return mac + b"\xaa\xaa\x03\x00\x00\x00" + struct.pack(">H", ETHERTYPE)
 
 
-def _packet_block(packet: _Packet, header: bytes, size_bytes: int, comment: str) -> bytes:
+def _packet_block(packet: _Packet, header: bytes, payload: bytes, size_bytes: int, comment: str) -> bytes:
+    captured = header + payload
     high, low = divmod(packet.time_ns, 1 << 32)
-    fixed = struct.pack("<IIIII", packet.interface, high, low, len(header), len(header) + size_bytes)
+    fixed = struct.pack("<IIIII", packet.interface, high, low, len(captured), len(header) + size_bytes)
     options = _option(_COMMENT, comment.encode()) + _option(_FLAGS, struct.pack("<I", packet.direction))
-    return _block(_PACKET, fixed + _padded(header) + options)
+    return _block(_PACKET, fixed + _padded(captured) + options)
 
 
 def _block(kind: int, body: bytes) -> bytes:

@@ -11,13 +11,13 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from emulator.records.radio_metrics import radio_metrics
-from emulator.records.recorded_run import RecordedRun
+from emulator.records.recorded_run import OpenedRun
 
 AXES = {2: ("x", "y"), 4: ("xx", "xy", "yx", "yy")}
 """Suffixes of the columns of a list by its length."""
 
 
-def write_csv(recorded: RecordedRun, folder: Path) -> list[str]:
+def write_csv(recorded: OpenedRun, folder: Path) -> list[str]:
     """Write all tables into a folder; return the files' names. Raise OSError if one cannot be written."""
     events = [
         {"time_ns": e.time_ns, "kind": e.kind, "node": e.node, "details": json.dumps(e.details)}
@@ -35,6 +35,10 @@ def write_csv(recorded: RecordedRun, folder: Path) -> list[str]:
     }
     if recorded.busy is not None:
         tables["busy"] = recorded.busy
+    if recorded.payloads is not None:
+        kept = recorded.payloads.table
+        payloads = pa.array([payload.hex() for payload in kept["payload"].to_pylist()], pa.string())
+        tables["payloads"] = kept.set_column(kept.column_names.index("payload"), "payload_hex", payloads)
     for name, table in tables.items():
         pacsv.write_csv(flat(table), folder / f"{name}.csv")
     return [f"{name}.csv" for name in tables]

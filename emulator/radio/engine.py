@@ -11,9 +11,8 @@ after it has been sent, over all frames at once that have been sent since the la
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -43,7 +42,7 @@ from emulator.radio.stages import (
     sender_side,
 )
 from emulator.radio.topology import Topology
-from emulator.radio.trace import Trace
+from emulator.radio.trace import Trace, payload_digest
 from emulator.scenario.scenario import Radio
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
@@ -95,6 +94,8 @@ class Engine:
         self._next_seq = [0] * len(node_ids)
         self._copies: Counter[tuple[int, int]] = Counter()
         self._in_flight = InFlight(len(node_ids))
+        self.on_payload: Callable[[int, int, int, bytes], None] | None = None
+        """Called with time in ns, node, number and payload of each frame that a program sends."""
 
     @property
     def trace(self) -> Trace:
@@ -142,6 +143,8 @@ class Engine:
         for payload in payloads:
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
+            if self.on_payload is not None:
+                self.on_payload(time_ns, node, seq, payload)
             if not self._senders.misbehave:
                 self._enqueue(time_ns, node, Outgoing(payload, seq))
                 continue
@@ -218,7 +221,7 @@ class Engine:
         then those of the second, and so on.
         """
         columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
-        digests = np.array([_digest(frame.payload) for frame in frames], np.uint64)
+        digests = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
         first = self._trace.append(
             {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns
         )
@@ -226,7 +229,7 @@ class Engine:
         for number, frame in enumerate(frames):
             for node, payload in frame.altered.items():
                 for row in np.flatnonzero((frame_index == number) & (receiver == node)).tolist():
-                    self._trace.alter(first + row, _digest(payload))
+                    self._trace.alter(first + row, payload_digest(payload))
         for kind, number in enumerate(np.bincount(outcome).tolist()):
             if number:
                 self._counts[Outcome(kind)] += number
@@ -312,10 +315,6 @@ class Engine:
         self._mac.run(None)
         self._settle()
         self._arrive(NO_ARRIVAL_NS - 1)
-
-
-def _digest(payload: bytes) -> int:
-    return int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little")
 
 
 def _flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:

@@ -253,3 +253,8 @@ def _canonical_codes(array: pa.Array) -> tuple[NDArray[np.int32], list[str]]:
     for number in used:
         code[number] = names.index(values[number])
     return code[indices], names
+
+
+def payload_digest(payload: bytes) -> int:
+    """Return the digest of a payload: BLAKE2b of 8 bytes, little-endian."""
+    return int.from_bytes(hashlib.blake2b(payload, digest_size=8).digest(), "little")

@@ -21,6 +21,7 @@ import pyarrow.parquet as pq
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
 from emulator.records.metrics import METRICS, PeriodFigures
+from emulator.records.payloads import PAYLOADS, KeptPayloads
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
@@ -28,6 +29,7 @@ from emulator.records.run_folder import (
     EVENTS_FILE,
     FORMAT,
     METRICS_FILE,
+    PAYLOADS_FILE,
     SCENARIO_FILE,
     STATES_FILE,
     TRACE_FILE,
@@ -54,6 +56,7 @@ TABLES: dict[str, pa.Schema] = {
     TRACE_FILE: Trace(["v01"], knows_air=True).to_table().schema,
     STATES_FILE: STATES,
     METRICS_FILE: METRICS,
+    PAYLOADS_FILE: PAYLOADS,
     BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
 }
 """The tables, with the columns that they must have."""
@@ -147,6 +150,13 @@ class RunFiles:
     def busy(self) -> pa.Table | None:
         """A row for each vehicle and 100 ms; None where there is no MAC."""
         return None if self.scenario.radio.mac is None else self._table(BUSY_FILE)
+
+    @cached_property
+    def payloads(self) -> KeptPayloads | None:
+        """Payloads of frames; None where the run has kept none."""
+        if not (self.folder / PAYLOADS_FILE).is_file():
+            return None
+        return KeptPayloads(self._table(PAYLOADS_FILE))
 
     # Tables a piece at a time.
 

@@ -68,6 +68,8 @@ class Run(Section):
     """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
     files_max_mb: float = Field(10.0, ge=0, le=1_000_000)
     """Megabytes of a vehicle's files (`node.folder`) that are kept in the run's folder, and 1000 files at most."""
+    keep_payloads: bool = False
+    """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
 
 
 OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]

@@ -19,7 +19,7 @@ import emulator.cli.commands
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map")
+HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map", "trace")
 """Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
 APART = ("campaign", "sweep")
 """Commands of vnet that are run in a process of their own, as they start some themselves."""

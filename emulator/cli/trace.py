@@ -1,0 +1,112 @@
+"""`vnet trace`: the frames of a run, their contents, and what became of them at each receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from emulator.cli.options import LATEST, RunArgument
+from emulator.records.frame_log import FrameEntry, frame_log
+from emulator.records.recorded_run import RecordedRun
+from emulator.terminal.console import one_line_errors
+from vnet.errors import VnetError, did_you_mean, printable, shown
+from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import error_line
+from vnet.units import NS_PER_S
+
+COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
+LONGEST_CONTENT = 200
+"""Characters of a content that are shown."""
+MOST_BYTES = 32
+"""Bytes of a payload that are shown where nothing decodes it."""
+
+
+def trace(
+    run: RunArgument = LATEST,
+    node: Annotated[str | None, typer.Option(metavar="ID", help="Only what it sent or could hear.")] = None,
+    start: Annotated[float, typer.Option("--from", min=0.0, help="Emulated second to begin at.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", help="Emulated second to stop before.")] = None,
+    decode: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODULE:FUNCTION", help="Show what this function returns for each payload (run.keep_payloads)."
+        ),
+    ] = None,
+) -> None:
+    """Show who sent what to whom, and what became of it; on a terminal as a table, else separated by tabs."""
+    with one_line_errors():
+        if end is not None and not end > start:
+            raise VnetError(f"--to {end:g}: must come after --from {start:g}")
+        recorded = RecordedRun.open(run)
+        if node is not None and node not in recorded.number:
+            raise VnetError(f"--node {node}: no such vehicle{did_you_mean(node, recorded.node_ids)}")
+        if decode is not None and recorded.payloads is None:
+            raise VnetError(f"--decode {decode}: {run} has kept no payloads; set run.keep_payloads = true")
+        content = _raw if decode is None else _decoded_by(_load(decode))
+        end_ns = None if end is None else round(end * NS_PER_S)
+        rows = (_row(entry, content) for entry in frame_log(recorded, node, round(start * NS_PER_S), end_ns))
+        console = Console()
+        if not console.is_terminal:
+            print("\t".join(COLUMNS))
+            for row in rows:
+                print("\t".join(row))
+            return
+        table = Table(*COLUMNS, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for row in rows:
+            table.add_row(*map(Text, row))
+        console.print(table)
+
+
+def _row(entry: FrameEntry, content: Callable[[FrameEntry], str]) -> list[str]:
+    number = f"{entry.seq}.{entry.copy}" if entry.copy else str(entry.seq)
+    said = printable(content(entry), LONGEST_CONTENT)
+    heard = "; ".join(f"{outcome} {', '.join(nodes)}" for outcome, nodes in entry.outcomes.items())
+    return [f"{entry.sent_ns / NS_PER_S:.6f}", entry.sender, number, str(entry.size_bytes), said, heard]
+
+
+def _raw(entry: FrameEntry) -> str:
+    """The payload as text or, where it is none, its first bytes; without it, its digest."""
+    if entry.payload is None:
+        return f"digest {entry.digest:016x}"
+    try:
+        text = entry.payload.decode()
+    except UnicodeDecodeError:
+        text = ""
+    if text.isprintable() and text:
+        return text
+    return entry.payload[:MOST_BYTES].hex() + ("…" if len(entry.payload) > MOST_BYTES else "")
+
+
+def _decoded_by(function: Callable[[bytes], Any]) -> Callable[[FrameEntry], str]:
+    def content(entry: FrameEntry) -> str:
+        if entry.payload is None:
+            return _raw(entry)
+        try:
+            return str(function(entry.payload))
+        except Exception as error:  # whatever the user's function cannot make sense of
+            return f"{_raw(entry)} ({error_line(error)})"
+
+    return content
+
+
+def _load(entry: str) -> Callable[[bytes], Any]:
+    """Import a function. Raises VnetError for what is none."""
+    module, _, name = entry.partition(":")
+    if not module or not name:
+        raise VnetError(f"--decode {shown(entry)}: write it as package.module:function")
+    search_programs_in((Path.cwd(),))
+    try:
+        function = getattr(import_module(module), name)
+    except (Exception, SystemExit) as error:
+        raise VnetError(f"--decode {entry}: cannot import: {error_line(error)}") from None
+    if not callable(function):
+        raise VnetError(f"--decode {entry}: is not a function of a payload: def {name}(payload)")
+    return function  # type: ignore[no-any-return]
