@@ -13,6 +13,7 @@ from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, Recor
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.faults import StaleMessages
+from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -50,8 +51,9 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     return result(
         name,
         total,
-        f"{len(frames):,} frames, {len(recorded.trace):,} receptions in range, each with one outcome",
-        f"{total} frames or receptions without exactly one outcome",
+        f"{counted(len(frames), 'frame')}, {counted(len(recorded.trace), 'reception')} in range, "
+        "each with one outcome",
+        f"{counted(total, 'frame or reception', 'frames or receptions')} without exactly one outcome",
         recorded.rows(offending),
         frames=len(frames),
         pairs=len(recorded.trace),
@@ -136,8 +138,8 @@ def check_range(recorded: RecordedRun) -> Finding:
         return nothing_seen(name, recorded, "nothing was delivered")
     beyond = delivered & recorded.placed & ~recorded.in_range
     broken, count = int(beyond.sum()), int(delivered.sum())
-    text = f"all {count:,} deliveries within range"
-    broken_text = f"{broken} deliveries beyond range"
+    text = f"all {counted(count, 'delivery', 'deliveries')} within range"
+    broken_text = f"{counted(broken, 'delivery', 'deliveries')} beyond range"
     return result(name, broken, text, broken_text, recorded.rows(beyond), delivered=count, beyond=broken)
 
 
@@ -157,9 +159,14 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
     if not broken and not capped.any():
         text = f"the cap of {cap} never acted, though up to {largest} are in range: those beyond it sent nothing"
         return unknown(name, text, **figures)
-    text = f"{int(capped.sum()):,} receptions beyond the nearest {cap} (up to {largest} in range)"
+    text = f"{counted(int(capped.sum()), 'reception')} beyond the nearest {cap} (up to {largest} in range)"
     return result(
-        name, broken, text, f"{broken} receptions on the wrong side of the cap", recorded.rows(wrong), **figures
+        name,
+        broken,
+        text,
+        f"{counted(broken, 'reception')} on the wrong side of the cap",
+        recorded.rows(wrong),
+        **figures,
     )
 
 
@@ -203,7 +210,7 @@ def check_loss_rate(recorded: RecordedRun) -> Finding:
         return nothing_seen(name, recorded, "no reception came as far as the loss")
     low, high = binomial_band(drawn, loss, LOSS_BAND)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": loss, "low": low, "high": high}
-    text = f"{lost:,} of {drawn:,} receptions lost, {lost / drawn:.2%}; {loss:.2%} expected"
+    text = f"{lost:,} of {counted(drawn, 'reception')} lost, {lost / drawn:.2%}; {loss:.2%} expected"
     wrong_way = recorded.outcome_is("lost") if lost > high else drawing & ~recorded.outcome_is("lost")
     outside = not low <= lost <= high
     rows = recorded.rows(wrong_way) if outside else []
@@ -238,9 +245,10 @@ def check_isolation(recorded: RecordedRun) -> Finding:
     claims = _claims_beyond(recorded)
     broken = int(foreign.sum()) + len(claims)
     reporting = int(np.isfinite(recorded.value("heard")).any(axis=0).sum())
-    text = f"{arrived:,} arrivals as they were sent"
+    text = f"{counted(arrived, 'arrival')} as they were sent"
     text += f"; {reporting} programs report no more received packets than that" if reporting else ""
-    broken_text = f"{int(foreign.sum())} arrivals that were never sent, {len(claims)} reports of more than arrived"
+    unsent, overstated = counted(int(foreign.sum()), "arrival"), counted(len(claims), "report")
+    broken_text = f"{unsent} of what was never sent, {overstated} of more than arrived"
     figures = {"arrivals": arrived, "foreign": int(foreign.sum()), "claims": len(claims), "refused": refused}
     return result(name, broken, text, broken_text, recorded.rows(foreign) + claims, **figures)
 

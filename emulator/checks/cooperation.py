@@ -12,6 +12,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
 from emulator.world.graph import weak_components
+from vnet.counted import counted
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
@@ -68,8 +69,10 @@ def check_consensus_mean(recorded: RecordedRun) -> Finding:
         for node in np.flatnonzero(off_m > MEAN_TOLERANCE_M).tolist()
     ]
     figures = {"vehicles": judged, "worst_m": worst_m, "tolerance_m": MEAN_TOLERANCE_M}
-    text = f"{judged} vehicles' means within {worst_m:.2f} m of their component's"
-    broken_text = f"{len(off)} of {judged} vehicles' means are over {MEAN_TOLERANCE_M:g} m off their component's"
+    text = f"means of {counted(judged, 'vehicle')} within {worst_m:.2f} m of their component's"
+    broken_text = (
+        f"means of {len(off)} of {counted(judged, 'vehicle')} over {MEAN_TOLERANCE_M:g} m off their component's"
+    )
     if off and rested_s < WITHIN_S:
         return unknown(name, f"{broken_text}, {rested_s:.1f} s at rest; {WITHIN_S:g} s are allowed", **figures)
     return result(name, len(off), text, broken_text, off, **figures)
@@ -175,7 +178,9 @@ def check_bounded_error(recorded: RecordedRun) -> Finding:
     ]
     worst = float(error_m[judged].max(initial=0))
     text = f"no common error over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s; {worst:.1f} m at most"
-    broken_text = f"{len(rows)} vehicles' common error was over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s"
+    broken_text = (
+        f"{counted(len(rows), 'vehicle')} with a common error over {DIVERGENT_M:g} m for {DIVERGENT_S:g} s"
+    )
     return result(name, len(rows), text, broken_text, rows, worst_m=worst, lost=len(rows))
 
 

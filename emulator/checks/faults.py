@@ -15,6 +15,7 @@ from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, Recorded
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import Fault, LossFault, ProcessFault, SenderFault
 from emulator.scenario.faults import BurstLoss, Corrupt, Duplicate, GnssOutage, StaleMessages
+from vnet.counted import counted
 from vnet.types import Array, Mask
 
 RATE_BAND = 1 - 1e-6
@@ -54,8 +55,8 @@ def check_causes(recorded: RecordedRun) -> Finding:
         broken = ~explained | (recorded.outcome_is("fault") & (recorded.cause == NO_FAULT))
         broken |= recorded.cause == UNHEARD_OF
     count, named = int(broken.sum()), int((recorded.cause != NO_FAULT).sum())
-    text = f"{named:,} receptions name a fault that acted on them"
-    broken_text = f"{count} receptions name no fault that acted on them"
+    text = f"{counted(named, 'reception')} with the fault that acted on them"
+    broken_text = f"{counted(count, 'reception')} without a fault that acted on them"
     return result(name, count, text, broken_text, recorded.rows(broken), named=named, wrong=count)
 
 
@@ -103,8 +104,8 @@ def check_partition_respected(recorded: RecordedRun) -> Finding:
         return unknown(name, "no frame was sent across a cut")
     passed = across & recorded.outcome_is(*ON_AIR)
     count = int(passed.sum())
-    text = f"{int(across.sum()):,} receptions across a cut, and none passed"
-    broken_text = f"{count} of {int(across.sum()):,} receptions passed a cut"
+    text = f"{counted(int(across.sum()), 'reception')} across a cut, and none passed"
+    broken_text = f"{count} of {counted(int(across.sum()), 'reception')} passed a cut"
     return result(name, count, text, broken_text, recorded.rows(passed), across=int(across.sum()), passed=count)
 
 
@@ -126,12 +127,13 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
     reports = _reports_within(recorded, spans)
     wrong = speaking | hearing | missing
     broken = int(wrong.sum()) + len(reports)
+    down = {span.node for span in recorded.down}
     figures = {"spoke": int(speaking.sum()), "heard": int(hearing.sum()), "missed": int(missing.sum())}
     return result(
         name,
         broken,
-        f"{len({span.node for span in recorded.down})} nodes were down, and neither sent nor received",
-        f"{broken} frames, arrivals or reports contradict the nodes' being up or down",
+        f"{counted(len(down), 'node was', 'nodes were')} down, and neither sent nor received",
+        f"{counted(broken, 'frame, arrival or report', 'frames, arrivals or reports')} of nodes that were down",
         recorded.rows(wrong) + reports,
         **figures,
         reports=len(reports),
@@ -152,8 +154,9 @@ def check_pause_respected(recorded: RecordedRun) -> Finding:
         spans += [(node, planned.start_ns, planned.end_ns) for node in np.flatnonzero(planned.nodes).tolist()]
     reports = _reports_within(recorded, spans)
     broken = int(speaking.sum()) + len(reports)
-    broken_text = f"{int(speaking.sum())} frames and {len(reports)} reports of paused nodes"
-    text = f"{len({span[0] for span in spans})} nodes were paused, and sent and reported nothing"
+    broken_text = f"{counted(int(speaking.sum()), 'frame')} and {counted(len(reports), 'report')} of paused nodes"
+    paused = {span[0] for span in spans}
+    text = f"{counted(len(paused), 'node was', 'nodes were')} paused, and sent and reported nothing"
     rows = recorded.rows(speaking) + reports
     return result(name, broken, text, broken_text, rows, spoke=int(speaking.sum()), reports=len(reports))
 
@@ -190,8 +193,15 @@ def check_outage_respected(recorded: RecordedRun) -> Finding:
         for p, n in zip(period.tolist()[:MOST_ROWS], node.tolist(), strict=False)
     ]
     count = len(period)
-    text = f"{int(due.sum())} fixes withheld, and no others"
-    return result(name, count, text, f"{count} fixes given in an outage, or withheld without", rows, wrong=count)
+    text = f"{counted(int(due.sum()), 'fix', 'fixes')} withheld, and no others"
+    return result(
+        name,
+        count,
+        text,
+        f"{counted(count, 'fix', 'fixes')} given in an outage, or withheld without",
+        rows,
+        wrong=count,
+    )
 
 
 def check_fault_loss(recorded: RecordedRun) -> Iterator[Finding]:
@@ -209,7 +219,7 @@ def _loss_of(recorded: RecordedRun, planned: PlannedFault) -> Finding:
         return unknown(name, "no reception came as far as this fault", pairs=0)
     expected, low, high = loss_band(planned.fault, recorded, planned, drawing)
     figures = {"lost": lost, "pairs": drawn, "rate": lost / drawn, "expected": expected, "low": low, "high": high}
-    text = f"{lost:,} of {drawn:,} receptions lost, {lost / drawn:.2%}; {expected:.2%} expected"
+    text = f"{lost:,} of {counted(drawn, 'reception')} lost, {lost / drawn:.2%}; {expected:.2%} expected"
     outside = not low <= lost <= high
     rows = recorded.rows(drawing & (hit if lost > high else ~hit)) if outside else []
     return result(name, int(outside), text, f"{text}: outside its band", rows, **figures)

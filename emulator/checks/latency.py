@@ -14,6 +14,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
 from emulator.scenario.fault_families import DelayFault
 from emulator.scenario.faults import Duplicate, Throttle
+from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_MS
 
@@ -170,7 +171,7 @@ def check_latency(recorded: RecordedRun) -> Finding:
     mean = _mean_latency(recorded, allowed, timed)
     figures |= mean
     off = bool(mean) and abs(mean["mean_ms"] - mean["expected_ms"]) > mean["band_ms"]
-    text = f"{int(timed.sum()):,} arrivals within their bounds"
+    text = f"{counted(int(timed.sum()), 'arrival')} within their bounds"
     if mean:
         text += f"; mean {mean['mean_ms']:.3f} ms without queueing, {mean['expected_ms']:.3f} ms expected"
     broken_text = (

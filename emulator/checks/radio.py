@@ -22,6 +22,7 @@ from emulator.records.verdicts import Finding, NotExercised, result
 from emulator.scenario.faults import Throttle
 from emulator.scenario.radio import EtsiReactive, Limeric, Receiver
 from emulator.scenario.scenario import Radio
+from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 
 SIGMAS = 4.9
@@ -51,14 +52,14 @@ def check_fading(recorded: RecordedRun) -> Finding:
     away = SIGMAS * sqrt(float((survives * (1 - survives)).sum())) + (log(1e6) / 3 if expected > 0 else 0)
     broken = not expected - away <= seen <= expected + away
     share, law = seen / len(drawing), expected / len(drawing)
-    text = f"{seen:,} of {len(drawing):,} receptions faded, {share:.2%}; {law:.2%} expected"
+    text = f"{seen:,} of {counted(len(drawing), 'reception')} faded, {share:.2%}; {law:.2%} expected"
     figures: dict[str, Any] = {"faded": seen, "pairs": len(drawing), "rate": share, "expected": law}
     unlike, figures["links"] = _unlike_their_law(recorded, drawing, survives, faded)
     broken_text = f"{text}: outside its band" if broken else f"{text}, but not on the links on which they should"
     rows = drawing[faded == (seen > expected)]
     if radio.fading is None and (impossible := np.where(faded, survives >= 1, survives <= 0)).any():
         rows, unlike = drawing[impossible], True
-        broken_text = f"{len(rows)} receptions have an impossible outcome"
+        broken_text = f"{counted(len(rows), 'reception')} with an impossible outcome"
         figures["impossible"] = len(rows)
     return result(name, broken + unlike, text, broken_text, recorded.rows(rows), **figures)
 
@@ -191,7 +192,8 @@ def check_medium(recorded: RecordedRun) -> Finding:
     counts["too_idle"] = _too_idle(air)
     total = sum(counts.values())
     collided = int(recorded.outcome_is("collided").sum())
-    text = f"{len(air.rows):,} transmissions by the rules of the MAC, {collided:,} receptions collided"
+    sent = counted(len(air.rows), "transmission")
+    text = f"{sent} by the rules of the MAC, {counted(collided, 'reception')} collided"
     broken_text = ", ".join(f"{count} {what}" for what, count in counts.items() if count)
     rows = recorded.rows(np.concatenate(list(broken.values())))
     return result(name, total, text, broken_text, rows, transmissions=len(air.rows), collided=collided, **counts)

@@ -12,6 +12,7 @@ from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import ProcessFault
+from vnet.counted import counted
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
@@ -30,7 +31,10 @@ def check_transport(recorded: RecordedRun) -> Finding:
     lost = recorded.outcome_is("transport")
     if gaps or lost.any():
         count = int(lost.sum())
-        text = f"{gaps} gaps in sequence numbers, {count} deliveries that never arrived: the machine, not the radio"
+        missing = counted(count, "delivery", "deliveries")
+        text = (
+            f"{counted(gaps, 'gap')} in sequence numbers, {missing} that never arrived: the machine, not the radio"
+        )
         return unknown(name, text, gaps=gaps, lost=count)
     return CheckResult(name, Verdict.VALID, "no message between agents and emulator went missing", {"gaps": 0})
 
@@ -42,7 +46,7 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
     if not gone and not recorded.event("started"):
         return unknown(name, "no event says that the run started")
     if not gone:
-        who = f"all {len(recorded.node_ids)} nodes" if recorded.node_ids else "all nodes"
+        who = f"all {counted(len(recorded.node_ids), 'node')}" if recorded.node_ids else "all nodes"
         return CheckResult(name, Verdict.VALID, f"{who} to the end")
     listed = [{"node": e.node, "time_ns": e.time_ns, "kind": e.kind, **e.details} for e in gone]
     return CheckResult(name, Verdict.INVALID, in_words(kinds_of(gone)), {"gone": listed})
@@ -101,7 +105,7 @@ def check_progress(recorded: RecordedRun) -> Finding:
         return unknown(name, "no event says that the run ended")
     due = recorded.scenario.duration_ns // recorded.scenario.period_ns
     if len(recorded.metrics) != due or len(recorded.states) != due * len(recorded.node_ids):
-        text = f"{len(recorded.metrics)} periods kept, {due} due"
+        text = f"{counted(len(recorded.metrics), 'period')} kept, {due} due"
         return unknown(name, text, periods=len(recorded.metrics), due=due)
     return CheckResult(name, Verdict.VALID, f"{recorded.scenario.run.duration_s:g} s emulated to the end")
 
@@ -116,9 +120,9 @@ def check_finite(recorded: RecordedRun) -> Finding:
         return NotExercised(name, "the program reports nothing")
     not_finite = recorded.metrics["not_finite"].to_numpy()
     broken = int(np.sum(not_finite))
-    text = f"{reporting:,} reports, all numbers finite"
+    text = f"{counted(reporting, 'report')}, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
-    broken_text = f"{broken} reports with NaN or infinity"
+    broken_text = f"{counted(broken, 'report')} with NaN or infinity"
     return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
 
 
@@ -132,7 +136,8 @@ def check_kept_up(recorded: RecordedRun) -> Finding:
         return unknown(name, "no delivery was timed")
     figures = late[-1].details
     share = figures["count"] / figures["total"]
-    text = f"{share:.3%} of {figures['total']:,} deliveries over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
+    deliveries = counted(figures["total"], "delivery", "deliveries")
+    text = f"{share:.3%} of {deliveries} over 20 ms late (p99 {figures['p99_ms']:.1f} ms)"
     return CheckResult(name, Verdict.VALID if share <= LATE_SHARE_LIMIT else Verdict.UNKNOWN, text, figures)
 
 
@@ -163,10 +168,10 @@ def check_liveness(recorded: RecordedRun) -> Finding:
                 silent.append({"node": recorded.node_ids[node], "last_period": before, "next_period": after})
                 break
     count = int(judged.sum())
-    text = f"{count} nodes reported at least once a second after the last fault"
+    text = f"{counted(count, 'node')} reported at least once a second after the last fault"
     if not recorded.plan:
-        text = f"{count} nodes reported at least once a second"
-    broken_text = f"{len(silent)} of {count} nodes were silent for over a second, {_where(silent)}"
+        text = f"{counted(count, 'node')} reported at least once a second"
+    broken_text = f"{len(silent)} of {counted(count, 'node')} silent for over a second, {_where(silent)}"
     return result(name, len(silent), text, broken_text, silent, nodes=count, silent=len(silent))
 
 
@@ -219,7 +224,9 @@ def check_presence(recorded: RecordedRun) -> Finding:
     rows += [{"what": what, "node": node, "time_ns": t, "event": "out of place"} for what, node, t in sorted(odd)]
     entered = sum(kind == "entered" for kind, _, _ in changes)
     text = f"vehicles entered ({entered}) and left ({len(changes) - entered}) as their trips do"
-    return result(name, len(rows), text, f"{len(rows)} events do not fit the trips", rows, changes=len(changes))
+    return result(
+        name, len(rows), text, f"{counted(len(rows), 'event')} against the trips", rows, changes=len(changes)
+    )
 
 
 Change = tuple[str, str, int]
@@ -286,6 +293,7 @@ def check_memory(recorded: RecordedRun) -> Finding:
             growing.append({"node": event.node, "before_kb": before_kb, "after_kb": after_kb})
     if not judged:
         return NotExercised(name, f"no process was measured for {MEMORY_SPAN_S:g} s")
-    text = f"{judged} processes, growing by {most:.1f} kB a second at most"
-    broken_text = f"{len(growing)} of {judged} processes grow: {growing[0]['node'] if growing else ''}"
+    text = f"{counted(judged, 'process', 'processes')}, growing by {most:.1f} kB a second at most"
+    first = growing[0]["node"] if growing else ""
+    broken_text = f"{len(growing)} of {counted(judged, 'process', 'processes')} with growing memory: {first}"
     return result(name, len(growing), text, broken_text, growing, processes=judged, most_kb_per_s=most)

@@ -14,6 +14,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
 from emulator.scenario.faults import DataReplay, DoS, Sybil
+from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
@@ -34,16 +35,18 @@ def check_copies(recorded: RecordedRun) -> Finding:
     frame_ns = dict(_of(recorded, originals))
     at_once = np.array([frame_ns.get(f) == t for f, t in _of(recorded, copies)], dtype=bool)
     again, often = np.unique(recorded.frame[copies[at_once]], return_counts=True)
-    counted = np.zeros(len(originals), dtype=np.int64)
+    times_sent = np.zeros(len(originals), dtype=np.int64)
     order = np.argsort(recorded.frame[originals])
     index = np.searchsorted(recorded.frame[originals][order], again)
-    counted[order[index]] = often
-    wrong = originals[counted != _due(recorded, originals)]
+    times_sent[order[index]] = often
+    wrong = originals[times_sent != _due(recorded, originals)]
     # Replayed frames may have been sent near a change.
     odd = _replayed_wrongly(recorded, copies[~at_once], _first_rows(recorded, once & (recorded.copy == 0)))
     broken = len(wrong) + len(odd)
-    text = f"{len(copies):,} frames sent again, as often and as late as configured"
-    broken_text = f"{len(wrong)} frames not sent as often as configured, {len(odd)} replayed at another time"
+    text = f"{counted(len(copies), 'frame')} sent again, as often and as late as configured"
+    broken_text = (
+        f"{counted(len(wrong), 'frame')} not sent as often as configured, {len(odd)} replayed at another time"
+    )
     rows = recorded.rows(np.concatenate([wrong, np.array(odd, dtype=np.intp)])) if broken else []
     return result(name, broken, text, broken_text, rows, copies=len(copies), miscounted=len(wrong), odd=len(odd))
 
@@ -127,7 +130,7 @@ def check_gnss(recorded: RecordedRun) -> Finding:
         return unknown(name, "no fix is free of faults with random effect")
     rows = [_described(label, error) for label, error in judged.items() if not is_noise(error, sigma_m)]
     fixes = sum(map(len, judged.values()))
-    text = f"{fixes:,} fixes have the noise of {sigma_m:g} m"
+    text = f"{counted(fixes, 'fix', 'fixes')} with the noise of {sigma_m:g} m"
     broken_text = f"fixes do not have the receiver's noise: {', '.join(row['under'] for row in rows)}"
     return result(name, len(rows), text, broken_text, rows, fixes=fixes)
 

@@ -242,7 +242,7 @@ def test_a_delivery_to_someone_out_of_range_breaks_range_and_conservation(line: 
         "range": Verdict.INVALID,
     }
     assert figures(found["range"]) == {"delivered": int(line.outcome_is("delivered").sum()), "beyond": 1}
-    assert found["range"].text == "1 deliveries beyond range"
+    assert found["range"].text == "1 delivery beyond range"
     assert found["conservation"].figures["not_in_range"] == 1
 
 
