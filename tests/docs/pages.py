@@ -8,6 +8,7 @@
 - `sh`: each command is run, or parsed (`tests.docs.commands`); its comment may say `status 1`.
 - `text`: right after a block that was run, an excerpt of what that printed, in which `…` stands for anything, and
   alone in its line for any lines; gaps may be of any width. `text figure` is a figure.
+- `{eval-rst}`: what its directives show exists.
 - `json`, `yaml`: parsed; of a GitHub workflow also its structure and its commands.
 """
 
@@ -15,6 +16,7 @@ import contextlib
 import csv
 import io
 import json
+import pkgutil
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -50,6 +52,7 @@ class Page:
             "text": self._text,
             "json": self._json,
             "yaml": self._yaml,
+            "{eval-rst}": self._directives,
         }
         for name in ("scenarios", "docs"):
             (folder / name).symlink_to(ROOT / name)
@@ -102,6 +105,17 @@ class Page:
             raise DocsError(f"{name} was written at {pending[name]}, and never run")
         (self._folder / name).write_text(block.text)
         pending[name] = block.place
+
+    def _directives(self, block: Block) -> None:
+        """What the site shows from docstrings exists."""
+        names = re.findall(r"^\.\. auto\w+:: ([\w.]+)$", block.text, re.MULTILINE)
+        if not names:
+            raise DocsError("no directive that shows a docstring")
+        for name in names:
+            try:
+                pkgutil.resolve_name(name)
+            except (ImportError, AttributeError) as error:
+                raise DocsError(f"{name}: {error}") from None
 
     def _toml(self, block: Block) -> None:
         found = _FILE.match(block.text)

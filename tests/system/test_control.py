@@ -37,7 +37,7 @@ def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Pat
     folder = tmp_path / "run"
     with long_run(folder) as process:
         assert [(folder / name).stat().st_mode & 0o077 for name in (CONTROL_FILE, OPERATOR_FILE)] == [0, 0]
-        told = command("fault", "inject", "kill", "--for", "2", "--set", "nodes.random=1", "--run", str(folder))
+        told = command("fault", "inject", "kill", "--for", "2", "--set", "nodes.count=1", "--run", str(folder))
         assert told.returncode == 0, told.stderr
         assert "kill-0" in told.stdout
         assert ask(folder, "inject", LOSS)["fault"] == "loss-1"
