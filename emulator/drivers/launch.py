@@ -1,9 +1,9 @@
 """Starting agent processes, watching them, and ending every one of them.
 
-Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator), a
-fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents are forked from a
-zygote, or are interpreters of their own. They stay in the emulator's session: Linux shares processors out between
-sessions first (autogroups, sched(7), where no CPU cgroup does), whatever their niceness.
+Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator) that
+ends with it, a fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents are
+forked from a zygote, or are interpreters of their own. They stay in the emulator's session: Linux shares processors
+out between sessions first (autogroups, sched(7), where no CPU cgroup does), whatever their niceness.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from emulator.drivers.process_group import GroupProcess
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
 from vnet.errors import VnetError
 from vnet.runtime import forking
@@ -161,7 +162,7 @@ class Launcher:
         try:
             inherit = nullcontext() if name in self._services else default_time_slice()
             with (self.logs / f"{name}.log").open("ab") as log, inherit:
-                self._processes[name] = subprocess.Popen(
+                self._processes[name] = GroupProcess(
                     command,
                     stdin=subprocess.DEVNULL,
                     stdout=log,

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol
 
+from emulator.drivers.process_group import has_ended, rest_of_group_ended, wait_until_ended
 from vnet.errors import VnetError
 from vnet.runtime import forking
 from vnet.runtime.environment import ONE_BLAS_THREAD
@@ -66,7 +67,7 @@ class Process(Protocol):
 
 
 class ForkedProcess:
-    """A process that was forked from the zygote, and whose parent is this process."""
+    """A process that was forked from the zygote, and whose parent is this process; its group ends with it."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -74,23 +75,16 @@ class ForkedProcess:
 
     def poll(self) -> int | None:
         """Return the exit status (minus the signal's number), or None while it runs."""
-        if self._status is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            if pid:
-                self._status = os.waitstatus_to_exitcode(status)
+        if self._status is None and has_ended(self.pid):
+            with rest_of_group_ended(self.pid):
+                self._status = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
         return self._status
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end, at most so many seconds. Raises subprocess.TimeoutExpired."""
         status = self.poll()
         if status is None:
-            descriptor = os.pidfd_open(self.pid)
-            try:
-                poll = select.poll()
-                poll.register(descriptor, select.POLLIN)
-                poll.poll(None if timeout is None else timeout * 1000)
-            finally:
-                os.close(descriptor)
+            wait_until_ended(self.pid, timeout)
             status = self.poll()
         if status is None:
             raise subprocess.TimeoutExpired(str(self.pid), timeout or 0.0)

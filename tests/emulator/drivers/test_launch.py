@@ -3,7 +3,10 @@
 import os
 from pathlib import Path
 
+import pytest
+
 from emulator.drivers.launch import Launcher
+from tests.support.processes import has_ended
 
 SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
 
@@ -24,3 +27,23 @@ def test_what_must_not_starve_has_a_session_of_its_own(tmp_path: Path) -> None:
     launcher.wait_for("recorder", 60.0)
     launcher.stop()
     assert launcher.log_tail("recorder").split() == [str(pid), "True"]
+
+
+FORKS = "import os, sys, time; child = os.fork(); child or time.sleep(600); print(child, flush=True)"
+"""Forks a child that would stay for ten minutes."""
+
+
+@pytest.mark.parametrize("then", ["", "; sys.exit(3)", "; time.sleep(600)"])
+def test_what_a_process_has_forked_ends_with_it(tmp_path: Path, then: str) -> None:
+    launcher = Launcher(tmp_path)
+    launcher.start("v1", ["-c", FORKS + then], None, {})
+    while not launcher.log_tail("v1").strip():
+        os.sched_yield()
+    child = int(launcher.log_tail("v1"))
+    if "sleep" in then:
+        launcher.kill("v1")
+    else:
+        launcher.wait_for("v1", 60.0)
+        assert launcher.ended()["v1"].status == (3 if then else 0)
+    launcher.stop()
+    assert has_ended(child, 60)
