@@ -72,9 +72,11 @@ def _ending_between_instants(simulation: _Simulation, on_interrupt: Callable[[],
 
     here = threading.current_thread() is threading.main_thread()
     if not here or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # others see to it
+        simulation.no_signal_raises = lambda: not here or signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         yield
         return
     signal.signal(signal.SIGINT, ask)
+    simulation.no_signal_raises = lambda: signal.getsignal(signal.SIGINT) is ask
     try:
         yield
     finally:
@@ -94,6 +96,8 @@ class _Simulation:
         self._before_horizon = before_horizon or (lambda lockstep: None)
         self._seq = 0
         self.stop = stop
+        self.no_signal_raises: Callable[[], bool] = lambda: False
+        """Tells whether a KeyboardInterrupt can only be the programs' own."""
         welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
         welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
         search_programs_in(emulation.scenario.program.folders)
@@ -118,6 +122,10 @@ class _Simulation:
                 except SpinError as spin:
                     self._host.end_spinning(self.loop, spin)
                 except SystemExit as leave:
+                    self._host.end_exited(leave)
+                except KeyboardInterrupt as leave:
+                    if self.stop.is_set() or not self.no_signal_raises():
+                        raise
                     self._host.end_exited(leave)
         except _RunOverError:
             self._close(self._emulation.duration_ns)

@@ -13,6 +13,8 @@ names what is missing or different when a new version of Python changes it. What
 - A future whose exception nobody has retrieved has `_log_traceback` set, which may be cleared; discarded with it,
   it calls the exception handler. Reading `_exception` does not clear it. What `gather` returns knows its
   `_children`.
+- Callbacks run in `Handle._run`, a function in Python, which lets SystemExit and KeyboardInterrupt through.
+- `gather` makes an `asyncio.tasks._GatheringFuture`, and lets it fail with `set_exception`.
 - `_default_executor`, `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
 """
 
@@ -20,6 +22,7 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+import traceback
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -71,6 +74,14 @@ def context_of(handle: asyncio.Handle) -> Context:
     return cast("Context", _private(handle)._context)
 
 
+def handle_that_raised(error: BaseException) -> asyncio.Handle | None:
+    """Return the callback out of which an exception has left the loop, if it was one."""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if frame.f_code is asyncio.Handle._run.__code__:
+            return cast("asyncio.Handle", frame.f_locals["self"])
+    return None
+
+
 def abandon(task: asyncio.Task[Any]) -> None:
     """Let a pending task be destroyed without a message in the log."""
     _private(task)._log_destroy_pending = False
@@ -97,6 +108,18 @@ def disclaim(future: asyncio.Future[Any]) -> BaseException:
 def gathered(future: asyncio.Future[Any]) -> Sequence[asyncio.Future[Any]]:
     """Return the futures that `asyncio.gather` has joined in this one; none if it is another kind of future."""
     return cast("Sequence[asyncio.Future[Any]]", getattr(future, "_children", ()))
+
+
+def tell_of_failed_gatherings() -> None:
+    """Have what `asyncio.gather` returns call `on_failed` of its loop, if it has one, when it fails."""
+
+    def set_exception(future: asyncio.Future[Any], exception: type | BaseException) -> None:
+        asyncio.Future.set_exception(future, exception)
+        on_failed = getattr(future.get_loop(), "on_failed", None)
+        if on_failed is not None:
+            on_failed(future)
+
+    _private(asyncio.tasks)._GatheringFuture.set_exception = set_exception
 
 
 class NumberedTimer(asyncio.TimerHandle):

@@ -142,7 +142,7 @@ class Host:
     def _start(self, node: Node) -> None:
         context = contextvars.copy_context()
         context.run(current_node.set, node)
-        program = self._run(node, self._programs[node.id])
+        program = self._main(node, self._programs[node.id])
         self._loop.create_task(program, name=f"{node.id} main", context=context)
 
     def _raised_ns(self, node: Node | None) -> int | None:
@@ -278,14 +278,21 @@ class Host:
             if self._runs(node):
                 self.end(node.id, "spun", str(spin), self.stacks(node.id))
 
-    def end_exited(self, leave: SystemExit) -> None:
-        """After a SystemExit that left the loop: the task that raised it has ended its node's program."""
+    def end_exited(self, leave: SystemExit | KeyboardInterrupt) -> None:
+        """After an exception that left the loop: the task or callback that raised it has ended its node's program.
+
+        Raises `leave` if no program has raised it.
+        """
         for task, owner in list(self._tasks.items()):
             if owner is not None and task.done() and asyncio_internals.error_of(task) is leave:
                 asyncio_internals.disclaim(task)
                 self._exited(owner, leave)
                 return
-        raise leave
+        handle = asyncio_internals.handle_that_raised(leave)
+        owner = None if handle is None else _owner(handle)
+        if owner is None:
+            raise leave
+        self._exited(owner, leave)
 
     def _exited(self, node: Node, error: BaseException) -> None:
         if isinstance(error, SystemExit) and not error.code:
@@ -326,8 +333,15 @@ class Host:
         `take_traffic` then returns the exceptions that nobody has handled.
         """
         self._closing = True
+        tasks = self._cancel_all()
         with contextlib.suppress(LoopAbandonedError, SpinError):
-            loop.finish(_all_done(self._cancel_all()))
+            while True:
+                try:
+                    loop.finish(_all_done(tasks))
+                    break
+                except SystemExit as leave:
+                    self.end_exited(leave)
+        del tasks  # it would keep their exceptions from being discarded
         self._settle()
 
     async def cancel(self) -> None:
@@ -344,11 +358,15 @@ class Host:
         self._unhandled.close()
         logging.getLogger().removeHandler(self._log_handler)
 
-    async def _run(self, node: Node, program: Program) -> None:
+    async def _main(self, node: Node, program: Program) -> None:
         try:
             await program(node)
-        except (asyncio.CancelledError, GeneratorExit):
+        except GeneratorExit:
             raise
+        except asyncio.CancelledError as error:  # of a task that the program awaits, unless vnet has cancelled it
+            if self._closing or not self._runs(node):
+                raise
+            self._exited(node, error)
         except (Exception, SystemExit) as error:
             self._exited(node, error)
         else:

@@ -92,6 +92,7 @@ class UnhandledExceptions:
         """Have the loop of the programs tell of what fails, until `close`."""
         self._loop = loop
         loop.on_failed, loop.on_unhandled = self._failed, self._unhandled
+        asyncio_internals.tell_of_failed_gatherings()
         if _collector not in gc.callbacks:
             gc.callbacks.append(_collector)
 
@@ -144,7 +145,12 @@ class UnhandledExceptions:
         """A future, which is no task, was given an exception."""
         context = getattr(future, "job_context", None)
         owner = current_node.get() if context is None else context.get(current_node)
-        self._note(future, owner, "in a future" if context is None else "in an executor job")
+        place = "in a future" if context is None else "in an executor job"
+        for each in asyncio_internals.gathered(future):
+            failure = self._failures.get(id(each))
+            if failure is not None and asyncio_internals.error_of(each) is asyncio_internals.error_of(future):
+                place = failure.place
+        self._note(future, owner, place)
 
     def _note(self, future: asyncio.Future[Any], owner: Node | None, place: str) -> None:
         if len(self._failures) >= self._most and not _collector.runs:

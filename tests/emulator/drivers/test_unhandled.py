@@ -3,6 +3,8 @@
 import asyncio
 import gc
 import logging
+import signal
+import sys
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -104,6 +106,11 @@ async def drops_what_it_gathers(node: Node) -> None:
     await sends(node)
 
 
+async def holds_what_it_gathers(node: Node) -> None:
+    held.append(asyncio.gather(fails(), fails(0.7)))
+    await sends(node)
+
+
 async def fails_a_future(node: Node) -> None:
     await asyncio.sleep(0.5)
     held.append(future := asyncio.get_running_loop().create_future())
@@ -140,6 +147,7 @@ UNHANDLED: dict[Callable[[Node], Awaitable[None]], tuple[str, float]] = {
     drops_a_job: ("in an executor job", 0.5),
     holds_a_job: ("in an executor job", 0.5),
     drops_what_it_gathers: ("in a task", 0.5),
+    holds_what_it_gathers: ("in a task", 0.5),
     shields_and_forgets: ("in a task", 0.5),
     fails_a_future: ("in a future", 0.5),
     fails_at_the_end: ("in main", 3.0),
@@ -344,6 +352,59 @@ def test_sys_exit_in_a_task_ends_the_node_alone(run: Run) -> None:
         ("finished", "v02", 500_000_000),
         ("finished", "v03", 500_000_000),
     ]
+
+
+async def awaits_what_it_cancelled(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    task = asyncio.create_task(asyncio.sleep(9))
+    task.cancel()
+    await task
+
+
+async def exits_in_a_callback(node: Node) -> None:
+    asyncio.get_running_loop().call_later(0.5, sys.exit, 3)
+    await sends(node)
+
+
+async def exits_at_the_end(node: Node) -> None:
+    async def leave() -> None:
+        try:
+            await asyncio.sleep(99)
+        finally:
+            raise SystemExit(3)
+
+    held.append(asyncio.create_task(leave()))
+    await sends(node)
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart])
+@pytest.mark.parametrize("program", [awaits_what_it_cancelled, exits_in_a_callback], ids=lambda p: p.__name__)
+def test_who_leaves_by_another_way_has_crashed(program: Callable[..., Any], run: Run) -> None:
+    emulation = run(scenario_of([], entry(program), vehicles=2))
+    ended = [(event.kind, event.node, event.time_ns) for event in emulation.folder.events if event.node]
+    assert ended == [("crashed", "v01", 500_000_000), ("crashed", "v02", 500_000_000)]
+
+
+def test_sys_exit_while_programs_are_ended_is_an_exception() -> None:
+    emulation = run_together(scenario_of([], entry(exits_at_the_end), vehicles=2))
+    assert [(event.node, event.details["error"]) for event in exceptions(emulation)] == [
+        ("v01", "SystemExit: 3"),
+        ("v02", "SystemExit: 3"),
+    ]
+
+
+async def interrupts(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    if node.id == "v01":
+        raise KeyboardInterrupt
+    asyncio.get_running_loop().call_soon(signal.default_int_handler, 2, None)
+    await sends(node)
+
+
+def test_an_interrupt_that_a_program_raises_is_a_crash_of_its_vehicle() -> None:
+    emulation = run_together(scenario_of([], entry(interrupts), vehicles=2))
+    ended = [(event.kind, event.node, event.time_ns) for event in emulation.folder.events if event.node]
+    assert ended == [("crashed", "v01", 500_000_000), ("crashed", "v02", 500_000_000)]
 
 
 def test_kinds_are_told_in_one_line_each() -> None:

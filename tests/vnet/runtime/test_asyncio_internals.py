@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -286,3 +286,29 @@ def test_no_other_module_names_what_is_private(module: ModuleType) -> None:
     named = set(re.findall(r"\._[a-z]\w+", inspect.getsource(asyncio_internals))) - {"._number"}
     assert {"._ready", "._scheduled", "._log_destroy_pending"} <= named
     assert named & set(re.findall(r"\._[a-z]\w+", inspect.getsource(module))) == set()
+
+
+def test_the_callback_that_raised_is_found() -> None:
+    loop = asyncio.new_event_loop()
+    handle = loop.call_soon(sys.exit, 3)
+    with pytest.raises(SystemExit) as raised:
+        loop.run_forever()
+    loop.close()
+    assert asyncio_internals.handle_that_raised(raised.value) is handle
+    assert asyncio_internals.handle_that_raised(SystemExit(3)) is None
+
+
+def test_what_is_gathered_tells_its_loop_when_it_fails() -> None:
+    class Loop(asyncio.SelectorEventLoop):
+        told: ClassVar[list[object]] = []
+        on_failed = told.append
+
+    asyncio_internals.tell_of_failed_gatherings()
+    loop = Loop()
+    inner = loop.create_future()
+    outer = asyncio.gather(inner)
+    loop.call_soon(inner.set_exception, ValueError("boom"))
+    with pytest.raises(ValueError, match="boom"):
+        loop.run_until_complete(outer)
+    loop.close()
+    assert Loop.told == [outer]
