@@ -107,7 +107,7 @@ class Page:
         pending[name] = block.place
 
     def _directives(self, block: Block) -> None:
-        """What the site shows from docstrings exists."""
+        """Check that what the site shows from docstrings exists."""
         names = re.findall(r"^\.\. auto\w+:: ([\w.]+)$", block.text, re.MULTILINE)
         if not names:
             raise DocsError("no directive that shows a docstring")
