@@ -31,6 +31,10 @@ LONGEST_TEXT = 64
 Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
 """A reported value besides the estimates."""
 
+RESERVED_NAMES = frozenset(
+    ["period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_estimate_m", "values"]
+)
+"""Names that no reported value can have: columns that the emulator fills in every row of a run's states."""
 COVARIANCE_TOLERANCE = 1e-6
 """Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
 LEVELS = ("debug", "info", "warning", "error", "critical")
@@ -239,6 +243,7 @@ class Node:
         incarnation: int = 0,
         disk: Callable[[], Path] | None = None,
     ) -> None:
+        self._is_text: dict[str, bool] = {}  # by the name of each reported value
         self.id = node_id
         self.radio = Radio(node_id, transport, max_payload)
         self.gnss = GnssReceiver()
@@ -285,12 +290,16 @@ class Node:
         in a unit is shown with it, as `delay_ms`. vnet's own metrics know `common_error_m` (2,),
         `common_error_covariance_m2` (2, 2), `mean_m` (2,) (of the consensus), `stacked_common_error_m` (2,) (after
         fusion) and `cloud_m` (n, 2); `heard` is the number of packets received since the last report, which is
-        checked against the trace. Raise ValueError for a wrong shape, for another kind of value, and for a
-        covariance that is none: not finite, not symmetric, or not positive semidefinite.
+        checked against the trace. A name is a Python identifier, with a dot and any text behind it if need be
+        (`weight.v03`). Raise ValueError for a wrong shape, for another kind of value, for a covariance that is
+        none (not finite, not symmetric, or not positive semidefinite), for a name that is none or that vnet's
+        own columns have, and for a text under a name that this node has reported numbers by, or the reverse.
         """
         estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
         covariance = None if covariance_m2 is None else _covariance("covariance_m2", covariance_m2)
         named = {name: _value(name, value) for name, value in values.items()}
+        for name, kept in named.items():
+            self._check_kind(name, kept)
         self._transport.send_report(
             Report(
                 time_ns=self.now_ns,
@@ -302,6 +311,18 @@ class Node:
                 values=named,
             )
         )
+
+    def _check_kind(self, name: str, value: Value) -> None:
+        """Raise ValueError for a name that no value can have, and for a text where numbers were, or the reverse."""
+        is_text = isinstance(value, str)
+        if name not in self._is_text:
+            _check_name(name)
+            self._is_text[name] = is_text
+        elif self._is_text[name] != is_text:
+            before, now = ("a text", "a number") if self._is_text[name] else ("a number", "a text")
+            raise ValueError(
+                f"report({name}={value!r}): {now}, but {self.id} has reported {before} by this name; use two names"
+            )
 
     def log(self, text: str, level: str = "info") -> None:
         """Write a line to this vehicle's log, with the emulated time and a level.
@@ -380,6 +401,15 @@ def _covariance(name: str, value: ArrayLike) -> list[float]:
     else:
         return flat
     raise ValueError(f"report({name}=[[{a:g}, {b:g}], [{c:g}, {d:g}]]): {reason}, so no covariance")
+
+
+def _check_name(name: str) -> None:
+    if name in RESERVED_NAMES:
+        taken = ", ".join(sorted(RESERVED_NAMES))
+        raise ValueError(f"report({name}=…): this name is taken by vnet; so are {taken}")
+    if not name.partition(".")[0].isidentifier():
+        allowed = "a Python identifier is expected, with a dot and any text behind it if need be"
+        raise ValueError(f"report(**{{{name!r}: …}}): not a name of a value; {allowed}")
 
 
 def _value(name: str, value: ArrayLike) -> Value:

@@ -6,13 +6,16 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from emulator.records.failures import in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
+from emulator.records.reported import is_text, numbers_of
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import ProcessFault
 from vnet.counted import counted
+from vnet.errors import first_names
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
@@ -122,8 +125,21 @@ def check_finite(recorded: RecordedRun) -> Finding:
     broken = int(np.sum(not_finite))
     text = f"{counted(reporting, 'report')}, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
-    broken_text = f"{counted(broken, 'report')} with NaN or infinity"
+    values = "; ".join(_not_finite_values(recorded)) if broken else ""
+    broken_text = f"{counted(broken, 'report')} with NaN or infinity" + (f": {values}" if values else "")
     return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
+
+
+def _not_finite_values(recorded: RecordedRun) -> list[str]:
+    """Return "NAME of NODES" for each figure of the program's own that was reported as NaN or infinity."""
+    found = []
+    for name in recorded.value_names:
+        column = recorded.states[name]
+        if not is_text(column.type):
+            broken = np.asarray(column.is_valid()) & ~np.isfinite(numbers_of(column))
+            nodes = recorded.states["node"].filter(pa.array(broken)).unique().to_pylist()
+            found += [f"{name} of {first_names(nodes)}"] if nodes else []
+    return found
 
 
 def check_kept_up(recorded: RecordedRun) -> Finding:

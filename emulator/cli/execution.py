@@ -177,8 +177,8 @@ def _finish(
 
 
 def _say(asked: OutputOptions, line: str) -> None:
-    """Print a line on stderr for who has pressed Ctrl-C."""
-    if not asked.only_the_result:
+    """Print a line on stderr for who has pressed Ctrl-C, with `--quiet` too: nothing else shows that it came."""
+    if asked.log_format is not LogFormat.JSON:
         say_first(f"vnet: {line}")
 
 

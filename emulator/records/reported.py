@@ -73,28 +73,26 @@ class ValueColumns:
         return states
 
     def _spread(self, column: _Column, rows: int) -> pa.Array:
+        """Return a column: of numbers if there is any; where vehicles disagree, texts do not spoil its mean."""
         row = np.frombuffer(column.row, dtype=np.int64)
         kind = np.frombuffer(column.kind, dtype=np.int8)
         number = np.frombuffer(column.number, dtype=float)
         missing = np.ones(rows, dtype=bool)
-        missing[row] = False
-        if (kind == _TEXT).any():
-            return self._texts(row, kind, number, rows)
+        if (kind == _TEXT).all():
+            return self._texts(row, number, rows)
+        missing[row[kind != _TEXT]] = False
         spread = np.zeros(rows)
         spread[row] = number
-        if (kind == _BOOLEAN).all():
+        if (kind != _NUMBER).all():
             return pa.array(spread.astype(bool), mask=missing)
         return pa.array(spread, mask=missing)
 
-    def _texts(self, row: NDArray[Any], kind: NDArray[Any], number: NDArray[Any], rows: int) -> pa.Array:
-        """Return a column of texts; numbers and booleans among them as Python writes them."""
+    def _texts(self, row: NDArray[Any], number: NDArray[Any], rows: int) -> pa.Array:
+        """Return a column of texts."""
         known = list(self._text_index)
         texts: list[str | None] = [None] * rows
-        for i, of, value in zip(row.tolist(), kind.tolist(), number.tolist(), strict=True):
-            if of == _TEXT:
-                texts[i] = known[int(value)]
-            else:
-                texts[i] = str(bool(value)) if of == _BOOLEAN else f"{value:g}"
+        for i, value in zip(row.tolist(), number.tolist(), strict=True):
+            texts[i] = known[int(value)]
         return pa.array(texts, pa.string()).dictionary_encode()
 
 

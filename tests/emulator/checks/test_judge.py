@@ -339,6 +339,7 @@ def test_numbers_that_are_none_are_counted(tmp_path: Path) -> None:
     assert isinstance(found, CheckResult)
     assert found.verdict is Verdict.INVALID
     assert figures(found) == {"reports": 40, "not_finite": 10}
+    assert found.text == "10 reports with NaN or infinity: x of v2"
 
 
 def test_programs_that_report_nothing_have_nothing_to_be_finite(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_while_a_command_starts_itself_again(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_program_that_does_not_yield_ends_at_the_second(tmp_path: Path) -> None:
     (tmp_path / "busy.py").write_text(BUSY)
-    status, shown, said = vnet(tmp_path, "simulate", BEACON, "--program", "busy:main")
+    status, shown, said = vnet(tmp_path, "simulate", BEACON, "--program", "busy:main", "--quiet")
     assert status == 130, said
     assert "vnet: interrupted, as soon as the programs yield; Ctrl-C again: at once\n" in said
     assert "Traceback" not in said

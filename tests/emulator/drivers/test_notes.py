@@ -12,10 +12,11 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.log_book import MOST_NOTES
 from emulator.records.node_logs import NodeLogs
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.states import COMMON_VALUES, STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
-from vnet.node import Node
+from vnet.node import RESERVED_NAMES, Node
 
 logger = logging.getLogger("my.program")
 
@@ -99,18 +100,52 @@ def test_a_log_that_is_full_says_so_once(tmp_path: Any, monkeypatch: pytest.Monk
     )
 
 
-def test_wrong_levels_and_details_are_refused() -> None:
-    class Transport:
-        def now_ns(self, node: str) -> int:
-            return 0
+class Transport:
+    """One that forgets all that it is given."""
 
-        def send_frame(self, node: str, payload: bytes) -> None: ...
+    def now_ns(self, node: str) -> int:
+        return 0
 
-        def send_report(self, report: object) -> None: ...
+    def send_frame(self, node: str, payload: bytes) -> None: ...
 
-        def send_note(self, *note: object) -> None: ...
+    def send_report(self, report: object) -> None: ...
 
-    node = Node("v01", Transport(), lane_map=None, seed=1, options={}, period_ns=1, max_payload=1)  # type: ignore[arg-type]
+    def send_note(self, *note: object) -> None: ...
+
+
+@pytest.fixture
+def node() -> Node:
+    return Node("v01", Transport(), lane_map=None, seed=1, options={}, period_ns=1, max_payload=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["", "x/y", "a b <c>", ".x", "node", "time_ns", "position_m", "values"])
+def test_a_figure_that_would_vanish_is_refused(node: Node, name: str) -> None:
+    with pytest.raises(ValueError, match=r"^report\(.*: (this name is taken by vnet|not a name of a value)"):
+        node.report(**{name: 1.0})
+
+
+def test_names_of_columns_and_names_with_a_dot_are_taken(node: Node) -> None:
+    names: dict[str, Any] = {"delay_ms": 1.0, "weight.flow.0/x": 0.5, "mean_m": [1.0, 2.0], "f\u00fc\u00df": True}
+    node.report(**names)
+
+
+def test_vnets_own_columns_are_those_that_no_value_can_have() -> None:
+    assert frozenset(STATES.names) - COMMON_VALUES.keys() - {"estimate_m", "covariance_m2"} == RESERVED_NAMES
+
+
+def test_numbers_and_texts_by_one_name_are_refused(node: Node) -> None:
+    node.report(delay_ms=4, state="idle")
+    node.report(delay_ms=True, state="busy")
+    expected = r"^report\(delay_ms='text'\): a text, but v01 has reported a number by this name; use two names$"
+    with pytest.raises(ValueError, match=expected):
+        node.report(delay_ms="text")
+    with pytest.raises(
+        ValueError, match=r"^report\(state=1.0\): a number, but v01 has reported a text by this name"
+    ):
+        node.report(state=1)
+
+
+def test_wrong_levels_and_details_are_refused(node: Node) -> None:
     with pytest.raises(
         ValueError, match=r"^log\(level='loud'\): allowed are debug, info, warning, error, critical$"
     ):

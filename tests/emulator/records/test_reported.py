@@ -45,10 +45,11 @@ def test_each_value_is_a_column_of_its_kind(tmp_path: Path) -> None:
     assert value_columns(pq.read_schema(tmp_path / "states.parquet")) == ["delay_ms", "state", "warned"]
 
 
-def test_kinds_that_change_become_the_wider_one() -> None:
+def test_numbers_stay_numbers_whatever_else_vehicles_report_by_their_name() -> None:
     table = states({"a": {"x": True, "y": 1.5}, "b": {"x": 2.5, "y": "far"}}, {"a": {"y": True}})
     assert table["x"].to_pylist() == [1.0, 2.5, None, None]
-    assert table["y"].to_pylist() == ["1.5", "far", "True", None]
+    assert table["y"].to_pylist() == [1.5, None, 1.0, None]
+    assert reported_figures(table)["y"].mean == 1.25
 
 
 def test_lists_odd_names_and_names_of_vnets_own_have_no_column() -> None:
