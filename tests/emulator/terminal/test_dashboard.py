@@ -224,9 +224,13 @@ def test_the_headline_says_how_fast_it_is_or_that_it_stands(
 
 
 def test_colours_and_none() -> None:
-    output = written(render(Dashboard(make())))
-    assert "\x1b[1;38;2;213;94;0mv04 died: SIGKILL\x1b[0m" in output, "what is bad is red"
-    assert "\x1b[1;38;2;213;94;0m  1 down: \x1b[0m" in output
+    """Styles, not codes: Rich keeps a style's codes for the first kind of terminal that it was written to."""
+    console = Console(width=100, height=30, force_terminal=True, file=io.StringIO(), color_system="truecolor")
+    styles = {segment.text: segment.style for segment in console.render(Dashboard(make()))}
+    for text in ("v04 died: SIGKILL", "  1 down: "):
+        style = styles[text]
+        assert style is not None and style.bold and style.color is not None
+        assert style.color.triplet == (213, 94, 0), "what is bad is red"
     plain = written(render(Dashboard(make()), color_system=None))
     assert "\x1b" not in plain
     (bar,) = [line for line in plain.splitlines() if line.startswith("frames")]
