@@ -102,5 +102,8 @@ def test_a_program_sees_the_same_process_forked_or_spawned(vnet: Vnet) -> None:
     drawn = [number for each in said.values() for number in each.pop("random")]
     assert len(set(drawn)) == 8, "no two agents draw the same"
     for node in ("v01", "v02"):
-        said["fork", node]["arguments"][2] = said["spawn", node]["arguments"][2]  # the port
+        for option in ("--connect", "--files"):  # the port, and the disk of this run
+            arguments = {start: said[start, node]["arguments"] for start in ("fork", "spawn")}
+            place = arguments["spawn"].index(option) + 1
+            arguments["fork"][place] = arguments["spawn"][place]
         assert said["fork", node] == said["spawn", node]
