@@ -5,10 +5,15 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from vnet.runtime.environment import use_one_blas_thread
 
 use_one_blas_thread()  # as in the commands, whose results some tests compare with those of this process
+
+# The same examples in each run, so that it fails for what was changed. Others: --hypothesis-profile=default.
+settings.register_profile("same", derandomize=True)
+settings.load_profile("same")
 
 
 @pytest.fixture
