@@ -8,6 +8,10 @@ READY := $(VENV)/.ready
 PYTEST := $(BIN)/pytest -n auto --dist worksteal
 COVERAGE := --cov --cov-report=
 
+# Bytecode is kept, also where the environment says otherwise: without it each worker compiles all tests, and each
+# process that a test starts compiles vnet.
+export PYTHONDONTWRITEBYTECODE :=
+
 # What `make test-all` tests with, each in a virtual environment of its own, if it is installed.
 PYTHONS ?= 3.11 3.12 3.13
 
@@ -80,3 +84,4 @@ soak: $(READY)
 
 clean:
 	rm -rf .venv .venv-* build site *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -r {} +
