@@ -13,8 +13,8 @@ import importlib.util
 import sys
 import sysconfig
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache, lru_cache
 from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
 from typing import Any
@@ -164,22 +164,30 @@ def _installed_folders() -> tuple[Path, ...]:
     return tuple(Path(sysconfig.get_path(name)) for name in _SITE)
 
 
-def _imported(module: str, path: Path) -> Iterator[str]:
+def _imported(module: str, path: Path) -> Sequence[str]:
     """Names that a source imports, absolute; a name that is imported from a package may be a module, or not."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are the program's, and Python tells them when it runs
-            tree = ast.parse(path.read_bytes())
-    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
-        return
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    try:
+        return _names_imported(package, path.read_bytes())
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
+        return ()
+
+
+@lru_cache(1024)
+def _names_imported(package: str, source: bytes) -> tuple[str, ...]:
+    """Names that a source of a package imports: parsed once in a process that runs many scenarios."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are the program's, and Python tells them when it runs
+        tree = ast.parse(source)
+    names: list[str] = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             parts = package.split(".")
             start = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
             base = ".".join(part for part in (start, node.module) if part)
             if base:
-                yield base
-                yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
+                names.append(base)
+                names += (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
+    return tuple(names)
