@@ -1,7 +1,7 @@
 """Destinations of a recording: a file, a server for viewers elsewhere, a window on this machine.
 
-Nothing of it listens on more than the loopback interface unless that is asked for. A viewer that is slow, or stands
-still, holds nothing up: what waits for it is bounded, and it is dropped when it no longer answers.
+Nothing of it listens on more than the loopback interface unless that is asked for. A slow or stopped viewer
+holds nothing up: what waits for it is bounded, and it is dropped when it no longer answers.
 """
 
 from __future__ import annotations
