@@ -171,6 +171,13 @@ EVENTS = {
     "refused": ("vehicle", "`key`, `reason`", "the first message on this key that was not believed"),
     "refused_total": ("", "`key`, `count`", "how many there were"),
     "observer_ended": ("process", "`how`", "a recorder ended before the run did"),
+    "host_gone": ("", "`host`, `where`", "the connection of this host closed; its processes have `died` with it"),
+    "host_silent": (
+        "",
+        "`host`, `where`",
+        "this host did not hand in all logs and files of its vehicles at the end",
+    ),
+    "log_left_out": ("vehicle", "`bytes`", "how much of the beginning of its log is still on its host"),
     "memory": ("process", "`time_s`, `rss_kb`", "what it held, as two lists"),
     "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
     "late_deliveries": (

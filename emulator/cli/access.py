@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.options import DEFAULT_LISTEN, ScenarioArgument, SetOption, load
+from emulator.cli.options import DEFAULT_LISTEN, HostsOption, ScenarioArgument, SetOption, host_names, load
 from emulator.drivers.join import split_into_processes
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
 from emulator.world.world import World, build_world
+from vnet.counted import counted
 from vnet.errors import TransportError
 from vnet.transport.access import Access, is_tls
 from vnet.transport.certificates import certifier
@@ -41,25 +42,42 @@ def access(
         Path | None,
         typer.Option(metavar="FOLDER", help="Where the zenohd sees --out, if elsewhere (in a container)."),
     ] = None,
+    hosts: HostsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Write the configuration of a separate router (zenohd) and everybody's credentials."""
     with one_line_errors():
         loaded = load(scenario, overrides)
-        users = create_access(loaded, build_world(loaded), listen, tls_name or ())
+        users = create_access(loaded, build_world(loaded), listen, tls_name or (), host_names(hosts))
         users.save(out, listen, router_folder or out.resolve())
-        print(f"{len(users.processes)} agent processes, and the emulator, in {out}/credentials")
+        if users.hosts:
+            who = f"{counted(len(users.hosts), 'host')} with {len(users.processes)} agent processes"
+        else:
+            who = f"{len(users.processes)} agent processes"
+        print(f"{who}, and the emulator, in {out}/credentials")
         print(f"start the router with: zenohd -c {shlex.quote(str(out / 'zenohd.json5'))}")
 
 
-def create_access(scenario: Scenario, world: World, listen: str = "", tls_names: Sequence[str] = ()) -> Access:
-    """New users of a run; with certificates where the router listens at tls/HOST:PORT."""
+def create_access(
+    scenario: Scenario,
+    world: World,
+    listen: str = "",
+    tls_names: Sequence[str] = (),
+    hosts: Sequence[str] = (),
+) -> Access:
+    """New users of a run, on these hosts; with certificates where the router listens at tls/HOST:PORT."""
     groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
-    return Access.create(scenario.run.name, groups, certifier(listen, tls_names) if is_tls(listen) else None)
+    certify = certifier(listen, tls_names) if is_tls(listen) else None
+    return Access.create(scenario.run.name, groups, certify, hosts)
 
 
-def load_or_create_access(scenario: Scenario, world: World, folder: Path, listen: str, separate: bool) -> Access:
-    """The users of a run whose agents are started by hand; new ones, not yet saved, where `folder` has none."""
+def load_or_create_access(
+    scenario: Scenario, world: World, folder: Path, listen: str, separate: bool, hosts: Sequence[str] = ()
+) -> Access:
+    """The users of a run whose agents are started elsewhere; new ones, not yet saved, where `folder` has none.
+
+    Raises TransportError for those of another scenario, or of other `hosts`, if any are given.
+    """
     if (folder / "access.json").exists() or separate:
         access = Access.load(folder)
         nodes = {node for process in access.processes for node in process}
@@ -67,5 +85,14 @@ def load_or_create_access(scenario: Scenario, world: World, folder: Path, listen
             raise TransportError(
                 f"access folder {folder} was made for another scenario; write a new one with: vnet access"
             )
+        groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
+        if access.hosts and [list(nodes) for nodes in access.processes] != groups:
+            raise TransportError(
+                f"access folder {folder} was made for another run.nodes_per_process; "
+                "write a new one with: vnet access"
+            )
+        if hosts and list(hosts) != list(access.hosts):
+            made = ",".join(access.hosts) or "no hosts"
+            raise TransportError(f"--hosts {','.join(hosts)}: access folder {folder} was made for {made}")
         return access
-    return create_access(scenario, world, listen)
+    return create_access(scenario, world, listen, hosts=hosts)

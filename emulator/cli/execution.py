@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -63,12 +63,12 @@ class Request:
         return Emulation(self.scenario, world, folder)
 
 
-def run_with_processes(request: Request, separate_router: bool) -> None:
-    """Run the emulator and a process a vehicle; exits with the verdict's status."""
+def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[str]) -> None:
+    """Run the emulator, these hosts, if any, and a process a vehicle; exits with the verdict's status."""
     scenario = request.scenario
     with program_check(scenario) as check:
         world = build_world(scenario)
-        access = create_access(scenario, world)
+        access = create_access(scenario, world, hosts=hosts)
         emulation = request.prepare(world)
         check.wait()
     with ExitStack() as stack:
@@ -76,7 +76,7 @@ def run_with_processes(request: Request, separate_router: bool) -> None:
         if separate_router:
             private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
             separate = SeparateRouter(access, Path(private))
-        options = LiveOptions(access, router=separate, record=request.sinks)
+        options = LiveOptions(access, router=separate, record=request.sinks, start_hosts=True)
         emulation.folder.open(scenario)
         _run_live(emulation, options, request.asked, request.output)
 
@@ -110,14 +110,16 @@ def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
     stack.callback(lambda: recorder.take("end", messages.end()))
 
 
-def run_for_agents(request: Request, listen: str | None, connect: str | None, access: Path | None) -> None:
-    """Run the emulator for agents that are started by hand; exits with the verdict's status."""
+def run_for_agents(
+    request: Request, listen: str | None, connect: str | None, access: Path | None, hosts: Sequence[str]
+) -> None:
+    """Run the emulator for hosts, or agents that are started by hand; exits with the verdict's status."""
     scenario = request.scenario
     world = build_world(scenario)
     emulation = request.prepare(world)
     folder = emulation.folder
     place = access or folder.path / "access"
-    users = load_or_create_access(scenario, world, place, listen or DEFAULT_LISTEN, connect is not None)
+    users = load_or_create_access(scenario, world, place, listen or DEFAULT_LISTEN, connect is not None, hosts)
     endpoint = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
 
     def create() -> str:
@@ -126,9 +128,10 @@ def run_for_agents(request: Request, listen: str | None, connect: str | None, ac
         place = access or folder.path / "access"
         if not (place / "access.json").exists():
             users.save(place, endpoint, place.resolve())
-        return f"credentials of the agents: {place}/credentials/NODE.json"
+        who, file = ("hosts", "host-NAME.json") if users.hosts else ("agents", "NODE.json")
+        return f"credentials of the {who}: {place}/credentials/{file}"
 
-    options = LiveOptions(users, endpoint, connect, launch=False, record=request.sinks)
+    options = LiveOptions(users, endpoint, connect, launch=bool(users.hosts), record=request.sinks)
     _run_live(emulation, options, request.asked, request.output, create)
 
 

@@ -101,6 +101,12 @@ QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only err
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
 ]
+HostsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAMES", help="Hosts of the vehicles, in equal parts: a,b,c. On each: vnet host --name NAME."
+    ),
+]
 RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
 RerunBindOption = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Where to serve; the default is 127.0.0.1, this machine only.")
@@ -111,6 +117,14 @@ RerunPortOption = Annotated[
 RerunVehicleOption = Annotated[
     str | None, typer.Option(metavar="ID", help="The vehicle that has a tab of its own; by default the first.")
 ]
+
+
+def host_names(names: str | None) -> list[str]:
+    """Return the names in `--hosts a,b,c`. Raises ScenarioError for an empty one."""
+    found = [] if names is None else [name.strip() for name in names.split(",")]
+    if not all(found):
+        raise ScenarioError(f"--hosts {printable(names or '')!r}: write names as a,b,c")
+    return found
 
 
 def load(

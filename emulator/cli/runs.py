@@ -16,6 +16,7 @@ from emulator.cli.options import (
     ChecksOption,
     DeterminismOption,
     DurationOption,
+    HostsOption,
     LogFormatOption,
     OutOption,
     OutputOptions,
@@ -33,6 +34,7 @@ from emulator.cli.options import (
     SeedOption,
     SetOption,
     VerboseOption,
+    host_names,
     load,
 )
 from emulator.scenario.scenario import Scenario
@@ -69,6 +71,10 @@ def run(
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
     ] = RouterKind.EMBEDDED,
+    hosts: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="Start the vehicles from N hosts (vnet host) on this machine."),
+    ] = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -86,7 +92,9 @@ def run(
             from emulator.cli.execution import Request, run_with_processes
 
         request = Request(loaded, scenario, out, sinks, asked, output)
-        run_with_processes(request, separate_router=router is RouterKind.SEPARATE)
+        run_with_processes(
+            request, router is RouterKind.SEPARATE, [str(1 + number) for number in range(hosts or 0)]
+        )
 
 
 def simulate(
@@ -136,6 +144,7 @@ def emulator(
             metavar="FOLDER", help="Users, as vnet access wrote them; made if not there. Default: OUT/access."
         ),
     ] = None,
+    hosts: HostsOption = None,
     program: ProgramOption = None,
     pacing: PacingOption = None,
     seed: SeedOption = None,
@@ -153,7 +162,7 @@ def emulator(
     verbose: VerboseOption = False,
     report: ReportOption = True,
 ) -> None:
-    """Run a scenario for agents that are started by hand, here or on other machines."""
+    """Run a scenario for hosts, or for agents that are started by hand, here or on other machines."""
     asked = OutputOptions(log_format, quiet, report=report, verbose=verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         if listen is not None and connect is not None:
@@ -165,7 +174,8 @@ def emulator(
         with ended_at_once():
             from emulator.cli.execution import Request, run_for_agents
 
-        run_for_agents(Request(loaded, scenario, out, sinks, asked, output), listen, connect, access)
+        request = Request(loaded, scenario, out, sinks, asked, output)
+        run_for_agents(request, listen, connect, access, host_names(hosts))
 
 
 def _announce(scenario: Scenario, asked: OutputOptions) -> None:

@@ -51,6 +51,7 @@ COMMANDS = (
     Command(
         "emulator", Panel.RUN, "runs", "emulator", "Run it for agents that are started by hand, here or elsewhere."
     ),
+    Command("host", Panel.RUN, "host", "host", "Start the vehicles of one host of a run on several."),
     Command("access", Panel.RUN, "access", "access", "Write the users and rules of a separate router (zenohd)."),
     Command("status", Panel.LOOK, "fault", "status", "Show how a run that is on is getting on."),
     Command("check", Panel.LOOK, "check", "check", "Judge a finished run again."),

@@ -24,9 +24,10 @@ from vnet.transport.session import open_client, open_router, router_endpoint
 class LiveOptions:
     """Options of a live run's attachment.
 
-    `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the
-    run); `launch` starts the agents; `record` is where a recorder process writes its recording (a file in the run's
-    folder, unless its path is absolute), or None.
+    `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the run).
+    `launch` starts the agents, which are on hosts if `access` names some; `start_hosts` starts those here as well.
+    `record` is where a recorder process writes its recording (a file in the run's folder, unless its path is
+    absolute), or None.
     """
 
     access: Access
@@ -35,10 +36,14 @@ class LiveOptions:
     launch: bool = True
     record: Sinks | None = None
     router: SeparateRouter | None = None
+    start_hosts: bool = False
 
 
 class Attachment:
-    """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a node's id or a verb."""
+    """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a name or a verb.
+
+    With hosts, `to_hosted` takes what is said to nodes, and `send_host` sends it to their hosts in bundles.
+    """
 
     def __init__(
         self,
@@ -49,6 +54,8 @@ class Attachment:
         on_tx: Callable[[str, bytes], None],
         on_alive: Callable[[str, bool], None],
         on_query: Callable[[str, zenoh.Query], None],
+        on_host_tx: Callable[[str, bytes], None] = lambda host, payload: None,
+        on_host_alive: Callable[[str, bool], None] = lambda host, alive: None,
     ) -> None:
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
@@ -60,8 +67,12 @@ class Attachment:
         self._on_tx = on_tx
         self._on_alive = on_alive
         self._on_query = on_query
+        self._on_host_tx = on_host_tx
+        self._on_host_alive = on_host_alive
+        self.to_hosted: Callable[[str, wire.EmulatorMessage], None] | None = None
         self._stack = ExitStack()
         self._rx: dict[str, zenoh.Publisher] = {}
+        self._host_rx: dict[str, zenoh.Publisher] = {}
         self._observers: dict[str, zenoh.Publisher] = {}
 
     def open(self) -> None:
@@ -81,7 +92,9 @@ class Attachment:
                 session.declare_publisher(keys.node_rx(self._run, node), congestion_control=control, express=True)
             )
             for node in self._node_ids
+            if not options.access.hosts
         }
+        self._open_hosts(session)
         self._observers = {
             stream: stack.enter_context(
                 session.declare_publisher(
@@ -97,6 +110,23 @@ class Attachment:
         stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
         stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
 
+    def _open_hosts(self, session: zenoh.Session) -> None:
+        """Declare the keys of hosts, if there are any. A host that cannot be reached is closed after a while."""
+        hosts, stack = self._options.access.hosts, self._stack
+        self._host_rx = {
+            host: stack.enter_context(
+                session.declare_publisher(
+                    keys.host_rx(self._run, host), congestion_control=zenoh.CongestionControl.BLOCK, express=True
+                )
+            )
+            for host in hosts
+        }
+        if hosts:
+            stack.enter_context(session.declare_subscriber(keys.host_tx(self._run, "*"), self._take_host_tx))
+            alive = keys.host_alive(self._run, "*")
+            liveliness = session.liveliness()
+            stack.enter_context(liveliness.declare_subscriber(alive, self._take_host_alive, history=True))
+
     def close(self) -> None:
         """Close everything."""
         self._stack.close()
@@ -107,16 +137,29 @@ class Attachment:
     def _take_alive(self, sample: zenoh.Sample) -> None:
         self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
+    def _take_host_tx(self, sample: zenoh.Sample) -> None:
+        self._on_host_tx(keys.host_of(str(sample.key_expr)), sample.payload.to_bytes())
+
+    def _take_host_alive(self, sample: zenoh.Sample) -> None:
+        self._on_host_alive(keys.host_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
+
     def _take_query(self, query: zenoh.Query) -> None:
         self._on_query(keys.verb_of(str(query.key_expr)), query)
 
     def knows(self, node: str) -> bool:
         """Return whether there is a key for this node."""
-        return node in self._rx
+        return node in self._node_ids
 
     def send(self, node: str, message: wire.EmulatorMessage) -> None:
         """Say something to a node."""
-        self._rx[node].put(wire.encode(message))
+        if self.to_hosted is not None:
+            self.to_hosted(node, message)
+        else:
+            self._rx[node].put(wire.encode(message))
+
+    def send_host(self, host: str, payload: bytes) -> None:
+        """Put an encoded message on the `rx` of a host."""
+        self._host_rx[host].put(payload)
 
     def is_watched(self, stream: str) -> bool:
         """Return whether somebody observes this stream."""

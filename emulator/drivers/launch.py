@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from emulator.drivers.process_group import GroupProcess
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
@@ -51,6 +52,39 @@ class Exit:
             return f"signal {-self.status}"
 
 
+class AgentProcesses(Protocol):
+    """Processes of the agents of a run, as a launcher starts and ends them on this machine, or hosts elsewhere."""
+
+    @property
+    def pids(self) -> Mapping[str, int]:
+        """Numbers that tell the processes of one name apart, of those that should be there."""
+
+    def is_prepared(self) -> bool:
+        """Return whether agents can be started without waiting. Raises VnetError if they never can."""
+
+    @property
+    def missing(self) -> Sequence[str]:
+        """Names of all that agents wait for before they can be started."""
+
+    def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
+        """Start the processes of these groups of nodes; the name of each is the id of its first node."""
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a signal to a process, if it is there."""
+
+    def kill(self, name: str) -> None:
+        """End a process at once, and forget it."""
+
+    def detach(self, name: str) -> Callable[[float], None]:
+        """Forget a process that has been told to go; returns what waits so many seconds for its end."""
+
+    def request_stack(self, name: str) -> None:
+        """Have a process write its stacks to its log."""
+
+    def log_tail(self, name: str) -> str:
+        """Return the last lines of a process's log."""
+
+
 class Launcher:
     """The processes that a run has started, which log to `logs`.
 
@@ -75,6 +109,11 @@ class Launcher:
     def is_prepared(self) -> bool:
         """Return whether agents can be started without waiting. Raises VnetError if they never can."""
         return self._zygote is None or self._zygote.is_ready()
+
+    @property
+    def missing(self) -> Sequence[str]:
+        """Names of all that agents wait for before they can be started."""
+        return [] if self.is_prepared() else ["the process from which agents are forked"]
 
     def start_agents(self, endpoint: str, access: Access, groups: Sequence[Sequence[str]], nice: int = 0) -> None:
         """Start the processes of these groups of nodes; the name of each is the id of its first node.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from emulator.records.run_folder import RunFolder
@@ -38,8 +38,12 @@ class MemoryWatch:
             if (size_kb := resident_kb(pid)) is not None:
                 self._series.setdefault((name, pid), []).append((time_ns / 1e9, size_kb))
 
+    def series(self) -> Iterator[tuple[str, list[float], list[int]]]:
+        """The samples of each process: its name, times in s and sizes in KiB."""
+        for (name, _), samples in self._series.items():
+            yield name, [time_s for time_s, _ in samples], [size_kb for _, size_kb in samples]
+
     def write(self, folder: RunFolder, time_ns: int) -> None:
         """One event `memory` a process: `time_s` and `rss_kb` of its samples."""
-        for (name, _), samples in self._series.items():
-            times, sizes = zip(*samples, strict=True)
-            folder.event(time_ns, "memory", name, time_s=list(times), rss_kb=list(sizes))
+        for name, time_s, rss_kb in self.series():
+            folder.event(time_ns, "memory", name, time_s=time_s, rss_kb=rss_kb)

@@ -48,7 +48,7 @@ LARGEST_MATRIX = 400
 LIMIT_VEHICLES = 100
 """Most vehicles for which the bound is computed: its cost grows with their number."""
 WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "refused", "interrupted",
-            "observer_ended"}  # fmt: skip
+            "observer_ended", "host_gone"}  # fmt: skip
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
 """Rerun's names of the levels of a program's log."""
 LONGEST_DETAIL = 60

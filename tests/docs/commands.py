@@ -28,6 +28,7 @@ PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 ONLY_PARSED = {
     "vnet conformance": "takes a minute; tests/emulator/testing/conformance runs it",
     "vnet emulator": "waits for agents",
+    "vnet host": "needs an emulator",
     "vnet-agent": "needs an emulator",
     "vnet record": "needs an emulator",
     "vnet fault": "needs a run that is on",

@@ -190,5 +190,6 @@ def test_a_reader_that_is_told_nonsense_says_so() -> None:
 def test_the_keys_are_those_of_the_page() -> None:
     text = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
     made = [make("RUN", "ID") for make in (keys.node_tx, keys.node_rx, keys.node_report, keys.node_alive)]
+    made += [make("RUN", "NAME") for make in (keys.host_tx, keys.host_rx, keys.host_alive)]
     made += [keys.emulator_alive("RUN"), keys.observe("RUN", "STREAM"), keys.control("RUN", "VERB")]
     assert [key for key in made if f"| `{key}` |" not in text] == []

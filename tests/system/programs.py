@@ -15,6 +15,18 @@ import numpy as np
 from vnet import Node
 
 
+async def counts_its_starts(node: Node) -> None:
+    """Keeps on its disk how often it was started, tells it, and says its turn in each period."""
+    path = node.folder / "starts.txt"
+    starts = int(path.read_text()) + 1 if path.exists() else 1
+    path.write_text(str(starts))
+    node.log(f"start {starts}")
+    node.event("began", starts=starts)
+    async for fix in node.gnss:
+        await node.radio.broadcast(fix.time_ns.to_bytes(8, "big"))
+        node.report(heard=len(node.radio.drain()))
+
+
 async def only_waits(node: Node) -> None:
     """Speaks once, then only ever waits on the radio; what it hears it says again, up to three hops."""
     await node.radio.broadcast(b"")

@@ -1,21 +1,22 @@
 """Access control of the router: users, passwords, certificates and rules of one run.
 
 The router denies by default. Roles: *node* (a user for each agent process, with access to exactly its nodes' keys),
+*host* (a user for each host of a run on several hosts, in place of its agents, with access to its own keys),
 *observer* (receives only), *operator* (queries `control`) and *emulator* (all keys of the run; used only if the
-emulator is a client of a separate router). Zenoh's rules have no templates by user name, so each process has its
-own.
+emulator is a client of a separate router). Zenoh's rules have no templates by user name, so each process and each
+host has its own.
 """
 
 from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vnet.errors import TransportError
+from vnet.errors import TransportError, shown
 from vnet.transport import keys
 from vnet.transport.credentials import (
     Certificates,
@@ -44,13 +45,15 @@ OPERATOR = "operator"
 class Access:
     """All users of a run. `processes` are the node ids of each agent process; the first is the process's id.
 
-    With `tls` the router accepts only TLS, and a user needs its own certificate as well as its password.
+    With `tls` the router accepts only TLS, and a user needs its own certificate as well as its password. `hosts`
+    are the ids of the processes on each host by its name, all of the run; empty if agents connect to the router.
     """
 
     run: str
     processes: tuple[tuple[str, ...], ...]
     passwords: dict[str, str] = field(repr=False)
     tls: Certificates | None = None
+    hosts: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
     def create(
@@ -58,19 +61,27 @@ class Access:
         run: str,
         processes: Sequence[Sequence[str]],
         certify: Callable[[Sequence[str]], Certificates] | None = None,
+        hosts: Sequence[str] = (),
     ) -> Access:
         """Draw new passwords for every process and role of a run.
 
         `certify` issues the certificates of all users for a router that accepts only TLS; see
-        `certificates.certifier`. Raise TransportError if it cannot.
+        `certificates.certifier`. With `hosts` (names) the processes are on these, in equal parts in the order of
+        both, and each host has a user in place of its processes. Raise TransportError for what cannot be done.
         """
-        users = _users(processes)
+        shares = _share([nodes[0] for nodes in processes], hosts)
+        users = _users(processes, shares)
         return cls(
             run,
             tuple(tuple(nodes) for nodes in processes),
             {user: secrets.token_urlsafe(24) for user in users},
             None if certify is None else certify(users),
+            shares,
         )
+
+    def processes_on(self, host: str) -> list[list[str]]:
+        """Return the node ids of each process on a host."""
+        return [list(nodes) for nodes in self.processes if nodes[0] in self.hosts[host]]
 
     def credentials(self, user: str) -> Credentials:
         """Return a user's credentials; node users are named by `node_user(process_id)`."""
@@ -102,7 +113,10 @@ class Access:
         }
 
     def _roles(self) -> list[tuple[str, list[Rule]]]:
-        roles = [(node_user(nodes[0]), _node_rules(self.run, nodes)) for nodes in self.processes]
+        if self.hosts:
+            roles = [(host_user(host), _host_rules(self.run, host)) for host in self.hosts]
+        else:
+            roles = [(node_user(nodes[0]), _node_rules(self.run, nodes)) for nodes in self.processes]
         observed = [
             keys.observe(self.run, "**"),
             keys.node_report(self.run, "*"),
@@ -163,10 +177,13 @@ class Access:
 
     def _check(self) -> None:
         """Raise ValueError if `create` cannot have made this: rules and the dictionary are written from it."""
-        names = [self.run, *(node for nodes in self.processes for node in nodes)]
+        names = [self.run, *self.hosts, *(node for nodes in self.processes for node in nodes)]
         if not all(map(keys.is_segment, names)) or not all(self.processes):
             raise ValueError
-        users = sorted(_users(self.processes))
+        hosted = sorted(process_id for share in self.hosts.values() for process_id in share)
+        if self.hosts and hosted != sorted(nodes[0] for nodes in self.processes):
+            raise ValueError
+        users = sorted(_users(self.processes, self.hosts))
         if users != sorted(self.passwords) or (self.tls is not None and users != sorted(self.tls.users)):
             raise ValueError
         for user, password in self.passwords.items():
@@ -197,14 +214,35 @@ EVERYTHING = [
 ]
 
 
-def _users(processes: Sequence[Sequence[str]]) -> list[str]:
-    """Return all users of a run: one for each process, and the other roles."""
-    return [*(node_user(nodes[0]) for nodes in processes), EMULATOR, OBSERVER, OPERATOR]
+def _users(processes: Sequence[Sequence[str]], hosts: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return all users of a run: one for each process, or for each host if there are any, and the other roles."""
+    own = [host_user(host) for host in hosts] or [node_user(nodes[0]) for nodes in processes]
+    return [*own, EMULATOR, OBSERVER, OPERATOR]
+
+
+def _share(process_ids: Sequence[str], hosts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Return the processes of each host: parts whose lengths differ by at most one. Raise TransportError."""
+    for host in hosts:
+        if not keys.is_segment(host):
+            raise TransportError(f"host {shown(host)}: names are letters, digits, '_', '.', '-', at most 64")
+        if hosts.count(host) > 1:
+            raise TransportError(f"host {host}: named {hosts.count(host)} times; each host needs a name of its own")
+    if len(hosts) > len(process_ids):
+        raise TransportError(
+            f"{len(hosts)} hosts for {len(process_ids)} agent processes: at most one host for each"
+        )
+    edges = [len(process_ids) * number // len(hosts) for number in range(len(hosts) + 1)] if hosts else []
+    return {host: tuple(process_ids[edges[i] : edges[i + 1]]) for i, host in enumerate(hosts)}
 
 
 def node_user(process_id: str) -> str:
     """Return the user name of an agent process, whose id is the first of its nodes."""
     return f"node-{process_id}"
+
+
+def host_user(host: str) -> str:
+    """Return the user name of a host."""
+    return f"host-{host}"
 
 
 def is_tls(endpoint: str) -> bool:
@@ -258,6 +296,20 @@ def _node_rules(run: str, nodes: Sequence[str]) -> list[Rule]:
         ),
         _rule(f"{process_id}-watch", ["ingress"], WATCH_TOKENS, emulator),
         _rule(f"{process_id}-watched", ["egress"], ["liveliness_token"], emulator),
+    ]
+
+
+def _host_rules(run: str, host: str) -> list[Rule]:
+    emulator = [keys.emulator_alive(run)]
+    rx = [keys.host_rx(run, host)]
+    return [
+        _rule(f"host-{host}-put", ["ingress"], ["put"], [keys.host_tx(run, host)]),
+        _rule(f"host-{host}-token", ["ingress"], ["liveliness_token"], [keys.host_alive(run, host)]),
+        _rule(f"host-{host}-subscribe", ["ingress"], SUBSCRIBE, rx),
+        _rule(f"host-{host}-receive", ["egress"], ["put"], rx),
+        _rule(f"host-{host}-matching", ["egress"], SUBSCRIBE, [keys.host_tx(run, "*")]),
+        _rule(f"host-{host}-watch", ["ingress"], WATCH_TOKENS, emulator),
+        _rule(f"host-{host}-watched", ["egress"], ["liveliness_token"], emulator),
     ]
 
 

@@ -9,7 +9,7 @@ _SEGMENT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z")
 
 
 def is_segment(name: str) -> bool:
-    """Return true if a run's name or a node's id is valid in a key: letters, digits, `_ . -`, at most 64."""
+    """Return true if the name of a run, node or host is valid in a key: letters, digits, `_ . -`, at most 64."""
     return _SEGMENT.match(name) is not None
 
 
@@ -31,6 +31,21 @@ def node_report(run: str, node: str) -> str:
 def node_alive(run: str, node: str) -> str:
     """Key of the liveliness token of a node's process."""
     return f"vnet/{run}/node/{node}/alive"
+
+
+def host_tx(run: str, host: str) -> str:
+    """Key of messages from a host to the emulator: those of its agents in bundles, and news of their processes."""
+    return f"vnet/{run}/host/{host}/tx"
+
+
+def host_rx(run: str, host: str) -> str:
+    """Key of messages from the emulator to a host: those for its agents in bundles, and orders for processes."""
+    return f"vnet/{run}/host/{host}/rx"
+
+
+def host_alive(run: str, host: str) -> str:
+    """Key of the liveliness token of a host."""
+    return f"vnet/{run}/host/{host}/alive"
 
 
 def emulator_alive(run: str) -> str:
@@ -55,4 +70,9 @@ def verb_of(key: str) -> str:
 
 def node_of(key: str) -> str:
     """Return the node id in one of the `node/` keys above."""
+    return key.split("/")[3]
+
+
+def host_of(key: str) -> str:
+    """Return the host's name in one of the `host/` keys above."""
     return key.split("/")[3]

@@ -42,7 +42,8 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())
         config = router_config([listen], dictionary, access.access_control(), access.tls)
-        link = {**_queues(lease_ms), "rx": {"max_message_size": wire.LARGEST_MESSAGE_BYTES}}
+        largest_bytes = wire.LARGEST_BUNDLE_BYTES if access.hosts else wire.LARGEST_MESSAGE_BYTES
+        link = {**_queues(lease_ms), "rx": {"max_message_size": largest_bytes}}
         config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
         session = _open(config, f"cannot listen on {listen}")

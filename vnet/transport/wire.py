@@ -30,6 +30,9 @@ LATENESS_BINS = 80
 LARGEST_MESSAGE_BYTES = 64 * 2**20
 """Largest message of an agent: it holds a frame of the largest payload from each of a thousand nodes."""
 
+LARGEST_BUNDLE_BYTES = 2 * LARGEST_MESSAGE_BYTES
+"""Largest message of a host, which bundles those of its agents."""
+
 
 class Message(msgspec.Struct, frozen=True, array_like=True, tag=True):
     """Base of all messages: an array whose first element names the kind of message."""
@@ -314,6 +317,11 @@ def encode_observation(message: dict[str, Any]) -> bytes:
 def decode_observation(data: bytes) -> dict[str, Any]:
     """Decode a message to observers. Raise WireError for a bad one."""
     return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
+
+
+def is_yield(data: bytes) -> bool:
+    """Return true if an encoded message is a yield, judged by its first bytes without decoding it."""
+    return data[1:7] == b"\xa5Yield"
 
 
 def is_batch(data: bytes) -> bool:

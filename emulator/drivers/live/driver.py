@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from emulator.drivers.attachment import Attachment
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.join import Membership
-from emulator.drivers.launch import Launcher
+from emulator.drivers.launch import AgentProcesses
 from emulator.drivers.live.inbox import Inbox
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.supervisor import Supervisor
@@ -24,7 +24,7 @@ class Parts:
     emulation: Emulation
     members: Membership
     supervisor: Supervisor
-    launcher: Launcher
+    agents: AgentProcesses
     attachment: Attachment
     inbox: Inbox
     reconnection: Reconnection

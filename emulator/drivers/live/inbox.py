@@ -49,7 +49,8 @@ class Refusals:
 class Inbox:
     """Hands what Zenoh's threads `put_…` to its handlers, on the loop on which it was made.
 
-    `handlers` is the table of message types: a part of the run adds the type that it takes. Of `connected` are the
+    `handlers` is the table of message types: a part of the run adds the type that it takes. What hosts say goes to
+    `on_host_…`, which unbundles it and calls `take_message` and `take_token`. Of `connected` are the
     nodes that hold a connection; `stacks` are the answers to stack requests, by process.
     """
 
@@ -70,6 +71,8 @@ class Inbox:
         self._incoming: deque[tuple[Callable[[str, Any], None], str, Any]] = deque()
         self._wake_pending = False
         self._closed = False
+        self.on_host_message: Callable[[str, bytes], None] = lambda host, payload: None
+        self.on_host_token: Callable[[str, bool], None] = lambda host, alive: None
         self.handlers: dict[type, Handler] = {wire.StackDump: self._take_stack, wire.Final: _ignore}
         self.connected: set[str] = set()
         self.stacks: dict[str, str] = {}
@@ -78,11 +81,19 @@ class Inbox:
 
     def put_message(self, node: str, payload: bytes) -> None:
         """Enqueue an encoded message of a node."""
-        self._put(self._take_message, node, payload)
+        self._put(self.take_message, node, payload)
 
     def put_token(self, node: str, alive: bool) -> None:
         """Enqueue that the connection of a node has appeared or is gone."""
-        self._put(self._take_token, node, alive)
+        self._put(self.take_token, node, alive)
+
+    def put_host_message(self, host: str, payload: bytes) -> None:
+        """Enqueue an encoded message of a host."""
+        self._put(self._take_host_message, host, payload)
+
+    def put_host_token(self, host: str, alive: bool) -> None:
+        """Enqueue that the connection of a host has appeared or is gone."""
+        self._put(self._take_host_token, host, alive)
 
     def put_query(self, verb: str, query: zenoh.Query) -> None:
         """Enqueue an operator's query."""
@@ -106,7 +117,14 @@ class Inbox:
             take, name, item = self._incoming.popleft()
             take(name, item)
 
-    def _take_message(self, node: str, payload: bytes) -> None:
+    def _take_host_message(self, host: str, payload: bytes) -> None:
+        self.on_host_message(host, payload)
+
+    def _take_host_token(self, host: str, alive: bool) -> None:
+        self.on_host_token(host, alive)
+
+    def take_message(self, node: str, payload: bytes) -> None:
+        """Take an encoded message of a node."""
         try:
             message = wire.decode_tx(payload)
             # A hello introduces its nonce; Membership judges it.
@@ -119,7 +137,8 @@ class Inbox:
         except (WireError, ProtocolError) as error:
             self._refusals.add(node, str(error))
 
-    def _take_token(self, node: str, alive: bool) -> None:
+    def take_token(self, node: str, alive: bool) -> None:
+        """Take note that the connection of a node has appeared or is gone."""
         if alive:
             self.connected.add(node)
             return

@@ -9,14 +9,15 @@ from collections.abc import Callable, Sequence
 from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import Membership, split_into_processes
-from emulator.drivers.launch import Launcher
+from emulator.drivers.launch import AgentProcesses, Launcher
 from emulator.drivers.live.inbox import Refusals
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.viewer.sinks import Sinks
+from vnet.counted import counted
 from vnet.errors import ProgramError, TransportError, VnetError, first_names
 from vnet.transport import wire
-from vnet.transport.access import OBSERVER
+from vnet.transport.access import OBSERVER, host_user
 
 RECORDER = "recorder"
 RECORDER_POLL_S = 0.05
@@ -37,6 +38,7 @@ class Joining:
         members: Membership,
         supervisor: Supervisor,
         launcher: Launcher,
+        agents: AgentProcesses,
         attachment: Attachment,
         options: LiveOptions,
         refusals: Refusals,
@@ -46,6 +48,7 @@ class Joining:
         self._members = members
         self._supervisor = supervisor
         self._launcher = launcher
+        self._agents = agents
         self._attachment = attachment
         self._options = options
         self._refusals = refusals
@@ -76,7 +79,7 @@ class Joining:
         """
         timeout_s = self._emulation.scenario.run.join_timeout_s
         deadline = time.monotonic() + timeout_s
-        await self._start_processes(on_state)
+        await self._start_processes(on_state, deadline)
         missing: list[str] = []
         while self._members.missing or not self._recorder_listens():
             if missing != self._members.missing:
@@ -91,22 +94,45 @@ class Joining:
         on_missing([])
         return self._members.processes()
 
-    async def _start_processes(self, on_state: Callable[[str], None]) -> None:
+    async def _start_processes(self, on_state: Callable[[str], None], deadline: float) -> None:
         node_ids = self._emulation.world.node_ids
         endpoint = self._attachment.endpoint
         groups = split_into_processes(node_ids, self._emulation.scenario.run.nodes_per_process)
         groups = [nodes for nodes in groups if nodes[0] not in self._members.later]
         if self._options.record is not None:
             self._start_recorder(endpoint, self._options.record.inside(self._emulation.folder.path))
+        hosts = list(self._options.access.hosts)
+        if hosts:
+            self._start_hosts(endpoint)
+            on_state(f"listening at {endpoint}; waiting for {counted(len(hosts), 'host')}: {first_names(hosts)}")
         if self._options.launch:
-            on_state(f"listening at {endpoint}; starting {len(groups)} agent processes")
-            while not self._launcher.is_prepared():
-                await asyncio.sleep(LAUNCHER_POLL_S)
+            await self._agents_prepared(deadline)
+            where = f" on {counted(len(hosts), 'host')}" if hosts else ""
+            on_state(f"listening at {endpoint}; starting {len(groups)} agent processes{where}")
             for first in range(0, len(groups), STARTED_AT_ONCE):
                 self._supervisor.launch(groups[first : first + STARTED_AT_ONCE])
                 await asyncio.sleep(0)  # those that have joined meanwhile are welcomed
         else:
             on_state(f"listening at {endpoint}; waiting for {len(node_ids) - len(self._members.later)} vehicles")
+
+    async def _agents_prepared(self, deadline: float) -> None:
+        """Wait until agents can be started. Raises VnetError if they cannot, TransportError after the deadline."""
+        while not self._agents.is_prepared():
+            if failure := self._supervisor.failure:
+                raise failure
+            if time.monotonic() > deadline:
+                timeout_s = self._emulation.scenario.run.join_timeout_s
+                raise TransportError(f"not ready within {timeout_s:g} s: {first_names(self._agents.missing)}")
+            await asyncio.sleep(LAUNCHER_POLL_S)
+
+    def _start_hosts(self, endpoint: str) -> None:
+        """Start the hosts that are processes of this machine."""
+        access = self._options.access
+        for host in access.hosts if self._options.start_hosts else ():
+            arguments = ["-P", "-m", "emulator.cli", "host", "--connect", endpoint, "--run", access.run]
+            for folder in self._emulation.scenario.program.folders:
+                arguments += ["--path", str(folder)]
+            self._launcher.start(host_user(host), arguments, access.credentials(host_user(host)), {})
 
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._options.access.run]

@@ -121,14 +121,16 @@ class LockstepDriver(Driver):
         parts = self._parts
         for process_id in process_ids:
             self._send(process_id, wire.StackRequest())
-            parts.launcher.request_stack(process_id)
+            parts.agents.request_stack(process_id)
         await asyncio.sleep(STACKS_WAIT_S)
-        for process_id in process_ids:
+        # Yields that their host kept for the sake of another process have come since.
+        silent = [process_id for process_id in process_ids if process_id in self._lockstep.owed]
+        for process_id in silent or process_ids:
             self._emulation.folder.event(
                 self.time_ns,
                 "stalled",
                 process_id,
                 error=f"no yield within {timeout_s:g} s of wall clock; {parts.members.describe(process_id)}",
-                where=parts.inbox.stacks.get(process_id) or parts.launcher.log_tail(process_id),
+                where=parts.inbox.stacks.get(process_id) or parts.agents.log_tail(process_id),
             )
         raise Stalled

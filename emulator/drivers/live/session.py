@@ -24,6 +24,7 @@ from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import Launcher
 from emulator.drivers.live.driver import Driver, Parts
+from emulator.drivers.live.fleet import Fleet
 from emulator.drivers.live.inbox import Inbox, Refusals
 from emulator.drivers.live.joining import RECORDER, Joining
 from emulator.drivers.live.lockstep_driver import HorizonCallback, LockstepDriver, no_horizon
@@ -69,7 +70,7 @@ async def run_live(
     the run's folder.
     """
     with ExitStack() as stack:
-        zygote = _zygote(emulation.scenario) if options.launch else None
+        zygote = _zygote(emulation.scenario) if options.launch and not options.access.hosts else None
         launcher = Launcher(emulation.folder.logs, emulation.scenario.program.folders, zygote)
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
@@ -137,10 +138,15 @@ class LiveSession:
             self._inbox.put_message,
             self._inbox.put_token,
             self._inbox.put_query,
+            self._inbox.put_host_message,
+            self._inbox.put_host_token,
         )
+        self._fleet = self._make_fleet() if options.access.hosts else None
+        agents = self._fleet or launcher
         self._feed = ObserverFeed(emulation, self._attachment)
         self._supervisor = Supervisor(
             launcher=launcher,
+            agents=agents,
             members=self._members,
             attachment=self._attachment,
             options=options,
@@ -154,13 +160,34 @@ class LiveSession:
             members=self._members,
             supervisor=self._supervisor,
             launcher=launcher,
+            agents=agents,
             attachment=self._attachment,
             options=options,
             refusals=self._refusals,
             changes=self._changes,
         )
         self._inbox.handlers[wire.Hello] = self._joining.take_hello
+        if self._fleet is not None:
+            self._fleet.on_ended, self._fleet.on_lost = self._supervisor.child_ends, self._supervisor.host_lost
         self._attachment.open()
+
+    def _make_fleet(self) -> Fleet:
+        """The hosts, between the attachment and the inbox."""
+        scenario, attachment, inbox = self._emulation.scenario, self._attachment, self._inbox
+        fleet = Fleet(
+            self._options.access,
+            self._emulation.folder,
+            scenario,
+            self._emulation.duration_ns,
+            attachment.send_host,
+            self._time_ns,
+            lambda: self._supervisor.reconnecting,
+            self._changes,
+        )
+        attachment.to_hosted = fleet.send
+        inbox.on_host_message, inbox.on_host_token = fleet.take, fleet.take_token
+        fleet.on_message, fleet.on_token = inbox.take_message, inbox.take_token
+        return fleet
 
     @property
     def endpoint(self) -> str:
@@ -197,7 +224,7 @@ class LiveSession:
             folder.event(0, "started", start_up_s=round(time.monotonic() - started_s, 3))
             self._emulation.watch(self._feed.period)
             self._emulation.watch(self._look_at_processes)
-            self._cpu.look(self._launcher.pids)
+            self._measure_cpu()
             gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
             started_s = time.monotonic()
             self._feed.begin()
@@ -212,9 +239,10 @@ class LiveSession:
             self._emulation.finish(self._time_ns())
         finally:
             wall_s = time.monotonic() - started_s
-            self._cpu.look(self._launcher.pids)
-            self._emulation.costs.take_processes(self._cpu.cpu_ns)
+            self._measure_cpu()
             await self._shut_down(completed)
+            in_all_ns = self._cpu.cpu_ns if self._fleet is None else self._cpu.cpu_ns + self._fleet.cpu_ns
+            self._emulation.costs.take_processes(in_all_ns)
             self._memory.write(folder, self._time_ns())
             self._refusals.write_totals()
         return wall_s, interrupted
@@ -234,7 +262,7 @@ class LiveSession:
             emulation=self._emulation,
             members=self._members,
             supervisor=self._supervisor,
-            launcher=self._launcher,
+            agents=self._fleet or self._launcher,
             attachment=self._attachment,
             inbox=self._inbox,
             reconnection=reconnection,
@@ -256,6 +284,8 @@ class LiveSession:
         if not self._options.launch:  # whoever closes at once may take the last messages along
             while self._inbox.connected and await self._changes.wait(deadline_s - time.monotonic()):
                 pass
+        if self._fleet is not None:
+            await self._fleet.hand_in(FULL_PATIENCE_S if completed else PATIENCE_S)
         self._feed.end()
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)
@@ -279,7 +309,14 @@ class LiveSession:
             except VnetError as error:
                 query.reply_err(str(error))
 
+    def _measure_cpu(self) -> None:
+        self._cpu.look(self._launcher.pids)
+        if self._fleet is not None:
+            self._fleet.look(self._time_ns())
+
     def _look_at_processes(self, view: PeriodView) -> None:
         self._cpu.look(self._launcher.pids)
+        if self._fleet is not None:
+            self._fleet.look(view.instant.time_ns)
         processes = {**self._launcher.pids, EMULATOR_PROCESS: os.getpid()}
         self._memory.look(view.instant.time_ns, processes)

@@ -16,13 +16,14 @@ from typing import Any
 
 from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.join import Membership
-from emulator.drivers.launch import Exit, Launcher
+from emulator.drivers.launch import AgentProcesses, Exit, Launcher
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.drivers.signals import gets_signals, signals_handled
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport import wire
+from vnet.transport.access import host_user
 
 DEATH_GRACE_S = 0.3
 """Seconds for which the last messages of a process that has ended may still arrive."""
@@ -69,13 +70,15 @@ class Supervisor:
 
     Before `begin` a process that ends is the reason why the run cannot start (`failure`). From then on each has a
     state, and `on_death` is called when one has died: `take_deaths` says which. In `realtime` a paused process is
-    stopped with a signal, and nobody waits for one that has been told to end.
+    stopped with a signal, and nobody waits for one that has been told to end. `agents` starts and ends the agents:
+    the `launcher`, which starts all else, or hosts.
     """
 
     def __init__(
         self,
         *,
         launcher: Launcher,
+        agents: AgentProcesses,
         members: Membership,
         attachment: Attachment,
         options: LiveOptions,
@@ -85,6 +88,7 @@ class Supervisor:
         realtime: bool,
     ) -> None:
         self._launcher = launcher
+        self._agents = agents
         self._members = members
         self._attachment = attachment
         self._options = options
@@ -127,7 +131,7 @@ class Supervisor:
     def launch(self, groups: Sequence[Sequence[str]]) -> None:
         """Start a process for each of these groups of nodes."""
         nice = REALTIME_AGENT_NICE if self._realtime else 0
-        self._launcher.start_agents(self._attachment.endpoint, self._options.access, groups, nice)
+        self._agents.start_agents(self._attachment.endpoint, self._options.access, groups, nice)
 
     def pause(self, process_ids: Collection[str]) -> None:
         """Pause these processes and no others; one that is returning is paused when it has returned."""
@@ -142,25 +146,25 @@ class Supervisor:
         if process_id in self._to_pause:
             self._change(process_id, ProcessState.PAUSED)
             if self._realtime:
-                self._launcher.signal(process_id, signal.SIGSTOP)
+                self._agents.signal(process_id, signal.SIGSTOP)
 
     def _resume(self, process_id: str) -> None:
         self._change(process_id, ProcessState.RUNNING)
         if self._realtime:
-            self._launcher.signal(process_id, signal.SIGCONT)
+            self._agents.signal(process_id, signal.SIGCONT)
 
     async def end(self, process_id: str, killed: bool, reason: str) -> None:
         """End a process. Those started by hand are told to go, and whoever started them may start them again."""
         if killed and self._options.launch:
             self._change(process_id, ProcessState.AWAY)
-            self._launcher.kill(process_id)
+            self._agents.kill(process_id)
             return
         if self.state(process_id) is ProcessState.PAUSED:
             self._resume(process_id)  # or it could not go
         self._change(process_id, ProcessState.AWAY)
         self._attachment.send(process_id, wire.End(None, reason))
         if self._options.launch:
-            ending = asyncio.create_task(asyncio.to_thread(self._launcher.detach(process_id), SHUT_DOWN_S))
+            ending = asyncio.create_task(asyncio.to_thread(self._agents.detach(process_id), SHUT_DOWN_S))
             if self._realtime:
                 self._ending.add(ending)
                 ending.add_done_callback(self._ending.discard)
@@ -230,28 +234,39 @@ class Supervisor:
             await asyncio.sleep(CHILDREN_POLL_S)
 
     def _children_ended(self) -> None:
-        loop = asyncio.get_running_loop()
         for name, how in self._launcher.ended().items():
-            loop.call_later(DEATH_GRACE_S, self.child_ended, name, how, self._all_told_to_end)
+            self.child_ends(name, how)
+
+    def child_ends(self, name: str, how: Exit) -> None:
+        """Take note that a process has just ended: its last messages may still arrive."""
+        loop = asyncio.get_running_loop()
+        loop.call_later(DEATH_GRACE_S, self.child_ended, name, how, self._all_told_to_end)
+
+    def host_lost(self, process_ids: Sequence[str], how: str) -> None:
+        """Take note that processes have ended with their host."""
+        for process_id in process_ids if self._processes else ():
+            self._ended(process_id, self._all_told_to_end, how=how)
 
     def child_ended(self, name: str, how: Exit, told_to_end: bool = False) -> None:
         """Take note that a process that the run has started has ended, `told_to_end` or by itself."""
-        if not self._attachment.knows(name):
+        is_host = name in map(host_user, self._options.access.hosts)
+        if not self._attachment.knows(name) and not is_host:
             self._folder.event(self._time_ns(), "observer_ended", name, how=how.how)
-        elif self._processes:
-            self._ended(name, told_to_end, how=how.how, log_tail=how.log_tail)
-        else:
+        elif not self._processes:
             last = (how.log_tail.splitlines() or ["its log is empty"])[-1]
             if "No module named" in last and (foreign := foreign_on_path("agents")):
                 last = f"{last}; {foreign}"
-            self.failure = VnetError(f"agent {name} ended before the start ({how.how}): {last}")
+            what = "process" if is_host else "agent"
+            self.failure = VnetError(f"{what} {name} ended before the start ({how.how}): {last}")
             self._changes.set()
+        elif not is_host:  # the end of a host's connection tells its own
+            self._ended(name, told_to_end, how=how.how, log_tail=how.log_tail)
 
     def disconnected(self, node: str) -> None:
         """Take note that the connection of a node is gone: it tells the end of a process started by hand."""
         if node in self._members.later:
             self._members.expect([node])
-        elif self.reconnecting or node not in self._members.joined or node in self._launcher.pids:
+        elif self.reconnecting or node not in self._members.joined or node in self._agents.pids:
             return
         elif not self._processes:
             self._members.leave(node)
@@ -270,7 +285,7 @@ class Supervisor:
 
     def _ended(self, process_id: str, told_to_end: bool, **details: Any) -> None:
         over = (ProcessState.AWAY, ProcessState.DEAD)
-        if self.state(process_id) in over or process_id in self._launcher.pids:
+        if self.state(process_id) in over or process_id in self._agents.pids:
             return  # a fault was faster, and may have started the next process of this name since
         if told_to_end:
             self._change(process_id, ProcessState.AWAY)

@@ -12,7 +12,7 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import Exit
-from emulator.drivers.live import lockstep_driver, realtime_driver, reconnection
+from emulator.drivers.live import fleet, lockstep_driver, realtime_driver, reconnection
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
 from tests.support.multi_loop_driver import emulation_of, scenario_of
@@ -29,7 +29,7 @@ def in_virtual_time(main: Coroutine[Any, Any, None], monkeypatch: pytest.MonkeyP
     """Run `main` on a loop that skips all waiting; the drivers take their clock from it."""
     loop = VirtualTimeLoop(skip_to)
     clock = SimpleNamespace(monotonic_ns=lambda: loop.now_ns, monotonic=lambda: loop.now_ns / NS_PER_S)
-    for module in (lockstep_driver, realtime_driver, reconnection):
+    for module in (fleet, lockstep_driver, realtime_driver, reconnection):
         monkeypatch.setattr(module, "time", clock)
     try:
         loop.run_until_complete(main)
@@ -143,6 +143,7 @@ class Stage:
         self.options = LiveOptions(Access.create("fake", self.processes), launch=launch)
         self.supervisor = Supervisor(
             launcher=self.launcher,  # type: ignore[arg-type]
+            agents=self.launcher,  # type: ignore[arg-type]
             members=self.members,
             attachment=self.attachment,  # type: ignore[arg-type]
             options=self.options,

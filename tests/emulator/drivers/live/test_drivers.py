@@ -36,12 +36,14 @@ class Play:
             "emulation": self.stage.emulation,
             "members": self.stage.members,
             "supervisor": self.stage.supervisor,
-            "launcher": self.stage.launcher,
             "attachment": self.stage.attachment,
             "inbox": self.inbox,
         }
-        reconnection = Reconnection(**common, options=self.stage.options, time_ns=lambda: self.driver.time_ns)
-        parts = Parts(**common, reconnection=reconnection, changes=self.stage.changes)
+        launcher: Any = self.stage.launcher
+        reconnection = Reconnection(
+            **common, launcher=launcher, options=self.stage.options, time_ns=lambda: self.driver.time_ns
+        )
+        parts = Parts(**common, agents=launcher, reconnection=reconnection, changes=self.stage.changes)
         self.driver = kind(parts, self.stage.members.processes())
         self.answer = answer
         self.stage.attachment.on_send = self.respond

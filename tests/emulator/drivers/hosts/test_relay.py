@@ -1,0 +1,63 @@
+"""The bundles of a host: yields wait for each other, and nothing else waits."""
+
+from emulator.drivers.hosts import relay
+from emulator.drivers.hosts.messages import FromNode, Token
+from emulator.drivers.hosts.relay import Relay
+from vnet.transport import wire
+
+YIELD = wire.encode(wire.Yield(b"nonce", 0, None, [], [], wire.Traffic()))
+FINAL = wire.encode(wire.Final(b"nonce", wire.Traffic()))
+
+
+def granted(*process_ids: str) -> Relay:
+    made = Relay()
+    for process_id in process_ids:
+        made.granted(process_id)
+    return made
+
+
+def test_the_yields_of_a_barrier_are_one_bundle() -> None:
+    host = granted("v01", "v02", "v03")
+    for node in ("v02", "v01"):
+        host.take(node, YIELD)
+        assert host.take_bundle() == []
+    host.take("v03", YIELD)
+    assert host.take_bundle() == [FromNode(node, YIELD) for node in ("v02", "v01", "v03")]
+    assert host.take_bundle() == []
+
+
+def test_who_ends_owes_nothing() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.ended("v02")
+    assert host.take_bundle() == [FromNode("v01", YIELD)]
+
+
+def test_what_is_no_yield_goes_at_once_and_takes_along_what_is_there() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.take("v02", FINAL)
+    assert host.take_bundle() == [FromNode("v01", YIELD), FromNode("v02", FINAL)]
+    host.add(Token("v02", False))
+    assert host.take_bundle() == [Token("v02", False)]
+    assert set(host.awaited) == {"v02"}, "it still owes its yield"
+
+
+def test_an_emulator_that_asks_does_not_wait_for_those_that_are_stuck() -> None:
+    host = granted("v01", "v02")
+    host.take("v01", YIELD)
+    host.hurry()
+    assert host.take_bundle() == [FromNode("v01", YIELD)]
+
+
+def test_a_bundle_does_not_grow_without_bound() -> None:
+    host = granted("v01", "v02")
+    large = YIELD + bytes(relay.FULL_BYTES)
+    host.take("v01", large)
+    assert host.take_bundle() == [FromNode("v01", large)]
+
+
+def test_yields_are_told_by_their_first_bytes() -> None:
+    assert wire.is_yield(YIELD)
+    assert not wire.is_yield(FINAL)
+    assert not wire.is_yield(b"")
