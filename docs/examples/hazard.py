@@ -1,7 +1,8 @@
 """Hazard warnings that are forwarded from vehicle to vehicle, with msgpack payloads.
 
-The vehicle `source` (in `[program.options]`, default v01) warns of a hazard at its position. Whoever is warned for
-the first time forwards it once, with one hop more: so it reaches vehicles far beyond the range of the source.
+The vehicle `source` (in `[program.options]`; by default v1, v01, v001, …) warns of a hazard at its position.
+Whoever is warned for the first time forwards it once, with one hop more: so it reaches vehicles far beyond the
+range of the source.
 Each vehicle reports whether it is warned, over how many hops, and after how many milliseconds:
 
     vnet simulate scenarios/beacon.toml --program docs.examples.hazard:main --set radio.range_m=1500
@@ -9,6 +10,7 @@ Each vehicle reports whether it is warned, over how many hops, and after how man
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import msgpack
@@ -17,7 +19,8 @@ from vnet import Node
 
 MOST_HOPS = 10
 """A warning that has been forwarded so often goes no further."""
-DEFAULT_SOURCE = "v01"
+FIRST = re.compile("v0*1")
+"""Id of the source where no option says it: the first vehicle of a generated network of any size."""
 
 
 def read_warning(payload: bytes) -> dict[str, Any] | None:
@@ -34,12 +37,13 @@ def read_warning(payload: bytes) -> dict[str, Any] | None:
 
 async def main(node: Node) -> None:
     """Warn, or forward each warning once; report at each fix what is known."""
-    source = node.options.get("source", DEFAULT_SOURCE)
+    source = node.options.get("source")
+    is_source = node.id == source if source else FIRST.fullmatch(node.id) is not None
     known: dict[str, dict[str, Any]] = {}
     delay_ms: dict[str, float] = {}
     malformed = 0
     async for fix in node.gnss:
-        if node.id == source and not known:
+        if is_source and not known:
             position_m = fix.position_m.tolist()
             event = {"event": f"{node.id}/1", "position_m": position_m, "since_ns": node.now_ns, "hops": 0}
             known[f"{node.id}/1"] = {"kind": "hazard", **event}

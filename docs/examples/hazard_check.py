@@ -9,12 +9,11 @@ import numpy as np
 from emulator import Result, Run
 
 WITHIN_S = 0.5
-DEFAULT_SOURCE = "v01"
 
 
 def check(run: Run) -> Iterator[Result]:
     """Judge whether everybody in range of the source is warned in time."""
-    source = run.scenario.program.options.get("source", DEFAULT_SOURCE)
+    source = run.scenario.program.options.get("source", run.nodes[0])
     warned = run.reported("warned") >= 1  # (periods, vehicles); False where nothing was reported
     if not warned[:, run.index(source)].any():
         yield Result("warned_in_time", "unknown", f"{source} never warned")

@@ -1,4 +1,4 @@
-"""The commands of the documentation: really run where that is cheap, and else parsed by the real command line."""
+"""The commands of the documentation: run as they are written; those that cannot run here are parsed."""
 
 import contextlib
 import importlib
@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,29 +18,28 @@ import emulator.cli.commands
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "run", "check", "analyze", "access", "radio", "export", "report", "compare", "map", "trace")
-"""Commands of vnet that are run in this process. `run` runs as `simulate`, without processes: the same trace."""
-APART = ("campaign", "sweep")
-"""Commands of vnet that are run in a process of their own, as they start some themselves."""
+HERE = ("simulate", "check", "analyze", "access", "radio", "export", "report", "compare", "map", "trace")
+"""Commands of vnet that are run in this process."""
+APART = (
+    *("run", "emulator", "host", "campaign", "sweep", "conformance"),  # they start processes
+    *("fault", "status", "render", "play", "view"),  # they open sessions and recordings
+    "experiment",
+)
+"""Commands of vnet that are run in a process of their own."""
 PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 """Run by this Python, with these arguments first."""
+MODULES = {"vnet": "emulator.cli", "vnet-agent": "agents.cli"}
 ONLY_PARSED = {
-    "vnet conformance": "takes a minute; tests/emulator/testing/conformance runs it",
-    "vnet emulator": "waits for agents",
-    "vnet host": "needs an emulator",
-    "vnet-agent": "needs an emulator",
-    "vnet record": "needs an emulator",
-    "vnet fault": "needs a run that is on",
-    "vnet status": "needs a run that is on",
-    "vnet experiment": "takes minutes to hours",
-    "vnet view": "needs a screen, or somebody who looks",
-    "vnet play": "needs a screen, or somebody who looks",
-    "vnet render": "needs a run that the page has not made",
+    r"--rerun spawn": "opens a window",
+    r"^vnet (view|play) ": "opens a window, or serves until somebody has looked",
+    r"^vnet(-agent| emulator| host).*tls/": "needs another host, or its address",
+    r"dask://HOST": "needs other hosts",
+    r"^vnet experiment .*DIR/": "needs recorded trips that are not part of vnet",
 }
-"""Why these are parsed, and not run."""
+"""Patterns of commands that are parsed and not run, and why."""
 NOT_RUN = {
     "cd": "the shell's own",
-    "dask": "waits for work",
+    "dask": "needs other hosts; tests/system/test_dask.py has a scheduler and workers",
     "docker": "needs an engine",
     "ip": "changes the machine; what it executes in a namespace is parsed",
     "make": "builds an environment; the target must be there",
@@ -50,17 +48,13 @@ NOT_RUN = {
     "scp": "needs another host",
     "ssh": "needs another host",
     "source": "the shell's own",
-    "tshark": "a program of its own",
-    "zenohd": "a program of its own",
+    "tshark": "is not among vnet's dependencies",
+    "zenohd": "is not among vnet's dependencies",
 }
 """Why these other programs are not run."""
-EXPENSIVE = ("quickstart.toml", "dense.toml", "faults.toml")
-"""Scenarios that take many seconds: only parsed, but for short runs."""
-MOST_RUNS = 10
-"""Campaigns of more are only parsed."""
-MOST_SEEDS = 5
-"""Sweeps of more are only parsed."""
-SHORT_S = 3.0
+UNKNOWN = 3
+"""Exit status that a run in real time may have: the machine that runs the tests may be too slow for it."""
+TIMEOUT_S = 300.0
 _STATUS = re.compile(r"#.*\bstatus (\d+)\b")
 
 
@@ -85,36 +79,38 @@ def run(words: Sequence[str], status: int, folder: Path) -> str | None:
     Raises DocsError if it is wrong, or ends with another exit status.
     """
     program, arguments = Path(words[0]).name, list(words[1:])
-    parse(words)
-    if program == "vnet" and arguments[0] in HERE and not _expensive(arguments):
-        verb = {"run": "simulate"}.get(arguments[0], arguments[0])
+    if not is_run(words):
+        parse(words)
+        return None
+    if program == "vnet" and arguments[0] in HERE:
         with _forgetting(folder):
-            text, ended = _captured(typer.main.get_command(APPS["vnet"]), [verb, *arguments[1:]])
-    elif program == "vnet" and arguments[0] in APART and not _expensive(arguments):
-        text, ended = _process(["-P", "-m", "emulator.cli", *arguments])
-    elif program in PYTHON:
-        text, ended = _process([*PYTHON[program], *arguments])
+            text, ended = _captured(typer.main.get_command(APPS["vnet"]), arguments)
     else:
+        text, ended = _process(process(words))
+    if ended == UNKNOWN and "realtime" in arguments:
         return None
     if ended != status:
         raise DocsError(f"{shlex.join(words)}: exit status {ended}, and not {status}:\n{text}")
     return text
 
 
-def _expensive(arguments: list[str]) -> bool:
-    """Return True if a command of vnet takes long, or a clock on the wall."""
-    given = dict(pairwise(arguments))
-    short = float(given.get("--duration", "inf")) <= SHORT_S
-    many = arguments[0] == "campaign" and int(given.get("--runs", "200")) > MOST_RUNS
-    many = many or (arguments[0] == "sweep" and int(given.get("--seeds", "1")) > MOST_SEEDS)
-    slow = any(argument.endswith(EXPENSIVE) for argument in arguments)
-    return (
-        many
-        or "realtime" in arguments
-        or "--executor" in arguments
-        or "--router" in arguments
-        or (slow and not short)
-    )
+def is_run(words: Sequence[str]) -> bool:
+    """Return True if a command is run, and False if it is only parsed. Raises DocsError if neither is said here."""
+    program = Path(words[0]).name
+    if program in NOT_RUN or any(re.search(pattern, shlex.join([program, *words[1:]])) for pattern in ONLY_PARSED):
+        return False
+    if program not in MODULES.keys() | PYTHON.keys():
+        raise DocsError(f"{program}: say in tests/docs/commands.py why it is not run")
+    if program == "vnet" and "".join(words[1:2]) not in HERE + APART:
+        raise DocsError(f"{shlex.join(words[:2])}: say in tests/docs/commands.py whether it is run, or why not")
+    return True
+
+
+def process(words: Sequence[str]) -> list[str]:
+    """Return the words by which a command of a page is started as a process of this Python."""
+    program, arguments = Path(words[0]).name, list(words[1:])
+    first = PYTHON[program] if program in PYTHON else ["-P", "-m", MODULES[program]]
+    return [sys.executable, *first, *arguments]
 
 
 def parse(words: Sequence[str]) -> None:
@@ -123,13 +119,9 @@ def parse(words: Sequence[str]) -> None:
     if program in NOT_RUN:
         _look_at(program, arguments)
         return
+    is_run(words)  # refuses what is not known
     if program in PYTHON:
         return
-    if program not in APPS:
-        raise DocsError(f"{program}: say in tests/docs/commands.py why it is not run")
-    known = f"{program} {arguments[0] if arguments else ''}" if program == "vnet" else program
-    if known not in ONLY_PARSED and (program != "vnet" or arguments[0] not in HERE + APART):
-        raise DocsError(f"{known}: say in tests/docs/commands.py whether it is run, or why not")
     command = typer.main.get_command(APPS[program])
     _disarm(command)
     text, status = _captured(command, arguments)
@@ -170,9 +162,9 @@ def _captured(command: Any, arguments: list[str]) -> tuple[str, int]:
     return out.getvalue() + error.getvalue(), status if isinstance(status, int) else 1
 
 
-def _process(arguments: list[str]) -> tuple[str, int]:
-    words = [sys.executable, *arguments]
-    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+def _process(words: list[str]) -> tuple[str, int]:
+    out, error = subprocess.PIPE, subprocess.STDOUT
+    done = subprocess.run(words, stdin=subprocess.DEVNULL, stdout=out, stderr=error, text=True, timeout=TIMEOUT_S)
     return done.stdout, done.returncode
 
 

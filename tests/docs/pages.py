@@ -5,7 +5,9 @@
   `python of PATH` is an excerpt of a file of the repository, at any depth of indentation.
 - `toml`: loaded as a scenario; written to a file if it begins with `# NAME.toml`.
 - `csv NAME`: written to that file.
-- `sh`: each command is run, or parsed (`tests.docs.commands`); its comment may say `status 1`.
+- `sh`: each command is run, or parsed if it cannot run here (`tests.docs.commands`); comments may say `status 1`.
+  `sh terminal`: the command goes on beside the blocks that follow, once it has printed the `text` right after it.
+  At the end of the page it is waited for; where its comment says `status 130` it gets Ctrl-C before.
 - `text`: right after a block that was run, an excerpt of what that printed, in which `…` stands for anything, and
   alone in its line for any lines; gaps may be of any width. `text figure` is a figure.
 - `{eval-rst}`: what its directives show exists.
@@ -28,6 +30,7 @@ from emulator.scenario.scenario import load_scenario
 from tests.docs import commands
 from tests.docs.commands import DocsError
 from tests.docs.markdown import Block, blocks
+from tests.docs.terminals import Terminals
 from tests.support.paths import ROOT
 
 NOT_INSTALLED = re.compile(r"^(import|from) pandas\b", re.MULTILINE)
@@ -42,6 +45,8 @@ class Page:
         self._folder = folder
         self._namespace: dict[str, Any] = {"__name__": "__docs__"}
         self._printed: str | None = None
+        self._terminals = Terminals(folder)
+        self._is_in_terminal = False
         self._programs: dict[str, str] = {}
         self._tests: dict[str, str] = {}
         self._languages: dict[str, Callable[[Block], str | None]] = {
@@ -59,10 +64,17 @@ class Page:
 
     def follow(self, text: str, name: str) -> None:
         """Follow all blocks of the page, which is called `name`."""
+        with contextlib.closing(self._terminals):
+            self._follow(text, name)
+            self._terminals.end()
+
+    def _follow(self, text: str, name: str) -> None:
         for block in blocks(text, name):
             with _at(block.place):
                 if block.language not in self._languages:
                     raise DocsError(f"language {block.language!r}; there are {', '.join(self._languages)}")
+                if block.language != "text":
+                    self._is_in_terminal = block.name == "terminal"
                 self._printed = self._languages[block.language](block)
         for file, place in self._programs.items():
             with _at(place):
@@ -132,7 +144,11 @@ class Page:
     def _sh(self, block: Block) -> str | None:
         printed: list[str] = []
         for words, status in commands.commands(block.text):
-            text = commands.run(words, status, self._folder)
+            text: str | None = ""
+            if self._is_in_terminal and commands.is_run(words):
+                self._terminals.start(words, commands.process(words), status, block.place)
+            else:
+                text = commands.run(words, status, self._folder)
             if text is not None:
                 printed.append(text)
                 for word in words:
@@ -141,7 +157,9 @@ class Page:
         return "".join(printed) if printed else None
 
     def _text(self, block: Block) -> None:
-        if self._printed is not None and block.name != "figure" and not shows(self._printed, block.text):
+        if self._is_in_terminal and self._printed is not None:
+            self._terminals.wait_for(lambda printed: shows(printed, block.text))
+        elif self._printed is not None and block.name != "figure" and not shows(self._printed, block.text):
             raise DocsError(f"this is not an excerpt of what was printed, which is:\n{self._printed}")
 
     def _json(self, block: Block) -> None:

@@ -20,14 +20,22 @@ from vnet.node import Report
 WARNING = {"kind": "hazard", "event": "v01/1", "position_m": [1.0, 2.0], "since_ns": 0, "hops": 0}
 
 
-def last_reports(folder: Path, links: list[list[int]], faults: Sequence[dict[str, Any]] = ()) -> dict[str, Report]:
+def last_reports(
+    folder: Path,
+    links: list[list[int]],
+    faults: Sequence[dict[str, Any]] = (),
+    options: dict[str, Any] | None = None,
+) -> dict[str, Report]:
     """The last report of each vehicle of a network with these links, of which none loses a frame."""
     scenario = Scenario.model_validate(
         {
             "run": {"duration_s": 2.0, "settle_s": 0.5},
             "network": {"vehicles": len(links)},
             "radio": {"loss": 0.0, "links": links},
-            "program": {"entry": "docs.examples.hazard:main", "options": {"source": "v02"}},
+            "program": {
+                "entry": "docs.examples.hazard:main",
+                "options": {"source": "v02"} if options is None else options,
+            },
             "fault": faults,
         }
     )
@@ -49,6 +57,12 @@ def test_a_warning_is_forwarded_to_vehicles_out_of_range(tmp_path: Path) -> None
 def test_a_vehicle_without_links_is_not_warned(tmp_path: Path) -> None:
     reports = last_reports(tmp_path / "run", [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     assert [reports[node].values["warned"] for node in sorted(reports)] == [1, 1, 0]
+
+
+def test_the_first_of_a_hundred_vehicles_warns_by_default(tmp_path: Path) -> None:
+    links = [[int(abs(a - b) == 1) for b in range(100)] for a in range(100)]
+    reports = last_reports(tmp_path / "run", links, options={})
+    assert [node for node in sorted(reports) if reports[node].values.get("hops") == 0] == ["v001"]
 
 
 def test_a_corrupted_warning_is_counted_and_dropped(tmp_path: Path) -> None:

@@ -42,9 +42,8 @@ def at_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
-@pytest.mark.parametrize("command", [FOREIGN, VNET_AGENT], ids=["foreign", "vnet-agent"])
-def test_an_agent_without_a_mistake_passes_every_check(command: list[str]) -> None:
-    found = play(command)
+def test_an_agent_without_a_mistake_passes_every_check() -> None:
+    found = play(VNET_AGENT)  # the foreign agent passes them in docs/how-to/other-languages.md
     assert found.failed == {}
     assert found.made.keys() == CHECKS.keys()
 
