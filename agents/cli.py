@@ -10,7 +10,7 @@ import signal
 import sys
 import termios
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,9 @@ from vnet.runtime import interrupts
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
 from vnet.runtime.program_path import search_programs_in
+
+if TYPE_CHECKING:
+    from vnet.runtime.debugger import NodeDebugger
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -60,6 +63,12 @@ def agent(
             "a temporary folder if left out.",
         ),
     ] = None,
+    debug: Annotated[
+        str | None, typer.Option(hidden=True, help="Stop a debugger in this vehicle's program: NODE[:FILE:LINE].")
+    ] = None,
+    debug_socket: Annotated[
+        Path | None, typer.Option(hidden=True, help="The debugger's user answers here.")
+    ] = None,
     show_version: Annotated[
         bool,
         typer.Option(
@@ -80,6 +89,7 @@ def agent(
     # are orphans, and end.
     signal_at_parent_death(signal.SIGCONT)
     _leave_terminal()
+    _pass_breakpoints()
     search_programs_in(path or ())
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     quiet_zenoh()
@@ -88,12 +98,37 @@ def agent(
             if not is_segment(name):
                 raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
         login = None if credentials is None else Credentials.load(credentials)
-        run_agent(connect, run, node, login, join_timeout_s, Disks(files))
+        debugger = None if debug is None or debug_socket is None else _debugger(debug, debug_socket)
+        run_agent(connect, run, node, login, join_timeout_s, Disks(files), debugger)
     except VnetError as error:
         print(f"vnet-agent: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, ProgramError) else 3)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _debugger(target: str, socket: Path) -> NodeDebugger:
+    """Return a debugger whose user answers at `socket`."""
+    from vnet.runtime.debug_target import DebugTarget
+    from vnet.runtime.debugger import NodeDebugger  # pdb, which few agents need
+    from vnet.runtime.remote_terminal import RemoteTerminal
+
+    terminal = RemoteTerminal(socket)
+    return NodeDebugger(DebugTarget.parse(target), terminal.open, terminal.quit, terminal, terminal)
+
+
+def _pass_breakpoints() -> None:
+    """Have `breakpoint()` pass where nobody could answer, unless PYTHONBREAKPOINT names a debugger."""
+    if os.isatty(0) or os.environ.get("PYTHONBREAKPOINT"):
+        return
+    told: list[str] = []
+
+    def passed(*args: object, **options: object) -> None:
+        if not told:
+            told.append("breakpoint() is passed over: there is no terminal here; vnet run --debug NODE stops at it")
+            print(f"vnet-agent: {told[0]}", file=sys.stderr, flush=True)
+
+    sys.breakpointhook = passed
 
 
 def _leave_terminal() -> None:

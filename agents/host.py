@@ -12,6 +12,7 @@ import queue
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from typing import TYPE_CHECKING
 
 from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
@@ -24,6 +25,9 @@ from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
 from vnet.transport.session import open_client
 
+if TYPE_CHECKING:
+    from vnet.runtime.debugger import NodeDebugger
+
 LEASE_MS = 60_000
 """Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
 
@@ -35,10 +39,11 @@ def run_agent(
     credentials: Credentials | None,
     join_timeout_s: float,
     disks: Disks | None = None,
+    debugger: NodeDebugger | None = None,
 ) -> None:
     """Join `run` at `endpoint` as `nodes` and run their programs to the end of the run.
 
-    `disks` has the folders of the nodes, by default temporary ones.
+    `disks` has the folders of the nodes, by default temporary ones. `debugger` stops in a program, in lockstep.
 
     Raises TransportError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
@@ -57,13 +62,17 @@ def run_agent(
         gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
-            _run_lockstep(attachment, welcomes, programs, disks)
+            _run_lockstep(attachment, welcomes, programs, disks, debugger)
         else:
             _run_realtime(attachment, welcomes, programs, disks)
 
 
 def _run_lockstep(
-    attachment: Attachment, welcomes: Sequence[wire.Welcome], programs: Programs, disks: Disks | None
+    attachment: Attachment,
+    welcomes: Sequence[wire.Welcome],
+    programs: Programs,
+    disks: Disks | None,
+    debugger: NodeDebugger | None,
 ) -> None:
     """Run the programs on a virtual-time loop until the emulator ends the run."""
     seq = 0
@@ -85,7 +94,7 @@ def _run_lockstep(
         return message.time_ns
 
     loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
-    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line, disks=disks)
+    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line, disks=disks, debugger=debugger)
     asyncio.set_event_loop(loop)
     try:
         loop.start_at(next_grant())

@@ -143,6 +143,8 @@ def _call(arguments: Sequence[str]) -> None:
         credentials=Path(given["--credentials"][0]),
         path=[Path(folder) for folder in given["--path"]],
         files=Path(given["--files"][0]) if given["--files"] else None,
+        debug=given["--debug"][0] if given["--debug"] else None,
+        debug_socket=Path(given["--debug-socket"][0]) if given["--debug-socket"] else None,
     )
 
 

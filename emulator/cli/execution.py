@@ -38,7 +38,7 @@ from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
 from emulator.world.world import World, build_world
-from vnet.errors import VnetError
+from vnet.errors import VnetError, did_you_mean, printable
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
 from vnet.transport.session import quiet_zenoh
@@ -59,6 +59,9 @@ class Request:
         """Return the run, with a folder that is not made yet. Raises VnetError for what cannot be done."""
         if self.sinks is not None and self.sinks.vehicle is not None and self.sinks.vehicle not in world.node_ids:
             raise VnetError(f"--rerun-vehicle {self.sinks.vehicle}: no such vehicle")
+        if (debug := self.asked.debug) is not None and debug.node not in world.node_ids:
+            meant = did_you_mean(debug.node, world.node_ids)
+            raise VnetError(f"--debug {printable(debug.node)}: no such vehicle{meant}")
         folder = prepare_folder(self.out, self.file, self.scenario, self.asked.log_format, world.notes)
         return Emulation(self.scenario, world, folder)
 
@@ -76,7 +79,9 @@ def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[
         if separate_router:
             private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
             separate = SeparateRouter(access, Path(private))
-        options = LiveOptions(access, router=separate, record=request.sinks, start_hosts=True)
+        options = LiveOptions(
+            access, router=separate, record=request.sinks, start_hosts=True, debug=request.asked.debug
+        )
         emulation.folder.open(scenario)
         _run_live(emulation, options, request.asked, request.output)
 
@@ -89,13 +94,18 @@ def run_in_this_process(request: Request) -> None:
         load_program(entry)
     emulation.folder.open(request.scenario)
     request.output.keep_in(emulation.folder.logs)
-    with show_progress(emulation, request.asked.log_format, request.asked.quiet) as progress:
+    with _progress(emulation, request.asked) as progress:
         with ExitStack() as stack:
             if request.sinks is not None:
                 _record_here(emulation, request.sinks, stack)
             say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
-            wall_s, interrupted = run_simulation(emulation, on_interrupt=say)
+            wall_s, interrupted = run_simulation(emulation, on_interrupt=say, debug=request.asked.debug)
         _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
+
+
+def _progress(emulation: Emulation, asked: OutputOptions) -> Progress:
+    """Return the display of a run's progress; a debugger and a picture do not share a terminal."""
+    return show_progress(emulation, asked.log_format, asked.quiet, picture=asked.debug is None)
 
 
 def _record_here(emulation: Emulation, sinks: Sinks, stack: ExitStack) -> None:
@@ -148,7 +158,7 @@ def _run_live(
     for the user, or "".
     """
     quiet_zenoh()
-    with show_progress(emulation, asked.log_format, asked.quiet) as progress:
+    with _progress(emulation, asked) as progress:
 
         def on_open() -> None:
             if line := create():

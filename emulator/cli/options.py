@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -13,7 +14,8 @@ import typer
 from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat
-from vnet.errors import ScenarioError, printable
+from vnet.errors import ScenarioError, VnetError, printable
+from vnet.runtime.debug_target import DebugTarget, resolve
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
@@ -36,6 +38,7 @@ class OutputOptions:
     check_determinism: bool = False
     report: bool = True
     verbose: bool = False
+    debug: DebugTarget | None = None
 
     @property
     def only_the_result(self) -> bool:
@@ -98,6 +101,13 @@ VerboseOption = Annotated[
     bool, typer.Option("--verbose", "-v", metavar="", help="List all checks, not only those that are not valid.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", metavar="", help="Only errors, and the verdict in one line.")]
+DebugOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ID",
+        help="Stop a debugger (pdb) in this vehicle's program, at its first line, or as v03:hello.py:12.",
+    ),
+]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
 ]
@@ -154,3 +164,24 @@ def _program_option(option: str) -> str:
     if not equals or not key.strip():
         raise ScenarioError(f"--option {printable(option)}: write it as KEY=VALUE, for example period_s=2")
     return f"program.options.{option}"
+
+
+def debug_target(text: str | None, scenario: Scenario, only_the_result: bool) -> DebugTarget | None:
+    """Return where a debugger is to stop, None for nowhere. Raises VnetError where there can be none.
+
+    Its user needs the terminal, which `only_the_result` takes away.
+    """
+    if text is None:
+        return None
+    target = resolve(DebugTarget.parse(text), scenario.program.folders)
+    if only_the_result:
+        raise VnetError(f"--debug {target.node}: cannot be combined with --quiet or --log-format json")
+    if scenario.run.pacing != Pacing.LOCKSTEP.value:
+        raise VnetError(f"--debug {target.node}: real time cannot be stopped; use --pacing lockstep")
+    if not _at_a_terminal():
+        raise VnetError(f"--debug {target.node}: needs a terminal on standard input and output")
+    return target
+
+
+def _at_a_terminal() -> bool:
+    return sys.stdin is not None and sys.stdin.isatty() and sys.stdout.isatty()

@@ -5,6 +5,7 @@ What runs it is imported once it has been read, and the user told so: that takes
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ import typer
 from emulator.cli.options import (
     DEFAULT_LISTEN,
     ChecksOption,
+    DebugOption,
     DeterminismOption,
     DurationOption,
     HostsOption,
@@ -34,6 +36,7 @@ from emulator.cli.options import (
     SeedOption,
     SetOption,
     VerboseOption,
+    debug_target,
     host_names,
     load,
 )
@@ -75,6 +78,7 @@ def run(
         int | None,
         typer.Option(metavar="N", min=1, help="Start the vehicles from N hosts (vnet host) on this machine."),
     ] = None,
+    debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -87,6 +91,9 @@ def run(
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
+        if debug is not None and hosts is not None:
+            raise VnetError("--debug and --hosts exclude each other")
+        asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
         with ended_at_once():
             from emulator.cli.execution import Request, run_with_processes
@@ -109,6 +116,7 @@ def simulate(
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
@@ -119,6 +127,7 @@ def simulate(
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+        asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
         with ended_at_once():
             from emulator.cli.execution import Request, run_in_this_process

@@ -15,6 +15,7 @@ import zenoh
 
 from emulator.drivers.router import SeparateRouter
 from emulator.viewer.sinks import Sinks
+from vnet.runtime.debug_target import DebugTarget
 from vnet.transport import keys, wire
 from vnet.transport.access import EMULATOR, Access
 from vnet.transport.session import open_client, open_router, router_endpoint
@@ -27,7 +28,7 @@ class LiveOptions:
     `listen` (embedded router), or `connect` (client of one that is there), or `router` (one started with the run).
     `launch` starts the agents, which are on hosts if `access` names some; `start_hosts` starts those here as well.
     `record` is where a recorder process writes its recording (a file in the run's folder, unless its path is
-    absolute), or None.
+    absolute), or None. `debug` has a debugger stop in a program.
     """
 
     access: Access
@@ -37,6 +38,7 @@ class LiveOptions:
     record: Sinks | None = None
     router: SeparateRouter | None = None
     start_hosts: bool = False
+    debug: DebugTarget | None = None
 
 
 class Attachment:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.process_group import GroupProcess
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
 from vnet.errors import VnetError
@@ -96,6 +97,8 @@ class Launcher:
         self.logs = logs
         self.disks: Path | None = None
         """Folder of the disks of vehicles, if agents are to have them in one place."""
+        self.debug: DebugPoint | None = None
+        """The debugger of a vehicle, and where its user answers."""
         self._folders = folders
         self._zygote = zygote
         self._processes: dict[str, Process] = {}
@@ -139,6 +142,8 @@ class Launcher:
             arguments += ["--files", str(self.disks.absolute())]
         for folder in self._folders:
             arguments += ["--path", str(folder)]
+        if self.debug is not None and self.debug.target.node in nodes:
+            arguments += ["--debug", str(self.debug.target), "--debug-socket", str(self.debug.socket)]
         return arguments
 
     def _fork_agents(self, zygote: Zygote, access: Access, agents: Mapping[str, list[str]], nice: int) -> None:

@@ -12,19 +12,24 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.signals import tell_from_handler
+from emulator.drivers.signals import signals_handled, tell_from_handler
 from emulator.records.node_logs import NodeLogs
 from vnet.runtime.cpu_meter import CpuMeter
+from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host, load_programs
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
+
+if TYPE_CHECKING:
+    from vnet.runtime.debugger import NodeDebugger
 
 _NONCE = b""
 
@@ -38,6 +43,7 @@ def simulate(
     before_horizon: Callable[[Lockstep], None] | None = None,
     stop: threading.Event | None = None,
     on_interrupt: Callable[[], None] = lambda: None,
+    debug: DebugTarget | None = None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
@@ -45,9 +51,9 @@ def simulate(
     it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
-    a thread of its own, at the first Ctrl-C.
+    a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program.
     """
-    simulation = _Simulation(emulation, before_horizon, stop or threading.Event())
+    simulation = _Simulation(emulation, before_horizon, stop or threading.Event(), debug)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
@@ -83,11 +89,22 @@ def _ending_between_instants(simulation: _Simulation, on_interrupt: Callable[[],
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def _debugger(target: DebugTarget, on_quit: Callable[[], None]) -> NodeDebugger:
+    """Return a debugger on this process's terminal. While it asks, Ctrl-C drops what was typed."""
+    from vnet.runtime.debugger import NodeDebugger  # pdb, which few runs need
+
+    return NodeDebugger(target, lambda: signals_handled(signal.default_int_handler, signal.SIGINT), on_quit)
+
+
 class _Simulation:
     """All nodes on one loop, and the barrier that this loop yields to."""
 
     def __init__(
-        self, emulation: Emulation, before_horizon: Callable[[Lockstep], None] | None, stop: threading.Event
+        self,
+        emulation: Emulation,
+        before_horizon: Callable[[Lockstep], None] | None,
+        stop: threading.Event,
+        debug: DebugTarget | None,
     ) -> None:
         node_ids = emulation.world.node_ids
         self._process_of = node_ids[0]
@@ -107,7 +124,13 @@ class _Simulation:
         self.loop.measure(self._meter)
         logs = NodeLogs(emulation.folder.logs)
         disks = Disks(emulation.folder.disks)
-        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write, disks=disks)
+        debugger = None if debug is None else _debugger(debug, self._quit)
+        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write, disks=disks, debugger=debugger)
+
+    def _quit(self) -> None:
+        """End the run wherever the debugger has stopped it."""
+        self.stop.set()
+        raise KeyboardInterrupt
 
     def run(self) -> None:
         """From the first grant to the last."""

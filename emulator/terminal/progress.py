@@ -54,13 +54,13 @@ class Progress:
         """The run has been judged: the contents of its verdict.json, and with what status the command ends."""
 
 
-def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool) -> Progress:
-    """Return the display of this run's progress on stderr."""
+def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool, picture: bool = True) -> Progress:
+    """Return the display of this run's progress on stderr; without `picture` lines in a terminal, too."""
     if quiet:
         return Progress()
     if log_format is LogFormat.JSON:
         return JsonLines(emulation, sys.stderr)
-    console = terminal(sys.stderr)
+    console = terminal(sys.stderr) if picture else None
     return PlainLines(emulation, sys.stderr) if console is None else Picture(emulation, console)
 
 

@@ -30,6 +30,7 @@ PYTHON = {"python": [], "pytest": ["-m", "pytest"]}
 """Run by this Python, with these arguments first."""
 MODULES = {"vnet": "emulator.cli", "vnet-agent": "agents.cli"}
 ONLY_PARSED = {
+    r"--debug ": "asks its user; tests/system/test_debugging.py has one",
     r"--rerun spawn": "opens a window",
     r"^vnet (view|play) ": "opens a window, or serves until somebody has looked",
     r"^vnet(-agent| emulator| host).*tls/": "needs another host, or its address",

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vnet.node import Node, NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
@@ -30,6 +30,9 @@ from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.units import NS_PER_S
+
+if TYPE_CHECKING:  # pdb, which few runs need
+    from vnet.runtime.debugger import NodeDebugger
 
 LONGEST_NOTE = 4000
 """Characters of a line of a log that are told to the emulator."""
@@ -47,7 +50,7 @@ class Host:
 
     `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
     puts it at once; lockstep takes it at the next yield). `on_line` is called with a node and a line of its log.
-    `disks` has the nodes' folders, by default temporary ones.
+    `disks` has the nodes' folders, by default temporary ones. `debugger` stops in the program of one of them.
     """
 
     def __init__(
@@ -57,7 +60,9 @@ class Host:
         on_traffic: Callable[[], None] = lambda: None,
         on_line: Callable[[str, str], None] = lambda node, line: None,
         disks: Disks | None = None,
+        debugger: NodeDebugger | None = None,
     ) -> None:
+        self._debugger = debugger
         self._disks = disks or Disks()
         self._clock = clock
         self._on_traffic = on_traffic
@@ -134,6 +139,8 @@ class Host:
         self._unhandled.attach(loop)
         logging.getLogger().addHandler(self._log_handler)
         self._programs = programs
+        if self._debugger is not None:
+            self._debugger.attach(self._is_debugged, self._clock)
         loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
         for node in self.nodes.values():
             if self._active[node.id]:
@@ -144,6 +151,13 @@ class Host:
         context.run(current_node.set, node)
         program = self._main(node, self._programs[node.id])
         self._loop.create_task(program, name=f"{node.id} main", context=context)
+
+    def _is_debugged(self) -> bool:
+        """Return whether code runs on behalf of the node that is debugged, and its program goes on."""
+        node, debugger = current_node.get(), self._debugger
+        if node is None or debugger is None or self._closing:
+            return False
+        return debugger.stops_in(node.id) and self._runs(node)
 
     def _raised_ns(self, node: Node | None) -> int | None:
         """Emulated time of an exception of `node`: while its process ends (simulated), when that began."""
@@ -356,10 +370,14 @@ class Host:
         self._settle_stopped()
         self._unhandled.settle()
         self._unhandled.close()
+        if self._debugger is not None:
+            self._debugger.detach()
         logging.getLogger().removeHandler(self._log_handler)
 
     async def _main(self, node: Node, program: Program) -> None:
         try:
+            if self._debugger is not None:
+                self._debugger.begin(node.id, program)
             await program(node)
         except GeneratorExit:
             raise
@@ -368,6 +386,8 @@ class Host:
                 raise
             self._exited(node, error)
         except (Exception, SystemExit) as error:
+            if self._debugger is not None and isinstance(error, Exception):
+                self._debugger.crashed(node.id, error)
             self._exited(node, error)
         else:
             self._over(node, "finished")

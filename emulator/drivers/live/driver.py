@@ -29,6 +29,8 @@ class Parts:
     inbox: Inbox
     reconnection: Reconnection
     changes: ChangeSignal
+    debugged: str | None = None
+    """The node whose program may wait for its user in a debugger."""
 
 
 class Driver(ABC):

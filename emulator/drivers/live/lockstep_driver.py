@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import Awaitable, Callable, Collection, Sequence
 
@@ -102,8 +103,14 @@ class LockstepDriver(Driver):
         while owed:
             for process_id, details in self._supervisor.take_deaths(owed.keys()).items():
                 self._lockstep.died(process_id, **details)
-            if owed and not await self._changes.wait(timeout_s):
+            patience_s = math.inf if self._waits_for_user(owed) else timeout_s
+            if owed and not await self._changes.wait(patience_s):
                 await self._stall(sorted(owed), timeout_s)
+
+    def _waits_for_user(self, process_ids: Collection[str]) -> bool:
+        """Return whether one of these processes may be in a debugger: its user takes what time it takes."""
+        debugged = self._parts.debugged
+        return debugged is not None and self._parts.members.process_of(debugged) in process_ids
 
     async def _await_returned(self, process_ids: Sequence[str]) -> None:
         """Wait until processes that have been started are ready: they may be granted the instant that comes."""

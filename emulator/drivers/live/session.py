@@ -20,6 +20,7 @@ import zenoh
 from emulator.drivers.attachment import Attachment, LiveOptions
 from emulator.drivers.control import answer, control_endpoint
 from emulator.drivers.cpu_watch import CpuWatch
+from emulator.drivers.debugging import debug_point
 from emulator.drivers.emulation import Emulation, PeriodView
 from emulator.drivers.join import Membership
 from emulator.drivers.launch import Launcher
@@ -83,6 +84,7 @@ async def run_live(
             session = LiveSession(emulation, options, launcher, before_horizon)
             stack.callback(session.close)
             on_open()
+            launcher.debug = stack.enter_context(debug_point(options.debug))
             launcher.logs, launcher.disks = emulation.folder.logs, emulation.folder.disks
             stack.enter_context(
                 control_endpoint(emulation.folder.path, session.endpoint, options.access, options.record)
@@ -267,6 +269,7 @@ class LiveSession:
             inbox=self._inbox,
             reconnection=reconnection,
             changes=self._changes,
+            debugged=None if self._options.debug is None else self._options.debug.node,
         )
         if self._emulation.scenario.run.pacing == "lockstep":
             return LockstepDriver(parts, processes, self._before_horizon)
