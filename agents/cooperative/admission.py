@@ -7,11 +7,11 @@ send is judged where it is used.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Generic, Protocol, TypeVar
 
-from agents.cooperative.frame import CooperativeFrame, FrameError, decode, short_name
+from agents.cooperative.frame import FrameError, short_name
 from vnet import Packet
-from vnet.types import Array
 
 STALE_PERIODS = 3
 """Age in periods beyond which a frame is stale: the radio takes less than one, a late vehicle another."""
@@ -24,7 +24,34 @@ FORGET_PERIODS = 10
 """Periods between two times at which senders are forgotten: it need not be exact."""
 
 
-class Admission:
+class Frame(Protocol):
+    """What is judged of a frame, of whatever layout."""
+
+    @property
+    def name(self) -> str:
+        """The sender's short name."""
+        ...
+
+    @property
+    def fix_time_ns(self) -> int:
+        """Time of the sender's fix."""
+        ...
+
+    @property
+    def epoch(self) -> int:
+        """Epoch of the consensus."""
+        ...
+
+    @property
+    def fingerprint(self) -> bytes:
+        """Bytes that come from the noise of the sender's receiver."""
+        ...
+
+
+F = TypeVar("F", bound=Frame)
+
+
+class Admission(Generic[F]):
     """The frames that the vehicle `name` admits.
 
     rejected: number of rejected frames by reason: those of `FrameError`, and replayed, stale, absurd,
@@ -32,8 +59,9 @@ class Admission:
     ids: node ids of the senders by short name.
     """
 
-    def __init__(self, name: str, period_ns: int, several: bool = False) -> None:
-        """With `several`, a sender may send several frames with the same fix."""
+    def __init__(self, name: str, period_ns: int, decode: Callable[[bytes], F], several: bool = False) -> None:
+        """Frames are decoded by `decode`; with `several`, a sender may send several with the same fix."""
+        self._decode = decode
         self.rejected: Counter[str] = Counter()
         self.ids: dict[str, str] = {}
         self._name = name
@@ -41,10 +69,10 @@ class Admission:
         self._several = several
         self._newest_ns: dict[str, int] = {}
         self._first_sender: dict[tuple[int, bytes], str] = {}
-        self._early: dict[tuple[str, int], tuple[str, CooperativeFrame]] = {}
+        self._early: dict[tuple[str, int], tuple[str, F]] = {}
         self._forgotten_ns = 0
 
-    def admit(self, packets: Iterable[Packet], now_ns: int) -> list[tuple[str, CooperativeFrame]]:
+    def admit(self, packets: Iterable[Packet], now_ns: int) -> list[tuple[str, F]]:
         """Return the frames to read, with their senders' short names, in the order of their arrival.
 
         In real time a vehicle that is late with its work finds frames of the next period: they wait for it.
@@ -55,7 +83,7 @@ class Admission:
         frames = list(waiting.values())
         for packet in packets:
             try:
-                frames.append((packet.sender, decode(packet.payload)))
+                frames.append((packet.sender, self._decode(packet.payload)))
             except FrameError as error:
                 self.rejected[str(error)] += 1
         admitted = []
@@ -72,7 +100,7 @@ class Admission:
                 admitted.append((sender, frame))
         return admitted
 
-    def _objection(self, sender: str, frame: CooperativeFrame, now_ns: int) -> str | None:
+    def _objection(self, sender: str, frame: F, now_ns: int) -> str | None:
         """Return the reason to reject the frame, if there is one."""
         if frame.name != sender or sender == self._name:
             return "replayed"
@@ -85,11 +113,11 @@ class Admission:
         known = (sender, frame.fix_time_ns) in self._early or self._newest_ns.get(sender, -1) >= frame.fix_time_ns
         if known and not self._several:
             return "duplicate"
-        return None if self.claim(sender, frame.fix_time_ns, frame.fix_m) else "replayed"
+        return None if self.claim(sender, frame.fix_time_ns, frame.fingerprint) else "replayed"
 
-    def claim(self, sender: str, time_ns: int, fix_m: Array) -> bool:
-        """Tell whether `sender` is the first with this fix (2,): no two receivers agree to the centimetre."""
-        return self._first_sender.setdefault((time_ns, fix_m.tobytes()), sender) == sender
+    def claim(self, sender: str, time_ns: int, fingerprint: bytes) -> bool:
+        """Tell whether `sender` is the first with what comes from a fix: no two receivers' noise is the same."""
+        return self._first_sender.setdefault((time_ns, fingerprint), sender) == sender
 
     def _forget(self, now_ns: int) -> None:
         """Forget senders and fixes that no frame can concern that is not stale."""

@@ -21,12 +21,13 @@ from agents.cooperative.frame import (
     RELAY_LIMIT,
     RELAYED,
     CooperativeFrame,
-    centimetres,
+    decode,
     encode,
     name_of_code,
     room,
     short_name,
 )
+from agents.cooperative.fusion_rule import FusionRule
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
 from vnet.cmm.consensus import (
@@ -40,14 +41,6 @@ from vnet.cmm.consensus import (
 from vnet.cmm.fusion import Cloud, fuse, shift
 from vnet.cmm.rbpf import Observation, Rbpf
 from vnet.cmm.robust import near_the_median
-from vnet.cmm.weights import (
-    OptimizedWeights,
-    constant_weights,
-    max_degree_weights,
-    metropolis_weights,
-    no_fusion_weights,
-    random_weights,
-)
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -74,9 +67,9 @@ class Estimator:
         self, node_id: str, options: Options, lanes: LaneMap | RoadMap, rng: np.random.Generator, period_ns: int
     ) -> None:
         self.name = short_name(node_id)
-        self._admission = Admission(self.name, period_ns, options.two_frames)
+        self._admission = Admission(self.name, period_ns, decode, options.two_frames)
         self.rbpf = Rbpf(options.filter_config(), lanes, rng)
-        self.consensus = _consensus(options, self.name, self.rejected)
+        self.consensus = mean_consensus(options, self.name, self.rejected)
         self.fused_m = self.rbpf.estimate_m
         self.weights: dict[str, float] = {}
         self.imported = 0
@@ -89,9 +82,8 @@ class Estimator:
         self._covariance_m2 = np.eye(2)
         self._frames: dict[str, CooperativeFrame] = {}
         self._fixes = FixTable(int(self.name, 16), period_ns)
-        self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
+        self._rule = FusionRule(options, rng)
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
-        self._largest_degree = 0
         self._sent = self._estimate()
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
@@ -114,6 +106,15 @@ class Estimator:
 
     def _is_neighbour(self, sender: str) -> bool:
         return self._neighbours is None or sender in self._neighbours
+
+    @property
+    def common_error(self) -> tuple[Array, Array]:
+        """Estimate (2,) of the common error, and its covariance (2, 2)."""
+        return self.rbpf.estimate_m, self.rbpf.estimate_covariance_m2
+
+    def sample(self, count: int) -> Array:
+        """Draw at most `count` hypotheses of the common error, (n, 2)."""
+        return self.rbpf.sample(min(count, self.rbpf.config.particles))
 
     def filter(self, own: Fix) -> None:
         """Take all fixes that have come, up to the time of the vehicle's `own`."""
@@ -144,8 +145,7 @@ class Estimator:
         everybody, self._frames = self._plausible(fresh), {}
         frames = {sender: frame for sender, frame in everybody.items() if self._is_neighbour(sender)}
         self._take_round(everybody if self._options.consensus == "exact" else frames)
-        degrees = [frame.largest_degree for frame in frames.values()]
-        self._largest_degree = max([self._largest_degree, len(self._share.heard), *degrees])
+        self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         self.imported = 0
         self.fused_m = self._fuse(frames) if frames and self._fusion_is_due() else self.rbpf.estimate_m
         if self._options.separate_map_update:
@@ -195,23 +195,8 @@ class Estimator:
 
     def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
-        count = 1 + len(frames)
-        match self._options.fusion:
-            case "none":
-                return no_fusion_weights(count)
-            case "random":
-                return random_weights(count, self._rng)
-            case "constant":
-                return constant_weights(count, self._options.alpha)
-            case "metropolis":
-                return metropolis_weights(len(frames), [len(frame.heard) for frame in frames.values()])
-            case "max-degree":
-                return max_degree_weights(count, max(self._largest_degree, len(frames)))
-            case _:
-                estimates, covariances = self._sent_estimates(frames)
-                mean = self.consensus.mean_m
-                mean = estimates.mean(axis=0) if mean is None else mean
-                return self._optimized.solve(estimates, covariances, mean)
+        degrees = [len(frame.heard) for frame in frames.values()]
+        return self._rule.weights(*self._sent_estimates(frames), self.consensus.mean_m, degrees)
 
     def _sent_estimates(self, frames: Mapping[str, CooperativeFrame]) -> tuple[Array, Array]:
         """Estimates (1 + n, 2) and covariances (1 + n, 2, 2) as they were sent, the vehicle's own first."""
@@ -227,7 +212,7 @@ class Estimator:
     def frame(self, fix: Fix, max_payload: int) -> bytes:
         """Return the bytes to broadcast with the newest fix, at most `max_payload`."""
         frame = self.compose(fix, max_payload)
-        self._admission.claim(self.name, fix.time_ns, np.array(centimetres(frame.fix_m)) / 100)
+        self._admission.claim(self.name, fix.time_ns, frame.fingerprint)
         return encode(frame)
 
     def compose(self, fix: Fix, max_payload: int) -> CooperativeFrame:
@@ -250,7 +235,7 @@ class Estimator:
             heard=heard,
             cloud_m=self.rbpf.sample(particles),
             relayed=self._fixes.freshest(fix.time_ns, relays if self._options.relay else 0),
-            largest_degree=min(self._largest_degree, MAX_DEGREE),
+            largest_degree=min(self._rule.largest_degree, MAX_DEGREE),
             name=self.name,
         )
 
@@ -266,7 +251,8 @@ def _known(sender: str, frame: CooperativeFrame) -> frozenset[str]:
     return frame.names_heard | {sender} | {name_of_code(code) for code in frame.relayed["name"].tolist()}
 
 
-def _consensus(options: Options, name: str, rejected: Counter[str]) -> Consensus:
+def mean_consensus(options: Options, name: str, rejected: Counter[str]) -> Consensus:
+    """Return the consensus of the options for the vehicle `name`; it counts in `rejected` what it does not take."""
     gate_m = MASS_GATE_SIGMAS * max(MIN_SIGMA_M, options.common_sigma_m) if options.defence else np.inf
     config = ConsensusConfig(gate_m=gate_m)
     match options.consensus:

@@ -92,6 +92,11 @@ class CooperativeFrame:
         """The names in `heard`."""
         return frozenset(self.heard)
 
+    @property
+    def fingerprint(self) -> bytes:
+        """The fix in centimetres, as bytes: no two receivers agree to the centimetre."""
+        return struct.pack("<2i", *centimetres(self.fix_m))
+
     def own_fix(self, code: int) -> NDArray[np.void]:
         """The sender's own fix, (1,) of `RELAYED`, under its code."""
         x_cm, y_cm = centimetres(self.fix_m)

@@ -13,6 +13,7 @@ from agents import options as parsing
 from agents.cooperative.frame import COMMON_LIMIT_M
 from vnet.cmm.consensus import AveragingRule
 from vnet.cmm.map_matching import MIN_MAP_LOG_LIKELIHOOD
+from vnet.cmm.own_vehicle import OwnConfig
 from vnet.cmm.rbpf import RbpfConfig
 
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -54,10 +55,15 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """`paper` gives many other keys the paper's values as defaults; keys that are set besides still count."""
     fusion: Literal["optimized", "random", "metropolis", "max-degree", "constant", "none"] = "optimized"
     """Rule of the fusion weights; `none` fuses nothing."""
-    exchange: Literal["estimates", "particles"] = "estimates"
-    """Fusion moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper."""
+    exchange: Literal["information", "estimates", "particles"] = "estimates"
+    """What is exchanged: information about the common error, each vehicle filtering itself alone; or fixes, with
+    fusion that moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper."""
     relay: bool = True
-    """If true, a frame relays the newest fixes of others."""
+    """If true, a frame relays the newest fixes of others; not with `exchange = "information"`."""
+    relay_increments: Annotated[int, Meta(ge=0, le=255)] = 30
+    """Number of increments that a frame passes on, with `exchange = "information"`."""
+    lateral_sigma_m: Deviation = 0.0
+    """Deviation of the offset in a straight lane, with `exchange = "information"`; 0 means 0.45 half-widths."""
     consensus: Literal["ratio", AveragingRule, "exact"] = "ratio"
     """Algorithm that finds the mean of all estimates. `exact` averages all frames, so that all must hear all."""
     alpha: Share = 0.5
@@ -107,6 +113,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         if parsed.hears and parsed.consensus != "exact":
             raise parsing.refuse("hears", parsed.hears, 'allowed with consensus = "exact" only')
         return parsed
+
+    def own_config(self) -> OwnConfig:
+        """Return the constants of the filter of a vehicle that exchanges information."""
+        return OwnConfig(self.filter_config(), self.lateral_sigma_m)
 
     def filter_config(self) -> RbpfConfig:
         """Return the constants of the vehicle's particle filter."""

@@ -19,6 +19,7 @@ import numpy as np
 from agents.cooperative.estimator import Estimator, usable
 from agents.cooperative.frame import NAME_BYTES
 from agents.cooperative.gnss_clock import GnssClock
+from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.options import Options
 from vnet import Fix, Node
 from vnet.units import NS_PER_S
@@ -42,10 +43,11 @@ CLOUD_REPORT_PARTICLES = 50
 async def main(node: Node) -> None:
     """Cooperate until the run ends."""
     options = Options.parse(node.options)
-    await cooperate(node, options, Estimator(node.id, options, node.map, node.rng, node.period_ns))
+    kind = InformationEstimator if options.exchange == "information" else Estimator
+    await cooperate(node, options, kind(node.id, options, node.map, node.rng, node.period_ns))
 
 
-async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
+async def cooperate(node: Node, options: Options, estimator: Estimator | InformationEstimator) -> None:
     """Run the vehicle's loop around its `estimator`, until the run ends."""
     slot = int(node.rng.integers(options.slots))
     slot_ns = slot * round(SENDING_SHARE * node.period_ns) // options.slots
@@ -72,7 +74,7 @@ async def cooperate(node: Node, options: Options, estimator: Estimator) -> None:
         _report(node, estimator, fix, {"heard": len(packets), "bytes": payload_bytes})
 
 
-async def _broadcast(node: Node, estimator: Estimator, fix: Fix) -> int:
+async def _broadcast(node: Node, estimator: Estimator | InformationEstimator, fix: Fix) -> int:
     """Broadcast the estimator's frame; returns its size in bytes, 0 if the fix cannot be sent."""
     if not usable(fix):
         return 0
@@ -93,16 +95,16 @@ def listening_share(name: str, options: Options) -> float:
     return first_share + turn * (TURNS_SHARE - first_share)
 
 
-def _report(node: Node, estimator: Estimator, fix: Fix, counts: dict[str, int]) -> None:
+def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, counts: dict[str, int]) -> None:
     """Report the position, the common error, and `counts` of the period.
 
     Once a second also the cloud, the fusion weights, and the number of rejections by reason.
     """
-    rbpf = estimator.rbpf
     position_m, covariance_m2 = estimator.position(fix)
+    common_m, common_covariance_m2 = estimator.common_error
     values: dict[str, Any] = {
-        "common_error_m": rbpf.estimate_m,
-        "common_error_covariance_m2": rbpf.estimate_covariance_m2,
+        "common_error_m": common_m,
+        "common_error_covariance_m2": common_covariance_m2,
         "stacked_common_error_m": estimator.fused_m,
         "heard": counts["heard"],
         "imported": estimator.imported,
@@ -113,7 +115,7 @@ def _report(node: Node, estimator: Estimator, fix: Fix, counts: dict[str, int]) 
     if mean_m is not None:
         values["mean_m"] = mean_m
     if (fix.time_ns // node.period_ns) % max(1, NS_PER_S // node.period_ns) == 0:
-        values["cloud_m"] = rbpf.sample(min(CLOUD_REPORT_PARTICLES, rbpf.config.particles))
+        values["cloud_m"] = estimator.sample(CLOUD_REPORT_PARTICLES)
         values |= {f"weight.{other}": weight for other, weight in estimator.weights.items()}
         values |= {f"rejected.{reason}": count for reason, count in estimator.rejected.items()}
     if np.isfinite(position_m).all():

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vnet.cmm.common_error import systematic
+from vnet.cmm.information import Information, transport
 from vnet.cmm.rbpf import Rbpf
 from vnet.cmm.weights import largest_remainder
 from vnet.types import Array
@@ -71,6 +72,20 @@ def shift(rbpf: Rbpf, by_m: Array) -> None:
     particles.past_m += (slopes.past @ by_m)[..., None]
     tracks.mean += (slopes.mean @ by_m)[..., None]
     tracks.map_log_likelihood += (slopes.map_log_likelihood @ by_m)[..., None]
+
+
+def transport_cloud(rbpf: Rbpf, pooled: Information) -> None:
+    """Move the filter's cloud to the moments of `pooled`, and what goes with it along the regression on c."""
+    slopes = regression_on_common_error(rbpf)
+    particles, tracks = rbpf.particles, rbpf.tracks
+    mean_m, covariance_m2 = pooled.moments()
+    spread_m = particles.common_m - particles.estimate_m[:, None]
+    moves = transport(particles.covariance_m2 + MIN_VARIANCE_M2 * np.eye(2), covariance_m2) @ spread_m
+    by_m = mean_m[:, None] + moves - particles.common_m
+    particles.common_m = particles.common_m + by_m
+    particles.past_m += slopes.past @ by_m
+    tracks.mean += slopes.mean @ by_m
+    tracks.map_log_likelihood += slopes.map_log_likelihood @ by_m
 
 
 def regression_on_common_error(rbpf: Rbpf) -> Slopes:

@@ -7,6 +7,7 @@ ridge that says how uncertain each estimate is itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import osqp
@@ -51,8 +52,9 @@ class OptimizedWeights:
             ridge = np.maximum(np.trace(covariances_m2, axis1=1, axis2=2), RIDGE_FLOOR_M2)
         else:
             ridge = np.full(count, self._ridge_m2)
-        hessian = 2 * (offset @ offset.T + np.diag(ridge))
-        scale = float(np.mean(np.diag(hessian)))  # OSQP's tolerances are absolute
+        hessian = 2 * (offset @ offset.T)
+        hessian.flat[:: count + 1] += 2 * ridge
+        scale = float(hessian.flat[:: count + 1].mean())  # OSQP's tolerances are absolute
         rows, columns = _upper_triangle(count)
         solver = self._solver(count)
         solver.update(Px=(hessian / scale)[rows, columns])
@@ -156,6 +158,7 @@ _SETTINGS = {
 }
 
 
+@lru_cache(maxsize=256)
 def _upper_triangle(count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of the upper triangle in the order of OSQP's data: column by column."""
     rows, columns = np.triu_indices(count)

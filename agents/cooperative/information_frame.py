@@ -1,0 +1,163 @@
+"""The frame of a vehicle that exchanges information about the common error, as bytes and back (MODEL 10).
+
+It holds what the sender knew of the common error before its fix (the prior), what the fix says about it (the
+increment), the state of the consensus, the names of the vehicles heard, and, if increments are passed on, those
+that the sender used in the period before. It ends with a CRC-32, and names its sender. Bytes that do not decode, or
+decode to absurd values, raise a `FrameError` with a reason of one word.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
+from vnet.types import Array
+
+VERSION = 4
+"""Version of the layout; `frame` has 3."""
+INFORMATION_LIMIT = 1e6
+"""Largest entry of a matrix (1/m²): a deviation of a millimetre."""
+PASSED_LIMIT = 255
+"""Number of increments in a frame: it is one byte."""
+MAX_HEARD = 255
+"""Number of names in a frame: it is one byte."""
+
+# version, heard, passed on, largest degree, name, fix time, prior (Λ, η), increment (δΛ, δη), epoch, running sums
+_HEADER = struct.Struct("<BBBBIq5f5fI3d")
+_CHECKSUM = struct.Struct("<I")
+PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
+"""An increment that is passed on: its origin, and (δΛ_xx, δΛ_xy, δΛ_yy, δη_x, δη_y) with half precision."""
+
+
+def _nothing_passed() -> NDArray[np.void]:
+    return np.empty(0, dtype=PASSED)
+
+
+@dataclass(frozen=True)
+class InformationFrame:
+    """The contents of a frame; names are `short_name`s.
+
+    prior, increment: (5,), the matrix (xx, xy, yy) in 1/m² and the vector (x, y) in 1/m.
+    heard: the names of the vehicles received lately; true for out-neighbours, which are given a share.
+    passed: (n,) records of `PASSED`, increments of the period before the frame's.
+    largest_degree: the largest number of neighbours of any vehicle, as far as this one knows.
+    """
+
+    name: str
+    fix_time_ns: int
+    prior: tuple[float, ...]
+    increment: tuple[float, ...]
+    epoch: int
+    running_sum: tuple[float, float, float]
+    heard: dict[str, bool]
+    passed: NDArray[np.void] = field(default_factory=_nothing_passed)
+    largest_degree: int = 0
+
+    @property
+    def out_neighbours(self) -> frozenset[str]:
+        """The out-neighbours: those of `heard` that are given a share."""
+        return frozenset(name for name, is_given in self.heard.items() if is_given)
+
+    @property
+    def names_heard(self) -> frozenset[str]:
+        """The names in `heard`."""
+        return frozenset(self.heard)
+
+    @property
+    def fingerprint(self) -> bytes:
+        """Bytes that no two senders share at one time: they come from the noise of a receiver."""
+        return np.array(self.increment, dtype="<f4").tobytes()
+
+
+def encode(frame: InformationFrame) -> bytes:
+    """Encode a frame."""
+    header = _HEADER.pack(
+        VERSION,
+        len(frame.heard),
+        len(frame.passed),
+        frame.largest_degree,
+        int(frame.name, 16),
+        frame.fix_time_ns,
+        *frame.prior,
+        *frame.increment,
+        frame.epoch,
+        *frame.running_sum,
+    )
+    names = bytes.fromhex("".join(frame.heard))
+    flags = np.packbits(np.array(list(frame.heard.values()), dtype=bool)).tobytes()
+    body = header + names + flags + frame.passed.tobytes()
+    return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
+def room(heard: int, max_payload: int) -> int:
+    """Return the number of increments that fit beside `heard` names in `max_payload` bytes."""
+    left = max_payload - _HEADER.size - _CHECKSUM.size - heard * NAME_BYTES - (heard + 7) // 8
+    return min(PASSED_LIMIT, max(0, left // PASSED.itemsize))
+
+
+@lru_cache(maxsize=4096)  # where many vehicles share a process, a frame is decoded once and not by each receiver
+def decode(payload: bytes) -> InformationFrame:
+    """Decode a frame.
+
+    Raises FrameError: `length`, `version`, `checksum`, `not_finite`, `absurd` or `covariance`.
+    """
+    end = len(payload) - _CHECKSUM.size
+    if end < _HEADER.size:
+        raise FrameError("length")
+    version, heard_count, passed_count, degree, name, fix_time_ns, *numbers = _HEADER.unpack_from(payload)
+    if version != VERSION:
+        raise FrameError("version")
+    names_end = _HEADER.size + heard_count * NAME_BYTES
+    flags_end = names_end + (heard_count + 7) // 8
+    if end != flags_end + PASSED.itemsize * passed_count:
+        raise FrameError("length")
+    if (zlib.crc32(payload[:end]),) != _CHECKSUM.unpack_from(payload, end):
+        raise FrameError("checksum")
+    prior, increment, epoch, running_sum = numbers[:5], numbers[5:10], numbers[10], numbers[11:]
+    passed = np.frombuffer(payload[flags_end:end], dtype=PASSED)
+    _check(prior, increment, running_sum, passed["information"])
+    flags = np.unpackbits(np.frombuffer(payload[names_end:flags_end], dtype=np.uint8), count=heard_count)
+    names, width = payload[_HEADER.size : names_end].hex(), 2 * NAME_BYTES
+    each = (names[i : i + width] for i in range(0, len(names), width))
+    return InformationFrame(
+        name=name_of_code(name),
+        fix_time_ns=fix_time_ns,
+        prior=tuple(prior),
+        increment=tuple(increment),
+        epoch=epoch,
+        running_sum=(running_sum[0], running_sum[1], running_sum[2]),
+        heard=dict(zip(each, flags.astype(bool).tolist(), strict=True)),
+        passed=passed,
+        largest_degree=degree,
+    )
+
+
+def _check(prior: list[float], increment: list[float], running_sum: list[float], passed: Array) -> None:
+    numbers = np.array([*prior, *increment, *running_sum])
+    if not (np.isfinite(numbers).all() and np.isfinite(passed).all()):
+        raise FrameError("not_finite")
+    s_x, s_y, weight = running_sum
+    if not 0 <= weight < MAX_WEIGHT or max(abs(s_x), abs(s_y)) > COMMON_LIMIT_M * weight:
+        raise FrameError("absurd")
+    a, b, d, x, y = prior
+    determinant = a * d - b * b
+    if not (a > 0 and d > 0 and determinant > 1e-6 * a * d):
+        raise FrameError("covariance")
+    if not is_increment(np.array([increment]))[0] or not is_increment(passed.astype(float)).all():
+        raise FrameError("covariance")
+    mean_m = abs(d * x - b * y) / determinant, abs(a * y - b * x) / determinant
+    if max(mean_m) > COMMON_LIMIT_M or max(a, d, *increment[:1], increment[2]) > INFORMATION_LIMIT:
+        raise FrameError("absurd")
+
+
+def is_increment(information: Array) -> NDArray[np.bool_]:
+    """Tell which of (n, 5) have a matrix that is positive semidefinite, but for rounding."""
+    a, b, d = information[:, 0], information[:, 1], information[:, 2]
+    slack = 1e-2 * np.abs(information[:, [0, 2]]).max(axis=1) + 1e-6
+    return np.asarray((a >= 0) & (d >= 0) & ((a + slack) * (d + slack) >= b * b))

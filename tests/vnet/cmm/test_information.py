@@ -1,0 +1,118 @@
+"""Information about the common error: its algebra, and what a vehicle believes of others'."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from vnet.cmm.information import Information, gained, inverse, square_root, transport
+from vnet.cmm.plausibility import Origins, deviation, inverses, matrices, median_belief, priors_agree, scaled_down
+from vnet.types import Array
+
+
+@st.composite
+def covariances(draw: st.DrawFn) -> Array:
+    """Draw a positive definite matrix with deviations of 1 cm to 10 m, in any direction."""
+    sigma = [draw(st.floats(0.01, 10)) for _ in range(2)]
+    angle = draw(st.floats(0, np.pi))
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    return np.asarray(turn @ np.diag(np.square(sigma)) @ turn.T)
+
+
+@given(covariances())
+def test_inverse_and_square_root_are_those_of_the_matrix(matrix: Array) -> None:
+    assert_allclose(inverse(matrix) @ matrix, np.eye(2), atol=1e-6)
+    assert_allclose(square_root(matrix) @ square_root(matrix), matrix, rtol=1e-9, atol=1e-9)
+    assert_allclose(inverses(matrix[None])[0], np.linalg.inv(matrix), rtol=1e-6, atol=1e-9)
+
+
+@given(covariances(), covariances())
+def test_a_cloud_that_is_transported_has_the_new_covariance(old: Array, new: Array) -> None:
+    moves = transport(old, new)
+    assert_allclose(moves @ old @ moves.T, new, rtol=1e-4, atol=1e-7)
+    assert_allclose(moves, moves.T, rtol=1e-5, atol=1e-8)  # symmetric and positive: nothing is turned needlessly
+    assert np.linalg.eigvalsh(moves)[0] > 0
+
+
+@given(covariances(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
+def test_what_is_gained_is_what_was_added(prior: Array, noise: Array, fix: tuple[float, float]) -> None:
+    before = Information.of(np.array([1.0, -2.0]), prior)
+    added = Information.of(np.array(fix), noise)
+    got = gained(before, before.plus(added))
+    assert_allclose(got.matrix, added.matrix, rtol=1e-6, atol=1e-6 * np.abs(before.matrix).max())
+    assert_allclose(got.vector, added.vector, rtol=1e-5, atol=1e-5 * np.abs(before.matrix).max())
+    lost = gained(before.plus(added), before)  # nothing was gained: less is known in every direction
+    assert_allclose(lost.matrix, 0, atol=1e-9)
+    assert_allclose(lost.vector, 0, atol=1e-9)
+
+
+def test_moments_come_back() -> None:
+    mean_m, covariance_m2 = np.array([3.0, -1.0]), np.array([[2.0, 0.5], [0.5, 1.0]])
+    for got, expected in zip(Information.of(mean_m, covariance_m2).moments(), (mean_m, covariance_m2), strict=True):
+        assert_allclose(got, expected)
+
+
+def _information(mean_m: tuple[float, float], variance_m2: float) -> Array:
+    matrix = np.eye(2) / variance_m2
+    return np.array([matrix[0, 0], 0.0, matrix[1, 1], *(matrix @ mean_m)])
+
+
+def test_what_says_too_much_is_scaled_and_keeps_its_mean() -> None:
+    loud, quiet = _information((4.0, 2.0), 0.01), _information((1.0, 1.0), 10.0)
+    scaled = scaled_down(np.array([loud, quiet]), 1.0)
+    assert_allclose(scaled[1], quiet)
+    assert scaled[0, 0] + scaled[0, 2] == pytest.approx(1.0)
+    assert_allclose(np.linalg.solve(matrices(scaled)[0], scaled[0, 3:]), [4.0, 2.0])
+
+
+def test_deviation_is_the_mahalanobis_distance_of_a_fix() -> None:
+    """An increment of a vehicle that knows where it is: a measurement of c with noise R."""
+    mean_m, covariance_m2, noise_m2 = np.array([1.0, 2.0]), np.diag([0.5, 0.2]), 4.0
+    increment = _information((3.0, 1.0), noise_m2)[None]
+    off = np.array([2.0, -1.0])
+    expected = off @ np.linalg.solve(covariance_m2 + noise_m2 * np.eye(2), off)
+    assert deviation(increment, mean_m, covariance_m2, increment[:, :3])[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_lane_that_says_nothing_along_itself_may_not_move_c_along_it() -> None:
+    belief = np.zeros(2), 0.1 * np.eye(2)
+    across = np.array([[0.5, 0.0, 0.0, 0.2, 0.0]])
+    along = np.array([[0.5, 0.0, 0.0, 0.2, 0.5]])
+    assert deviation(across, *belief, across[:, :3])[0] < 1
+    assert deviation(along, *belief, along[:, :3])[0] > 1000
+
+
+def test_a_small_lie_is_found_in_the_sum_and_forgiven_later() -> None:
+    origins, belief = Origins(), (np.zeros(2), 0.01 * np.eye(2))
+    honest, liar = _information((0.3, 0.0), 2.0), _information((3.0, 0.0), 2.0)
+    believed = [origins.agree([1, 2], np.array([honest, liar]), belief, 0.1 * k).tolist() for k in range(50)]
+    assert all(good for good, _ in believed)
+    assert believed[0][1]  # by itself it is what noise may do
+    assert not any(lie for _, lie in believed[10:])
+    assert origins.agree([2], honest[None], belief, 60.0).tolist() == [True]
+
+
+def test_only_so_many_origins_are_kept() -> None:
+    origins, belief = Origins(), (np.zeros(2), np.eye(2))
+    increment = _information((0.0, 0.0), 1.0)
+    for first in range(0, 20_000, 500):
+        origins.agree(list(range(first, first + 500)), np.tile(increment, (500, 1)), belief, first / 100)
+    assert len(origins._row) <= 1024
+    assert len(origins._sums) <= 1524
+
+
+def test_priors_agree_within_what_both_claim() -> None:
+    means, covariances_m2 = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0]]), np.tile(0.5 * np.eye(2), (3, 1, 1))
+    assert priors_agree(means, covariances_m2, np.zeros(2), 0.5 * np.eye(2)).tolist() == [True, True, False]
+
+
+def test_the_median_belief_is_not_moved_by_one_liar() -> None:
+    priors = np.array(
+        [_information((1.0, 1.0), 0.2), _information((1.2, 0.8), 0.1), _information((99.0, -99.0), 1e-6)]
+    )
+    mean_m, covariance_m2 = median_belief(priors).moments()
+    assert_allclose(mean_m, [1.2, 0.8])
+    assert_allclose(covariance_m2, 0.4 * np.eye(2))

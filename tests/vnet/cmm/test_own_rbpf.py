@@ -1,0 +1,152 @@
+"""The filter of a vehicle that tracks itself alone, and the bound, against textbook filters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from vnet.cmm.information import Information
+from vnet.cmm.kalman_bound import KalmanBound, LaneModel
+from vnet.cmm.own_rbpf import OwnRbpf
+from vnet.types import Array
+
+NOISE_M2 = np.eye(2)
+EAST = (np.zeros((1, 2)), np.zeros(1))
+
+
+def _fixes(count: int, heading_rad: float, common_m: Array, seed: int) -> Array:
+    """Draw fixes (count, 2) of a vehicle that stands 0.3 m to the right of the lane's centre line."""
+    rng = np.random.default_rng(seed)
+    right = np.array([np.sin(heading_rad), -np.cos(heading_rad)])
+    return np.asarray(0.3 * right + common_m + rng.standard_normal((count, 2)))
+
+
+def test_the_bound_is_the_textbook_filter() -> None:
+    """Two vehicles on crossing lanes, written out as one filter on (c, l, s, v, l, s, v)."""
+    model, heading_rad = LaneModel(), np.array([0.0, np.pi / 2])
+    bound = KalmanBound(np.zeros((2, 2)), heading_rad, model)
+    mean, covariance = np.zeros(8), np.zeros((8, 8))
+    covariance[:2, :2] = 9 * np.eye(2)
+    covariance[2:5, 2:5] = covariance[5:, 5:] = model.own_covariance()
+    observe = np.zeros((4, 8))
+    for vehicle, heading in enumerate(heading_rad):
+        right, along = [np.sin(heading), -np.cos(heading)], [np.cos(heading), np.sin(heading)]
+        observe[2 * vehicle : 2 * vehicle + 2, :2] = np.eye(2)
+        observe[2 * vehicle : 2 * vehicle + 2, 2 + 3 * vehicle : 4 + 3 * vehicle] = np.column_stack([right, along])
+    common_m = np.array([2.0, -1.0])
+    fixes = np.stack([_fixes(60, heading, common_m, 3 + k) for k, heading in enumerate(heading_rad)], axis=1)
+    for k, fix in enumerate(fixes):
+        dt_s = 0.1 if k else 0.0
+        keep, variance = model.common_step(dt_s)
+        step, noise = np.eye(8), np.zeros((8, 8))
+        step[:2, :2], noise[:2, :2] = keep * np.eye(2), variance * np.eye(2)
+        for rows in (slice(2, 5), slice(5, 8)):
+            step[rows, rows], noise[rows, rows] = model.transition(dt_s), model.process_noise(dt_s)
+        mean, covariance = step @ mean, step @ covariance @ step.T + noise
+        innovation = observe @ covariance @ observe.T + np.eye(4)
+        gain = covariance @ observe.T @ np.linalg.inv(innovation)
+        mean = mean + gain @ (fix.ravel() - observe @ mean)
+        covariance = covariance - gain @ observe @ covariance
+        bound.step(dt_s, fix, NOISE_M2)
+    assert_allclose(bound.common_m, mean[:2], atol=1e-6)
+    assert_allclose(bound.common_covariance_m2, covariance[:2, :2], atol=1e-6)
+    assert_allclose(bound.position_m[0], [mean[3], -mean[2]], atol=1e-5)
+    assert np.linalg.norm(bound.common_m - common_m) < 1.0
+
+
+def test_a_vehicle_without_a_fix_is_predicted() -> None:
+    bound = KalmanBound(np.zeros((2, 2)), np.array([0.0, 1.0]))
+    bound.step(0.0, np.array([[1.0, 1.0], [np.nan, np.nan]]), NOISE_M2)
+    before = bound.common_covariance_m2.copy()
+    bound.step(0.1, np.full((2, 2), np.nan), NOISE_M2)
+    assert np.trace(bound.common_covariance_m2) >= np.trace(before) - 1e-9
+
+
+@pytest.mark.parametrize("heading_rad", [0.0, 1.1])
+def test_alone_it_is_the_kalman_filter(heading_rad: float) -> None:
+    model = LaneModel()
+    lane = np.zeros((1, 2)), np.array([heading_rad])
+    own = OwnRbpf(lane, model, 20_000, np.random.default_rng(1))
+    bound = KalmanBound(*lane, model)
+    for k, fix in enumerate(_fixes(100, heading_rad, np.array([2.0, -1.0]), 7)):
+        own.predict(0.1 if k else 0.0)
+        bound.step(0.1 if k else 0.0, fix[None], NOISE_M2)
+        own.update(fix, NOISE_M2)
+    assert_allclose(own.estimate_m, bound.common_m, atol=0.15)
+    assert_allclose(own.estimate_covariance_m2, bound.common_covariance_m2, rtol=0.1, atol=0.25)
+    position_m, covariance_m2 = own.position_m()
+    assert_allclose(position_m, bound.position_m[0], atol=0.15)
+    assert_allclose(covariance_m2, bound.position_covariance_m2()[0], rtol=0.1, atol=0.25)
+
+
+def test_the_increment_is_what_the_fix_adds() -> None:
+    own = OwnRbpf(EAST, LaneModel(), 50_000, np.random.default_rng(2))
+    for fix in _fixes(5, 0.0, np.array([1.0, 1.0]), 5):
+        own.predict(0.1)
+        before, increment = own.belief, own.increment(fix, NOISE_M2)
+        own.update(fix, NOISE_M2)
+        expected = before.plus(increment).moments()
+        assert_allclose(own.estimate_m, expected[0], atol=0.05)
+        assert_allclose(own.estimate_covariance_m2, expected[1], rtol=0.05, atol=0.05)
+
+
+def test_nothing_counts_twice() -> None:
+    """A vehicle that has long known its offset says little more: the lane is evidence once."""
+    own = OwnRbpf(EAST, LaneModel(common_tau_s=1e9, lateral_tau_s=1e9), 2000, np.random.default_rng(3))
+    said = []
+    for fix in _fixes(300, 0.0, np.zeros(2), 9):
+        own.predict(0.1)
+        said.append(np.trace(own.increment(fix, NOISE_M2).matrix))
+        own.update(fix, NOISE_M2)
+    assert sum(said) < 1.2 / 0.38**2  # no more than what an offset of 0.38 m can tell
+    assert said[-1] < said[0] / 50
+
+
+def test_pooled_information_is_taken_exactly() -> None:
+    own = OwnRbpf(EAST, LaneModel(), 500, np.random.default_rng(4))
+    own.predict(0.0)
+    own.update(np.array([1.0, 1.0]), NOISE_M2)
+    pooled = Information.of(np.array([0.5, -0.5]), np.array([[0.3, 0.1], [0.1, 0.2]]))
+    place_m, _ = own.position_m()
+    moved = own.estimate_m - pooled.moments()[0]
+    own.absorb(pooled)
+    assert_allclose(own.estimate_m, [0.5, -0.5], atol=1e-9)
+    assert_allclose(own.estimate_covariance_m2, [[0.3, 0.1], [0.1, 0.2]], atol=1e-6)
+    # Along the lane nothing but the fix tells where it is: it moves against c.
+    assert_allclose((own.position_m()[0] - place_m)[0], moved[0], atol=0.05)
+
+
+@pytest.mark.parametrize("lane", [0, 1, 2])
+def test_of_competing_lanes_the_one_that_fits_c_is_found(lane: int) -> None:
+    """Three lanes 3.5 m apart; the fixes alone cannot tell which, what others know of c can."""
+    points = np.array([[0.0, 3.5], [0.0, 0.0], [0.0, -3.5]])
+    own = OwnRbpf((points, np.zeros(3)), LaneModel(), 1000, np.random.default_rng(5))
+    rng = np.random.default_rng(6)
+    common_m = np.array([1.0, 2.0])
+    for k in range(60):
+        own.predict(0.1)
+        fix = points[lane] + common_m + rng.standard_normal(2)
+        own.update(fix, NOISE_M2)
+        if k == 5:
+            assert len(own.lane_probability) > 1
+        if k >= 10:
+            own.absorb(own.belief.plus(Information.of(common_m + 0.5 * rng.standard_normal(2), np.eye(2))))
+    assert len(own.lane_probability) == 1
+    assert_allclose(own.position_m()[0], points[lane], atol=0.8)
+    assert_allclose(own.estimate_m, common_m, atol=0.6)
+
+
+def test_a_fix_that_is_far_off_is_seen() -> None:
+    own = OwnRbpf(EAST, LaneModel(), 500, np.random.default_rng(8))
+    for fix in _fixes(20, 0.0, np.zeros(2), 4):
+        own.predict(0.1)
+        own.update(fix, NOISE_M2)
+    assert own.distance(np.array([0.3, 0.2]), NOISE_M2) < 9
+    assert own.distance(np.array([30.0, 0.0]), NOISE_M2) > 25
+
+
+def test_the_sample_is_of_the_cloud() -> None:
+    own = OwnRbpf(EAST, LaneModel(), 400, np.random.default_rng(8))
+    assert own.sample(50).shape == (50, 2)
+    assert set(map(tuple, own.sample(50).tolist())) <= set(map(tuple, own.common_m.T.tolist()))

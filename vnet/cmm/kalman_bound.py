@@ -1,0 +1,157 @@
+"""The hears-all bound on straight lanes: one Kalman filter that hears every fix of a component without loss.
+
+With straight lanes, one candidate each, cooperative map matching is a linear-Gaussian problem once the lateral
+offset of a vehicle is a state: x = [c, (l_j, s_j, v_j) for all j], with the common error c, the offset l_j to the right of
+the lane's centre line, and position and speed s_j, v_j along it (MODEL 10). No estimator that is told the same can
+have a smaller error in the mean, so this filter is the bound of every other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from vnet.types import Array
+
+LATERAL_SIGMA_M = 0.38
+"""Deviation (m) of a lateral offset: that of 0.4 m after reflection at ±0.85 m."""
+UNKNOWN_ALONG_M = 1e4
+"""Deviation (m) of the position along the lane before the first fix: unknown."""
+
+
+@dataclass(frozen=True)
+class LaneModel:
+    """Constants of the linear-Gaussian model; lengths in metres, times in seconds.
+
+    common_sigma_m, common_tau_s: the common error, a Gauss-Markov process an axis.
+    common_walk_m: in place of it, the deviation of a random walk after a second.
+    lateral_sigma_m, lateral_tau_s: the lateral offset, a Gauss-Markov process.
+    acceleration_m2_s4: variance of the white acceleration along the lane.
+    speed_sigma_m_s: deviation of the speed at the start.
+    """
+
+    common_sigma_m: float = 3.0
+    common_tau_s: float = 600.0
+    common_walk_m: float | None = None
+    lateral_sigma_m: float = LATERAL_SIGMA_M
+    lateral_tau_s: float = 20.0
+    acceleration_m2_s4: float = 1.0
+    speed_sigma_m_s: float = 0.5
+
+    def transition(self, dt_s: float) -> Array:
+        """Return F (3, 3) of a vehicle's own state (l, s, v) over `dt_s`."""
+        keep = np.exp(-dt_s / self.lateral_tau_s)
+        return np.array([[keep, 0.0, 0.0], [0.0, 1.0, dt_s], [0.0, 0.0, 1.0]])
+
+    def process_noise(self, dt_s: float) -> Array:
+        """Return Q (3, 3) of a vehicle's own state over `dt_s`."""
+        keep = np.exp(-dt_s / self.lateral_tau_s)
+        noise = np.zeros((3, 3))
+        noise[0, 0] = self.lateral_sigma_m**2 * (1 - keep**2)
+        step = np.array([dt_s**2 / 2, dt_s])
+        noise[1:, 1:] = self.acceleration_m2_s4 * np.outer(step, step)
+        return noise
+
+    def own_covariance(self) -> Array:
+        """Return the covariance (3, 3) of a vehicle's own state before its first fix."""
+        return np.diag([self.lateral_sigma_m**2, UNKNOWN_ALONG_M**2, self.speed_sigma_m_s**2])
+
+    def common_step(self, dt_s: float) -> tuple[float, float]:
+        """Return the factor of c over `dt_s`, and the variance (m²) that is added an axis."""
+        return common_step(self.common_sigma_m, self.common_tau_s, self.common_walk_m, dt_s)
+
+
+def common_step(sigma_m: float, tau_s: float, walk_m: float | None, dt_s: float) -> tuple[float, float]:
+    """Return the factor of c over `dt_s` and the variance (m²) added an axis: Gauss-Markov, or a walk if given."""
+    if walk_m is not None:
+        return 1.0, walk_m**2 * dt_s
+    keep = float(np.exp(-dt_s / tau_s))
+    return keep, sigma_m**2 * (1 - keep**2)
+
+
+def lane_axes(heading_rad: Array | float) -> Array:
+    """Return the rotation (…, 2, 2) into the lane's frame: to its right, and along it."""
+    sine, cosine = np.sin(heading_rad), np.cos(heading_rad)
+    return np.stack([np.stack([sine, -cosine], axis=-1), np.stack([cosine, sine], axis=-1)], axis=-2)
+
+
+class KalmanBound:
+    """The filter of one component of vehicles on straight lanes that are known.
+
+    point_m (N, 2), heading_rad (N,): a point of each vehicle's lane, and the direction of travel.
+    common_m (2,), common_covariance_m2 (2, 2): the estimate of the common error.
+    """
+
+    def __init__(self, point_m: Array, heading_rad: Array, model: LaneModel | None = None) -> None:
+        self.model = model or LaneModel()
+        self._point_m = point_m
+        self._axes = lane_axes(heading_rad)
+        count = len(heading_rad)
+        self._mean = np.zeros(2 + 3 * count)
+        self._covariance = np.zeros((2 + 3 * count, 2 + 3 * count))
+        self._covariance[:2, :2] = self.model.common_sigma_m**2 * np.eye(2)
+        own = self.model.own_covariance()
+        for vehicle in range(count):
+            rows = slice(2 + 3 * vehicle, 5 + 3 * vehicle)
+            self._covariance[rows, rows] = own
+
+    @property
+    def common_m(self) -> Array:
+        """Estimate (2,) of the common error."""
+        return self._mean[:2]
+
+    @property
+    def common_covariance_m2(self) -> Array:
+        """Covariance (2, 2) of the common error."""
+        return self._covariance[:2, :2]
+
+    @property
+    def position_m(self) -> Array:
+        """Estimated positions (N, 2) of all vehicles."""
+        own = self._mean[2:].reshape(-1, 3)
+        return np.asarray(self._point_m + np.einsum("nji,nj->ni", self._axes, own[:, :2]))
+
+    def position_covariance_m2(self) -> Array:
+        """Return the covariances (N, 2, 2) of the positions."""
+        blocks = [self._covariance[2 + 3 * n : 4 + 3 * n, 2 + 3 * n : 4 + 3 * n] for n in range(len(self._axes))]
+        return np.asarray(self._axes.transpose(0, 2, 1) @ np.array(blocks) @ self._axes)
+
+    def step(self, dt_s: float, fix_m: Array, noise_m2: Array) -> None:
+        """Advance by `dt_s` and take the fixes (N, 2), NaN where there is none, with noise covariance (2, 2)."""
+        self._predict(dt_s)
+        heard = np.flatnonzero(np.isfinite(fix_m[:, 0]))
+        if not len(heard):
+            return
+        axes, rows = self._axes[heard], (2 + 3 * heard[:, None] + np.arange(2)).ravel()
+        common = axes.reshape(-1, 2)
+        measured = np.einsum("nij,nj->ni", axes, fix_m[heard] - self._point_m[heard]).ravel()
+        projected = common @ self._covariance[:2] + self._covariance[rows]
+        innovation = projected[:, :2] @ common.T + projected[:, rows]
+        noise = axes @ noise_m2 @ axes.transpose(0, 2, 1)
+        for k in range(len(heard)):
+            innovation[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += noise[k]
+        factor = cho_factor(innovation, lower=True)
+        gain = cho_solve(factor, projected).T
+        self._mean += gain @ (measured - common @ self._mean[:2] - self._mean[rows])
+        self._covariance -= gain @ projected
+        self._covariance = (self._covariance + self._covariance.T) / 2
+
+    def _predict(self, dt_s: float) -> None:
+        keep, variance_m2 = self.model.common_step(dt_s)
+        moves, noise = self.model.transition(dt_s), self.model.process_noise(dt_s)
+        count = len(self._axes)
+        self._mean[:2] *= keep
+        self._mean[2:] = (self._mean[2:].reshape(-1, 3) @ moves.T).ravel()
+        covariance = self._covariance
+        covariance[:2] *= keep
+        covariance[:, :2] *= keep
+        rows = covariance[2:].reshape(count, 3, -1)
+        covariance[2:] = (moves @ rows).reshape(3 * count, -1)
+        columns = covariance[:, 2:].reshape(-1, count, 3)
+        covariance[:, 2:] = (columns @ moves.T).reshape(-1, 3 * count)
+        covariance[[0, 1], [0, 1]] += variance_m2
+        for vehicle in range(count):
+            own = slice(2 + 3 * vehicle, 5 + 3 * vehicle)
+            covariance[own, own] += noise

@@ -1,0 +1,223 @@
+"""What one vehicle knows of itself and of the common error: its filter, from the first fix on (MODEL 10).
+
+On straight lanes that is `own_rbpf`, on the map of a city `rbpf` with one tracked vehicle. Both say to others what
+they knew before a fix, and what the fix says about the common error: the *increment*.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vnet.cmm.fusion import transport_cloud
+from vnet.cmm.information import Information, gained
+from vnet.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel, common_step
+from vnet.cmm.map_matching import candidate_lanes
+from vnet.cmm.own_rbpf import OwnRbpf
+from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
+
+LATERAL_SHARE = 0.45
+"""Deviation of a lateral offset relative to the half-width: 0.38 m at 0.85 m, where one of 0.4 m is reflected."""
+GATE_SIGMAS = 5.0
+"""Fixes further from their prediction are outliers."""
+LOST_S = 2.0
+"""Time (s) of nothing but outliers after which the vehicle is somewhere else."""
+SAME_LANE_M = 0.3
+SAME_LANE_RAD = 0.02
+"""Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""
+MAX_LANES = 8
+"""Number of lanes that compete, the nearest."""
+MIN_VARIANCE_M2 = 1e-6
+"""Variance (m²) added to that of a cloud, so that it stays positive."""
+
+
+@dataclass(frozen=True)
+class OwnConfig:
+    """Constants of a vehicle's filter: `rbpf` those of the filter on a map, `lateral_sigma_m` 0 for the map's."""
+
+    rbpf: RbpfConfig
+    lateral_sigma_m: float = 0.0
+
+
+class OwnVehicle:
+    """The filter of one vehicle on straight lanes.
+
+    prior: what was known of c before the latest fix.
+    """
+
+    def __init__(self, config: OwnConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
+        self._lanes = lanes
+        self._rng = rng
+        self._particles = config.rbpf.particles
+        self._model = LaneModel(
+            common_sigma_m=config.rbpf.common_sigma_m,
+            common_tau_s=config.rbpf.common_tau_s,
+            common_walk_m=config.rbpf.common_walk_m,
+            lateral_sigma_m=config.lateral_sigma_m or LATERAL_SHARE * lanes.half_width_m,
+            lateral_tau_s=config.rbpf.lateral_tau_s,
+            acceleration_m2_s4=config.rbpf.acceleration_m2_s4,
+        )
+        sigma_m = config.rbpf.start_sigma_m or config.rbpf.common_sigma_m
+        start = np.array(config.rbpf.start_m), sigma_m**2 * np.eye(2)
+        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=np.inf)
+        nowhere = np.zeros((1, 2)), np.zeros(1)
+        self._unknown = unknown
+        self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start)
+        self._is_placed = False
+        self._outliers_s = 0.0
+        self.prior = self._filter.belief
+
+    @property
+    def estimate_m(self) -> Array:
+        """Estimate (2,) of the common error."""
+        return np.asarray(self._filter.estimate_m)
+
+    @property
+    def estimate_covariance_m2(self) -> Array:
+        """Covariance (2, 2) of the common error."""
+        return np.asarray(self._filter.estimate_covariance_m2)
+
+    @property
+    def is_decided(self) -> bool:
+        """True if the vehicle knows its lane."""
+        return self._is_placed and len(self._filter.lane_probability) == 1
+
+    @property
+    def belief(self) -> tuple[Array, Array]:
+        """Estimate (2,) of the common error, and its covariance (2, 2)."""
+        return self.estimate_m, self.estimate_covariance_m2
+
+    def position_m(self) -> tuple[Array, Array] | None:
+        """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
+        return self._filter.position_m() if self._is_placed else None
+
+    def sample(self, count: int) -> Array:
+        """Draw `count` equally likely hypotheses (count, 2) of the common error."""
+        return self._filter.sample(count)
+
+    def step(self, dt_s: float, fix: Observation | None) -> Information:
+        """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
+        self._filter.predict(dt_s)
+        self.prior = self._filter.belief
+        nothing = Information(np.zeros((2, 2)), np.zeros(2))
+        if fix is None:
+            return nothing
+        if not self._is_placed:
+            self._place(fix)
+        elif self._filter.distance(fix.position_m, fix.covariance_m2) > GATE_SIGMAS**2:
+            self._outliers_s += dt_s
+            if self._outliers_s < LOST_S:
+                return nothing
+            self._place(fix)
+        self._outliers_s = 0.0
+        increment = self._filter.increment(fix.position_m, fix.covariance_m2)
+        self._filter.update(fix.position_m, fix.covariance_m2)
+        return increment
+
+    def absorb(self, pooled: Information) -> None:
+        """Replace what is known of c by `pooled`."""
+        self._filter.absorb(pooled)
+
+    def restart(self, belief: Information) -> None:
+        """Begin again with this belief about c, and seek the lane anew."""
+        self._filter = OwnRbpf(
+            (np.zeros((1, 2)), np.zeros(1)), self._unknown, self._particles, self._rng, belief.moments()
+        )
+        self._is_placed = False
+
+    def _place(self, fix: Observation) -> None:
+        """Seek the lanes on which the vehicle may be; without any its fixes say nothing about c."""
+        belief = self.belief
+        expected_m = fix.position_m - belief[0]
+        variance_m2 = np.trace(belief[1]) + np.trace(fix.covariance_m2)
+        lanes = candidate_lanes(self._lanes, expected_m, fix.heading_rad, 3 * float(np.sqrt(variance_m2)))
+        self._is_placed = True
+        if len(lanes):
+            found = self._different(lanes, expected_m)
+            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief)
+        else:
+            nowhere = expected_m[None], np.zeros(1)
+            self._filter = OwnRbpf(nowhere, self._unknown, self._particles, self._rng, belief)
+
+    def _different(self, lanes: NDArray[np.intp], expected_m: Array) -> tuple[Array, Array]:
+        """Return point and direction of those lanes that differ, the nearest first: a map may have a lane often."""
+        heading_rad, normal = self._lanes.heading_rad[lanes], self._lanes.normal[lanes]
+        across_m = normal @ expected_m - self._lanes.offset_m[lanes]
+        kept: list[int] = []
+        for row in np.argsort(np.abs(across_m), kind="stable").tolist():
+            turn_rad = np.abs(np.mod(heading_rad[kept] - heading_rad[row] + np.pi, 2 * np.pi) - np.pi)
+            beside_m = np.abs(across_m[kept] - across_m[row])
+            if not np.any((turn_rad < SAME_LANE_RAD) & (beside_m < SAME_LANE_M)) and len(kept) < MAX_LANES:
+                kept.append(row)
+        # The point of each lane that is nearest to the vehicle: coordinates along it stay small.
+        return expected_m - across_m[kept, None] * normal[kept], heading_rad[kept]
+
+
+class OwnVehicleOnMap:
+    """The filter of one vehicle on the map of a city; as `OwnVehicle`, the increment by moments."""
+
+    _NAME = "self"
+
+    def __init__(self, config: OwnConfig, roads: RoadMap, rng: np.random.Generator) -> None:
+        self._config = config.rbpf
+        self._rng = rng
+        self._filter = Rbpf(config.rbpf, roads, rng)
+        self.prior = self._belief()
+
+    def _belief(self) -> Information:
+        return Information.of(self.estimate_m, self.estimate_covariance_m2)
+
+    @property
+    def estimate_m(self) -> Array:
+        """Estimate (2,) of the common error."""
+        return self._filter.estimate_m
+
+    @property
+    def estimate_covariance_m2(self) -> Array:
+        """Covariance (2, 2) of the common error."""
+        return self._filter.estimate_covariance_m2 + MIN_VARIANCE_M2 * np.eye(2)
+
+    @property
+    def belief(self) -> tuple[Array, Array]:
+        """Estimate (2,) of the common error, and its covariance (2, 2)."""
+        return self.estimate_m, self.estimate_covariance_m2
+
+    def position_m(self) -> tuple[Array, Array] | None:
+        """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
+        return self._filter.position_m(self._NAME) if self._NAME in self._filter.vehicles else None
+
+    def sample(self, count: int) -> Array:
+        """Draw `count` equally likely hypotheses (count, 2) of the common error."""
+        return self._filter.sample(count)
+
+    def step(self, dt_s: float, fix: Observation | None) -> Information:
+        """Advance by `dt_s` and take the vehicle's own fix; returns the increment."""
+        keep, variance_m2 = common_step(
+            self._config.common_sigma_m, self._config.common_tau_s, self._config.common_walk_m, dt_s
+        )
+        covariance_m2 = keep**2 * self.estimate_covariance_m2 + variance_m2 * np.eye(2)
+        self.prior = Information.of(keep * self.estimate_m, covariance_m2)
+        self._filter.step(dt_s, {} if fix is None else {self._NAME: fix})
+        return gained(self.prior, self._belief())
+
+    def absorb(self, pooled: Information) -> None:
+        """Replace what is known of c by `pooled`."""
+        transport_cloud(self._filter, pooled)
+
+    def restart(self, belief: Information) -> None:
+        """Move the cloud to this belief about c."""
+        transport_cloud(self._filter, belief)
+
+
+def own_vehicle(
+    config: OwnConfig, lanes: LaneMap | RoadMap, rng: np.random.Generator
+) -> OwnVehicle | OwnVehicleOnMap:
+    """Return the filter of a vehicle on a map of this kind."""
+    if isinstance(lanes, RoadMap):
+        return OwnVehicleOnMap(config, lanes, rng)
+    return OwnVehicle(config, lanes, rng)
