@@ -178,10 +178,15 @@ class InformationEstimator:
         near = priors_agree(mean, covariance, *own)
         codes = [int(name, 16) for name in names]
         agrees = self._origins.agree(codes, heard[:, 5:], own, self._now_ns / NS_PER_S)
-        self.rejected["prior"] += int(np.count_nonzero(~near))
-        self.rejected["increment"] += int(np.count_nonzero(near & ~agrees))
+        self._reject("prior", ~near)
+        self._reject("increment", near & ~agrees)
         self._notice_being_lost(near, heard[:, :5])
         return np.asarray(near & agrees)
+
+    def _reject(self, reason: str, which: NDArray[np.bool_]) -> None:
+        """Count what is not used."""
+        if count := int(np.count_nonzero(which)):
+            self.rejected[reason] += count
 
     def _notice_being_lost(self, near: NDArray[np.bool_], priors: Array) -> None:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long."""
@@ -243,7 +248,7 @@ class InformationEstimator:
         if not self._options.defence or not codes:
             return increments
         agrees = self._origins.agree(codes, increments, self.own.belief, self._now_ns / NS_PER_S)
-        self.rejected["passed"] += int(np.count_nonzero(~agrees))
+        self._reject("passed", ~agrees)
         return scaled_down(increments[agrees], self._largest_increment)
 
     def _forged(
@@ -262,7 +267,7 @@ class InformationEstimator:
             return np.zeros(count, dtype=np.bool_)
         false = np.bincount(sender[differs], minlength=count)
         forged = np.asarray(false > MAX_FORGED_SHARE * np.bincount(sender[known], minlength=count))
-        self.rejected["forged"] += int(np.count_nonzero(forged))
+        self._reject("forged", forged)
         return forged
 
     # What goes out.

@@ -17,7 +17,7 @@ from vnet.types import Array
 
 @dataclass(frozen=True)
 class Information:
-    """A Gaussian belief about c, or what is added to it: `matrix` Λ (2, 2) in 1/m², `vector` η = Λ x (2,) in 1/m."""
+    """A Gaussian belief about c, or what is added to it: `matrix` Λ (2, 2) in 1/m², `vector` η (2,) in 1/m."""
 
     matrix: Array
     vector: Array

@@ -1,9 +1,9 @@
 """The hears-all bound on straight lanes: one Kalman filter that hears every fix of a component without loss.
 
 With straight lanes, one candidate each, cooperative map matching is a linear-Gaussian problem once the lateral
-offset of a vehicle is a state: x = [c, (l_j, s_j, v_j) for all j], with the common error c, the offset l_j to the right of
-the lane's centre line, and position and speed s_j, v_j along it (MODEL 10). No estimator that is told the same can
-have a smaller error in the mean, so this filter is the bound of every other.
+offset of a vehicle is a state: x = [c, (l_j, s_j, v_j) for all j], with the common error c, the offset l_j to the
+right of the lane's centre line, and position and speed s_j, v_j along it (MODEL 10). No estimator that is told the
+same can have a smaller error in the mean, so this filter is the bound of every other.
 """
 
 from __future__ import annotations

@@ -68,7 +68,8 @@ class OwnRbpf:
         weight /= weight.sum()
         self.weight = weight
         if len(self._axes) > 1:
-            return self._collapse()
+            self._collapse()
+            return
         joint = np.concatenate([self.common_m, self._own[0]])
         mean = joint @ weight
         spread = joint - mean[:, None]

@@ -64,7 +64,7 @@ class OwnVehicle:
         )
         sigma_m = config.rbpf.start_sigma_m or config.rbpf.common_sigma_m
         start = np.array(config.rbpf.start_m), sigma_m**2 * np.eye(2)
-        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=np.inf)
+        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M)
         nowhere = np.zeros((1, 2)), np.zeros(1)
         self._unknown = unknown
         self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start)

@@ -1,0 +1,303 @@
+"""Vehicles that exchange information about the common error: a small network without a radio."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.cooperative.frame import FrameError, name_of_code, short_name
+from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
+from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
+from agents.cooperative.options import Options
+from vnet import Fix, Packet
+from vnet.roads.lanes import LaneMap
+from vnet.types import Array
+
+PERIOD_NS = 100_000_000
+COMMON_M = np.array([2.0, -1.5])
+Change = Callable[[str, InformationFrame], InformationFrame | None]
+
+
+def _honest(_: str, frame: InformationFrame) -> InformationFrame:
+    return frame
+
+
+class Network:
+    """Vehicles on lanes through the origin in all directions, that hear their neighbours on a ring, or all."""
+
+    def __init__(self, count: int = 6, reach: int | None = None, **options: object) -> None:
+        headings = np.arange(count) * np.pi / count
+        self.lanes = LaneMap(np.zeros((count, 2)), headings, 0.85)
+        self.ids = [f"v{k}" for k in range(count)]
+        self.options = Options.parse({"exchange": "information", "particles": 300, **options})
+        self.estimators = [self.new(k) for k in range(count)]
+        self.reach = count if reach is None else reach
+        self.period = 0
+        self._rng = np.random.default_rng(1)
+
+    def new(self, k: int) -> InformationEstimator:
+        """Return a vehicle that has just started."""
+        return InformationEstimator(self.ids[k], self.options, self.lanes, np.random.default_rng(k), PERIOD_NS)
+
+    def run(self, periods: int, change: Change = _honest) -> None:
+        """Run some periods; `change` is what becomes of the frame of each vehicle, None if it is lost."""
+        for _ in range(periods):
+            now_ns = self.period * PERIOD_NS
+            fixes = [self.fix(k) for k in range(len(self.ids))]
+            sent: list[bytes | None] = []
+            for name, estimator, fix in zip(self.ids, self.estimators, fixes, strict=True):
+                frame = change(name, decode(estimator.frame(fix, 1400)))
+                sent.append(None if frame is None else encode(frame))
+            for k, estimator in enumerate(self.estimators):
+                packets = [
+                    Packet(self.ids[j], now_ns, now_ns + 5_000_000, payload)
+                    for j, payload in enumerate(sent)
+                    if payload is not None and 0 < min((j - k) % len(sent), (k - j) % len(sent)) <= self.reach
+                ]
+                estimator.read(packets, now_ns + 50_000_000)
+                estimator.filter(fixes[k])
+                estimator.agree()
+            self.period += 1
+
+    def fix(self, k: int) -> Fix:
+        """Return a fix of vehicle k, which stands at the origin."""
+        noise_m = self._rng.standard_normal(2)
+        heading = float(self.lanes.heading_rad[k])
+        return Fix(self.period * PERIOD_NS, COMMON_M + noise_m, np.eye(2), heading)
+
+    def errors_m(self) -> Array:
+        """Return the errors (n,) of all estimates of the common error."""
+        return np.array([np.linalg.norm(e.common_error[0] - COMMON_M) for e in self.estimators])
+
+
+def test_vehicles_agree_on_the_common_error() -> None:
+    network = Network()
+    network.run(60)
+    assert network.errors_m().max() < 0.6
+    positions = np.array([e.position(network.fix(k))[0] for k, e in enumerate(network.estimators)])
+    assert np.abs(positions).max() < 1.0
+    assert sum(e.rejected.total() for e in network.estimators) < 0.01 * 60 * 30  # of all frames
+
+
+def test_alone_a_vehicle_knows_less() -> None:
+    together, alone = Network(), Network(reach=0)
+    together.run(60)
+    alone.run(60)
+    assert np.sqrt(np.mean(together.errors_m() ** 2)) < 0.6 * np.sqrt(np.mean(alone.errors_m() ** 2))
+
+
+def test_without_fusion_increments_are_added_all_the_same() -> None:
+    network = Network(fusion="none")
+    network.run(60)
+    assert network.errors_m().max() < 0.8
+    assert all(e.weights[name] == 1 for name, e in zip(network.ids, network.estimators, strict=True))
+
+
+@pytest.mark.parametrize("relay_increments", [0, 30])
+def test_increments_are_passed_on_one_hop(relay_increments: int) -> None:
+    """On a ring each vehicle hears two others; two more are two hops away."""
+    network = Network(8, reach=1, relay_increments=relay_increments)
+    network.run(5)
+    assert {e.imported for e in network.estimators} == ({4} if relay_increments else {2})
+    frame = network.estimators[0].compose(network.fix(0), 1400)
+    names = [name_of_code(code) for code in frame.passed["name"].tolist()]
+    expected = [short_name(name) for name in ("v0", "v1", "v7")]
+    assert names[:1] == expected[:1] * bool(relay_increments)
+    assert sorted(names) == sorted(expected) * bool(relay_increments)
+
+
+def test_what_pooled_priors_hold_is_not_added_again() -> None:
+    """All hear all, so nobody has an increment that the others have not used themselves."""
+    network = Network(6, relay_increments=30)
+    network.run(5)
+    assert {e.imported for e in network.estimators} == {5}
+
+
+def test_a_frame_holds_as_many_increments_as_there_is_room_for() -> None:
+    network = Network(8, relay_increments=30)
+    network.run(5)
+    estimator, seen = network.estimators[0], set()
+    for _ in range(7):
+        fix = network.fix(0)
+        payload = estimator.frame(fix, 170)
+        frame = decode(payload)
+        assert len(payload) <= 170
+        assert len(frame.passed) == room(len(frame.heard), 170) == 3
+        assert name_of_code(frame.passed["name"][0]) == estimator.name
+        seen |= set(frame.passed["name"][1:].tolist())
+        network.run(1)
+    assert len(seen) > 3  # in turns
+
+
+def _shifted(information: tuple[float, ...], by_m: Array, factor: float = 1.0) -> tuple[float, ...]:
+    a, b, d, x, y = information
+    off = np.array([[a, b], [b, d]]) @ by_m
+    return tuple(factor * value for value in (a, b, d, x + off[0], y + off[1]))
+
+
+@pytest.mark.parametrize(("off_m", "factor"), [(10.0, 1.0), (10.0, 100.0), (3.0, 1.0)])
+def test_a_liar_moves_nobody(off_m: float, factor: float) -> None:
+    def lie(name: str, frame: InformationFrame) -> InformationFrame:
+        if name != "v0" or network.period < 20:
+            return frame
+        by_m = np.array([off_m, 0.0])
+        increment = _shifted(frame.increment, by_m, factor)
+        return replace(frame, prior=_shifted(frame.prior, by_m), increment=increment)
+
+    network = Network(8)
+    network.run(80, lie)
+    assert network.errors_m()[1:].max() < 0.7
+    assert all(e.rejected["prior"] > 20 for e in network.estimators[1:])
+
+
+def test_passed_on_increments_that_are_forged_are_seen() -> None:
+    def lie(name: str, frame: InformationFrame) -> InformationFrame:
+        passed = frame.passed.copy()
+        if name == "v0":
+            passed["information"][:, 3] += 2.0
+        return replace(frame, passed=passed)
+
+    network = Network(8, reach=2)
+    network.run(40, lie)
+    assert network.errors_m()[1:].max() < 0.7
+    assert all(network.estimators[k].rejected["forged"] > 20 for k in (1, 2, 6, 7))
+
+
+def test_a_vehicle_that_is_wrong_begins_again_where_the_others_are() -> None:
+    network = Network(6)
+    network.run(30)
+    lost = network.estimators[0]
+    lost.own.restart(
+        lost.own.prior.plus(replace(lost.own.prior, vector=lost.own.prior.matrix @ np.array([30.0, 0])))
+    )
+    network.run(1)
+    assert network.errors_m()[0] > 5
+    network.run(LOST_PERIODS + 30)
+    assert network.errors_m()[0] < 0.7
+
+
+def test_a_restarted_vehicle_learns_from_the_others() -> None:
+    network = Network(6)
+    network.run(30)
+    network.estimators[0] = network.new(0)
+    network.run(10)
+    assert network.errors_m()[0] < 0.9
+
+
+def test_frames_of_another_period_are_not_fused() -> None:
+    network = Network(3)
+    network.run(5)
+    late = network.estimators[1].frame(network.fix(1), 1400)
+    network.period += 1
+    estimator, fix = network.estimators[0], network.fix(0)
+    estimator.read([Packet("v1", 0, 0, late)], fix.time_ns + 1)
+    estimator.filter(fix)
+    estimator.agree()
+    assert estimator.imported == 0
+    assert estimator.rejected["late"] == 1
+
+
+def test_a_frame_that_is_sent_again_by_another_is_rejected() -> None:
+    network = Network(3)
+    network.run(2)
+    payload = network.estimators[1].frame(network.fix(1), 1400)
+    estimator = network.estimators[0]
+    estimator.read([Packet("v2", 0, 0, payload)], network.period * PERIOD_NS)
+    assert estimator.rejected == {"replayed": 1}
+
+
+def test_a_receiver_that_fails_sends_and_counts_nothing() -> None:
+    network = Network(3)
+    network.run(20)
+    estimator = network.estimators[0]
+    before = estimator.common_error
+    fix = Fix(network.period * PERIOD_NS, np.full(2, np.nan), np.eye(2), None)
+    estimator.filter(fix)
+    estimator.agree()
+    assert np.isfinite(estimator.position(fix)[0]).all()
+    assert np.linalg.norm(estimator.common_error[0] - before[0]) < 0.1
+
+
+def test_without_a_lane_a_vehicle_learns_from_the_others() -> None:
+    network = Network(6)
+    network.lanes = LaneMap(np.zeros((0, 2)), np.zeros(0), 0.85)
+    network.estimators[0] = network.new(0)
+    network.lanes = LaneMap(np.zeros((6, 2)), np.arange(6) * np.pi / 6, 0.85)
+    network.run(40)
+    assert network.errors_m()[0] < 0.7
+    position_m, covariance_m2 = network.estimators[0].position(network.fix(0))
+    assert np.linalg.norm(position_m) < 4
+    assert np.linalg.eigvalsh(covariance_m2)[1] > 0.9  # across, no better than a fix
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> InformationFrame:
+    """Draw a frame as a vehicle sends one, with single precision."""
+    number = st.floats(-3, 3, width=32)
+    matrix = [
+        draw(st.floats(0.5, 4, width=32)),
+        draw(st.floats(-0.25, 0.25, width=32)),
+        draw(st.floats(0.5, 4, width=32)),
+    ]
+    information = (*matrix, draw(number), draw(number))
+    heard = draw(st.dictionaries(st.integers(0, 2**32 - 1).map(name_of_code), st.booleans(), max_size=12))
+    passed = np.zeros(draw(st.integers(0, 30)), dtype=PASSED)
+    passed["name"] = np.arange(len(passed))
+    passed["information"] = np.float16(information)
+    weight = draw(st.floats(0, 100))
+    return InformationFrame(
+        name=name_of_code(draw(st.integers(0, 2**32 - 1))),
+        fix_time_ns=draw(st.integers(0, 2**60)),
+        prior=information,
+        increment=information,
+        epoch=draw(st.integers(0, 2**32 - 1)),
+        running_sum=(weight * draw(st.floats(-9, 9)), weight * draw(st.floats(-9, 9)), weight),
+        heard=heard,
+        passed=passed,
+        largest_degree=draw(st.integers(0, 255)),
+    )
+
+
+@given(frames())
+def test_a_frame_comes_back(frame: InformationFrame) -> None:
+    payload = encode(frame)
+    got = decode(payload)
+    assert replace(got, passed=frame.passed) == replace(frame, passed=frame.passed)
+    assert np.array_equal(got.passed, frame.passed)
+    assert len(frame.passed) <= room(len(frame.heard), len(payload))
+
+
+@given(frames(), st.data())
+def test_a_frame_that_is_changed_does_not_decode(frame: InformationFrame, data: st.DataObject) -> None:
+    payload = bytearray(encode(frame))
+    payload[data.draw(st.integers(0, len(payload) - 1))] ^= data.draw(st.integers(1, 255))
+    with pytest.raises(FrameError):
+        decode(bytes(payload))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"prior": (np.nan, 0.0, 1.0, 0.0, 0.0)}, "not_finite"),
+        ({"prior": (1.0, 2.0, 1.0, 0.0, 0.0)}, "covariance"),
+        ({"prior": (-1.0, 0.0, -1.0, 0.0, 0.0)}, "covariance"),
+        ({"prior": (1.0, 0.0, 1.0, 1e6, 0.0)}, "absurd"),
+        ({"prior": (1e9, 0.0, 1.0, 0.0, 0.0)}, "absurd"),
+        ({"increment": (1e9, 0.0, 1.0, 0.0, 0.0)}, "absurd"),
+        ({"increment": (-1.0, 0.0, 1.0, 0.0, 0.0)}, "covariance"),
+        ({"increment": (np.inf, 0.0, 1.0, 0.0, 0.0)}, "not_finite"),
+        ({"running_sum": (1e9, 0.0, 1.0)}, "absurd"),
+        ({"running_sum": (0.0, 0.0, -1.0)}, "absurd"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(change: dict[str, tuple[float, ...]], reason: str) -> None:
+    one = (1.0, 0.0, 1.0, 0.0, 0.0)
+    frame = InformationFrame("00000001", 0, one, one, 0, (0.0, 0.0, 1.0), {})
+    assert decode(encode(frame)).prior == one
+    with pytest.raises(FrameError, match=reason):
+        decode(encode(replace(frame, **change)))  # type: ignore[arg-type]
