@@ -25,7 +25,7 @@ FORGET_PERIODS = 10
 
 
 class Frame(Protocol):
-    """What is judged of a frame, of whatever layout."""
+    """The part of a frame that is judged, whatever its layout."""
 
     @property
     def name(self) -> str:

@@ -56,8 +56,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     fusion: Literal["optimized", "random", "metropolis", "max-degree", "constant", "none"] = "optimized"
     """Rule of the fusion weights; `none` fuses nothing."""
     exchange: Literal["information", "estimates", "particles"] = "estimates"
-    """What is exchanged: information about the common error, each vehicle filtering itself alone; or fixes, with
-    fusion that moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper."""
+    """Fusion moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper. With
+    `information` a vehicle filters itself alone and exchanges what it knows of the common error, not fixes."""
     relay: bool = True
     """If true, a frame relays the newest fixes of others; not with `exchange = "information"`."""
     relay_increments: Annotated[int, Meta(ge=0, le=255)] = 30

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from agents.cooperative import frame as cooperative_frame
+from agents.cooperative import information_frame
 from emulator.scenario.faults import KINDS
 from tests.support import maps
 from vnet.node import Report
@@ -152,6 +153,20 @@ def frame_seeds() -> tuple[bytes, ...]:
             )
         )
         for heading, heard in ((None, {}), (1.0, {"00000001": True, "0a0b0c0d": False}))
+    )
+
+
+def information_frame_seeds() -> tuple[bytes, ...]:
+    """Return frames of vehicles that exchange information."""
+    one, passed = (1.0, 0.1, 1.0, 0.5, -0.5), np.ones(2, dtype=information_frame.PASSED)
+    passed["information"] = one
+    return tuple(
+        information_frame.encode(
+            information_frame.InformationFrame(
+                "0a0b0c0d", 10**8, one, one, 3, (0.5, -0.5, 1.0), heard, passed[: len(heard)], 4
+            )
+        )
+        for heard in ({}, {"00000001": True, "00000002": False})
     )
 
 

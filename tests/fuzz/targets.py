@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from agents.cooperative import frame as cooperative_frame
+from agents.cooperative import information_frame
 from emulator.drivers.control import answer
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.status import Course
@@ -54,6 +55,7 @@ from tests.fuzz.seeds import (
     TX,
     XML_WORDS,
     frame_seeds,
+    information_frame_seeds,
     npz,
     pbf,
     temporary_folder,
@@ -122,6 +124,12 @@ def _read_frame(data: bytes) -> None:
     frame = cooperative_frame.decode(data)
     if len(frame.heard) == data[1]:  # repeated names count once
         assert cooperative_frame.decode(cooperative_frame.encode(frame)).heard == frame.heard
+
+
+def _read_information_frame(data: bytes) -> None:
+    frame = information_frame.decode(data)
+    if len(frame.heard) == data[1]:  # repeated names count once
+        assert information_frame.decode(information_frame.encode(frame)).heard == frame.heard
 
 
 def _read_fault(data: bytes) -> None:
@@ -262,6 +270,7 @@ TARGETS = (  # the slowest first
         "credentials", _read_credentials, TransportError, (b'{"user": "node-v01", "password": "p"}',), JSON_WORDS
     ),
     Target("cooperative frame", _read_frame, cooperative_frame.FrameError, frame_seeds()),
+    Target("information frame", _read_information_frame, cooperative_frame.FrameError, information_frame_seeds()),
     Target(
         "observation", _read_observation, WireError, (wire.encode_observation({"a": [1, b"x"]}),), MSGPACK_WORDS
     ),

@@ -104,7 +104,7 @@ class OwnRbpf:
 
     @property
     def belief(self) -> Information:
-        """What is known of c."""
+        """The belief about c."""
         return Information.of(self.estimate_m, self.estimate_covariance_m2)
 
     def position_m(self) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What one vehicle knows of itself and of the common error: its filter, from the first fix on (MODEL 10).
+"""The filter of one vehicle, from its first fix on: itself and the common error (MODEL 10).
 
 On straight lanes that is `own_rbpf`, on the map of a city `rbpf` with one tracked vehicle. Both say to others what
 they knew before a fix, and what the fix says about the common error: the *increment*.
@@ -124,7 +124,7 @@ class OwnVehicle:
         self._filter.absorb(pooled)
 
     def restart(self, belief: Information) -> None:
-        """Begin again with this belief about c, and seek the lane anew."""
+        """Begin again with this belief about c, and seek the lane again."""
         self._filter = OwnRbpf(
             (np.zeros((1, 2)), np.zeros(1)), self._unknown, self._particles, self._rng, belief.moments()
         )

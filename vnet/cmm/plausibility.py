@@ -1,4 +1,4 @@
-"""Plausibility of what others say about the common error: what a vehicle believes of it, and how much it may weigh.
+"""Plausibility of what others say about the common error: whether it is believed, and how much it may weigh.
 
 A liar's increment or prior is bounded by what the vehicle itself knows, and compared with what it believes. One
 period's lie may be small; so the deviations of each origin are summed up as well, and decay over seconds.

@@ -270,7 +270,7 @@ def frame_of(name: str, period: int, place_cm: int = 0, relayed: np.ndarray | No
 
 def test_ten_thousand_names_leave_the_memory_as_it_was() -> None:
     """And those who were known before are still heard among them."""
-    admission = Admission("00000000", PERIOD_NS)
+    admission = Admission("00000000", PERIOD_NS, decode)
     read = 0
     for period in range(40):
         now_ns = period * PERIOD_NS

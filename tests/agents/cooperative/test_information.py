@@ -248,7 +248,7 @@ def frames(draw: st.DrawFn) -> InformationFrame:
     heard = draw(st.dictionaries(st.integers(0, 2**32 - 1).map(name_of_code), st.booleans(), max_size=12))
     passed = np.zeros(draw(st.integers(0, 30)), dtype=PASSED)
     passed["name"] = np.arange(len(passed))
-    passed["information"] = np.float16(information)
+    passed["information"] = np.array(information, dtype=np.float16)
     weight = draw(st.floats(0, 100))
     return InformationFrame(
         name=name_of_code(draw(st.integers(0, 2**32 - 1))),
