@@ -43,7 +43,10 @@ LARGEST_BYTES = 300_000
 START_TIMEOUT_S = 60.0
 SETTLE_S = 4.0
 """Time that a viewer may take to draw everything."""
-WEB_SETTLE_S = 25.0
+WEB_SETTLE_S = 120.0
+"""Longest time that the browser may take to draw everything, by software alone."""
+LEAST_BYTES = 100_000
+"""Size of a picture of the browser from which on its views have data."""
 
 
 def main() -> None:
@@ -95,7 +98,10 @@ def web_picture(run: Path, out: Path) -> None:
     with running([*command, "--rerun-port", str(place.port)]), Browser() as browser:
         until(lambda: urllib.request.urlopen(place.web_url).read())
         browser.look(place.web_url, DESK, dark=True)
-        time.sleep(WEB_SETTLE_S)
+        deadline = time.monotonic() + WEB_SETTLE_S
+        while len(browser.picture()) < LEAST_BYTES and time.monotonic() < deadline:
+            time.sleep(SETTLE_S)
+        time.sleep(SETTLE_S)
         put(browser.picture(), out / "web.png", MENU)
 
 

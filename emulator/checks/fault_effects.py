@@ -29,6 +29,7 @@ from emulator.scenario.fault_families import (
     SenderFault,
 )
 from emulator.scenario.faults import Corrupt, GnssFreeze, GnssOutage, Throttle
+from vnet.counted import counted
 from vnet.types import Mask
 from vnet.units import NS_PER_MS
 
@@ -56,13 +57,14 @@ def check_fault_effects(recorded: RecordedRun) -> Iterator[Finding]:
 def effect(fault: Fault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
     """Return what shows that a planned fault took effect: unless its class says otherwise, rows that name it."""
     count = int((recorded.cause == planned.number).sum())
-    return _found(name, count, "receptions name it", "no reception names it")
+    return _found(name, count, "reception names it|receptions name it", "no reception names it")
 
 
 @effect.register
 def _(fault: Corrupt, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
     changed = changed_bytes(recorded) & (recorded.cause == planned.number)
-    return _found(name, int(changed.sum()), "receptions with changed bytes", "no reception with changed bytes")
+    text = "reception with changed bytes|receptions with changed bytes"
+    return _found(name, int(changed.sum()), text, "no reception with changed bytes")
 
 
 @effect.register
@@ -76,16 +78,15 @@ def _(fault: Throttle, recorded: RecordedRun, planned: PlannedFault, name: str) 
 
 
 def _later(name: str, count: int) -> CheckResult:
-    text = "arrivals are later than they could be without it"
+    text = "arrival is later than it could be without it|arrivals are later than they could be without it"
     return _found(name, count, text, "no arrival is later than it could be without it")
 
 
 @effect.register
 def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
     count = _silenced(recorded, planned)
-    return _found(
-        name, count, "nodes neither sent nor received", "no node had sent or reported before and then not"
-    )
+    text = "node neither sent nor received|nodes neither sent nor received"
+    return _found(name, count, text, "no node had sent or reported before and then not")
 
 
 @effect.register
@@ -117,7 +118,8 @@ def _affected(recorded: RecordedRun, planned: PlannedFault) -> Mask:
 
 
 def _wrong_fixes(name: str, count: int) -> CheckResult:
-    text = "fixes are missing, repeated, or further off than receiver noise"
+    what = "missing, repeated, or further off than receiver noise"
+    text = f"fix is {what}|fixes are {what}"
     return _found(name, count, text, "the fixes could be those of a receiver without faults")
 
 
@@ -138,9 +140,11 @@ def _held_down(recorded: RecordedRun, planned: PlannedFault) -> bool:
 
 
 def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
+    """Return a valid result that `count` things were seen: `text` says what, `of one|of several`."""
     if not count:
         return unknown(name, nothing, count=0)
-    return CheckResult(name, Verdict.VALID, f"{count:,} {text}", {"count": count})
+    one, several = text.split("|")
+    return CheckResult(name, Verdict.VALID, counted(count, one, several), {"count": count})
 
 
 def _delayed(recorded: RecordedRun, planned: PlannedFault) -> int:
@@ -213,7 +217,9 @@ def _(fault: ClockFault, recorded: RecordedRun, planned: PlannedFault, name: str
         if len(before) >= STEADY_FRAMES and np.ptp(before) <= tolerance_ns:
             moved += bool((np.abs(during - np.median(before)) > 2 * tolerance_ns).any())
     if moved:
-        return _found(name, moved, "vehicles send at other times of the period", "")
+        return _found(
+            name, moved, "vehicle sends at other times of the period|vehicles send at other times of the period", ""
+        )
     return NotExercised(name, "these vehicles do not send by their own clocks, and nothing else would show them")
 
 
@@ -230,7 +236,7 @@ def _disturbed(recorded: RecordedRun) -> Mask:
 def _(fault: Infrastructure, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
     done = [e for e in recorded.event(f"{fault.kind}ed") if e.time_ns >= planned.start_ns]
     if done:
-        return _found(name, len(done), "restarts", "")
+        return _found(name, len(done), "restart|restarts", "")
     started = recorded.event("started")
     if started and not started[0].details.get("start_up_s"):
         return NotExercised(name, "a simulation has neither router nor sessions")

@@ -14,9 +14,11 @@ from emulator.pages.page import SIGNS, put_page, render, table
 from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
+from emulator.report.program_figures import MOST_CHARTS, is_number, label_of, mean_over_time
 from emulator.report.radio_figures import bin_width_s, decided, latencies_ms
-from emulator.report.source import Source
+from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
+from vnet.units import title_of
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
 REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
@@ -66,6 +68,10 @@ def _runs(comparison: Comparison) -> Iterator[dict[str, Any]]:
 
 def _draw(comparison: Comparison) -> tuple[list[Chart], dict[str, list[str]]]:
     drawers: dict[str, tuple[str, Callable[[], Drawing]]] = {
+        f"own-{number}": (title_of(name), partial(_own, comparison, name))
+        for number, name in enumerate(_own_names(comparison))
+    }
+    drawers |= {
         key: (title, partial(_metric, comparison, name, label)) for key, (title, name, label) in METRICS.items()
     }
     drawers["delivered"] = ("Packet delivery ratio", partial(_delivered, comparison))
@@ -89,12 +95,14 @@ def _of_both(comparison: Comparison, read: Callable[[Source], Any]) -> tuple[lis
     return found, note
 
 
-def _over_time(comparison: Comparison, read: Callable[[Source], Any], y_label: str, caption: str) -> Drawing:
+def _over_time(
+    comparison: Comparison, read: Callable[[Source], Any], y_label: str, caption: str, linear: bool = False
+) -> Drawing:
     """Draw values of both runs; `read` returns times (n,) in seconds and values (n,) of a run."""
     found, note = _of_both(comparison, read)
     spans, said = _spans(comparison)
     lines = [Line(name, times, values, colour, dash) for (name, colour, dash), (times, values) in found]
-    made = time_figure(lines, y_label, max(comparison.first.end_s, comparison.second.end_s), spans)
+    made = time_figure(lines, y_label, max(comparison.first.end_s, comparison.second.end_s), spans, linear)
     return Drawing(made, f"{caption}{said}{note}".strip())
 
 
@@ -103,6 +111,29 @@ def _spans(comparison: Comparison) -> tuple[list[Span], str]:
     if comparison.first.spans == comparison.second.spans:
         return comparison.first.spans, " Shaded: active faults." if comparison.first.spans else ""
     return [], " Faults differ, and are not shaded."
+
+
+def _own_names(comparison: Comparison) -> list[str]:
+    """The names of numbers that programs of either run report."""
+    names = dict.fromkeys(name for source in (comparison.first, comparison.second) for name in source.value_names)
+    both = comparison.first, comparison.second
+    return [name for name in names if any(is_number(source, name) for source in both)][:MOST_CHARTS]
+
+
+def _own(comparison: Comparison, name: str) -> Drawing:
+    """Draw what the programs report under a name: its mean over the vehicles."""
+
+    def read(source: Source) -> Any:
+        if not is_number(source, name):
+            raise NothingToShow(f"its programs do not report {title_of(name)}")
+        return mean_over_time(source, name)
+
+    is_share = any(
+        is_number(each, name) and each.is_boolean(name) for each in (comparison.first, comparison.second)
+    )
+    label = f"{title_of(name)} (%)" if is_share else label_of(name)
+    text = "Share of the vehicles that say true." if is_share else "Mean of the vehicles."
+    return _over_time(comparison, read, label, text, linear=True)
 
 
 def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:

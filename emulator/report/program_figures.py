@@ -90,6 +90,17 @@ def _texts(source: Source, name: str) -> Drawing:
     return Drawing(made, f"Share of the vehicles that report each text.{more}{faults_note(made, source)}")
 
 
+def mean_over_time(source: Source, name: str) -> tuple[Array, Array]:
+    """Return times (periods,) in seconds and the mean of a number over the vehicles; of a boolean in per cent."""
+    value = source.values_of(name)
+    return source.period_times_s(len(value)), _mean(value) * (100 if source.is_boolean(name) else 1)
+
+
+def is_number(source: Source, name: str) -> bool:
+    """Return whether a run has numbers or booleans under this name."""
+    return name in source.value_names and not is_text(source.recorded.states.schema.field(name).type)
+
+
 def _mean(value: Array) -> Array:
     """Return the mean (periods,) of what is finite in each period; NaN where nothing is."""
     known = np.isfinite(value)

@@ -77,7 +77,11 @@ def outcomes(source: Source) -> Drawing:
         below = above
     made.axes.set_ylim(0, 100)
     legend(made)
-    text = f"Outcomes of the attempted receptions (a frame at a receiver in range), in bins of {width_s:g} s."
+    rate = counts.sum(axis=1) / np.maximum(np.diff(edges), 1e-9)
+    text = (
+        f"Outcomes of the {len(code):,} attempted receptions (a frame at a receiver in range), in bins of "
+        f"{width_s:g} s: {rate.min():,.0f} to {rate.max():,.0f} a second."
+    )
     return Drawing(made, text + faults_note(made, source))
 
 

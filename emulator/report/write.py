@@ -1,7 +1,7 @@
 """`report.html`: a run on one page, made from the run's files alone.
 
-Verdict and checks first, then key figures, figures, events, the scenario, and how to reproduce the run. This module
-gathers what the page shows; `report.html.j2` lays it out.
+The verdict and the checks that are not valid first, then results, all checks, events, the scenario, and how to
+reproduce the run. This module gathers what the page shows; `report.html.j2` lays it out.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ def report_page(source: Source) -> str:
         note=_note(source, record),
         summary=_summary(source, record),
         checks=_checks(record) if record else [],
+        problems=[check for check in _checks(record) if check["verdict"] is not Verdict.VALID] if record else [],
         not_applicable=record.judgement.not_applicable if record else {},
         key_figures=key_figures(record) if record else {},
         has_errors=bool(record and shown_figures(record.figures)),

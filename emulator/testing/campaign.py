@@ -37,6 +37,7 @@ from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.shrinking import Schedule, shrink
 from emulator.testing.trial import Trial, TrialPool
+from vnet.counted import counted
 from vnet.errors import VnetError
 
 FORMAT = 1
@@ -165,7 +166,9 @@ class Campaign:
 
     def _take(self, outcome: Outcome) -> None:
         self.outcomes.append(outcome)
-        self._progress.update(self._task, advance=1, description=f"campaign: {len(self.failures)} failures")
+        self._progress.update(
+            self._task, advance=1, description=f"campaign: {counted(len(self.failures), 'failure')}"
+        )
         if outcome.trial.failed or len(self.outcomes) % WRITE_EVERY == 0:
             self.write()
 

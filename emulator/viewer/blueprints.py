@@ -79,7 +79,8 @@ def _curves(content: Content) -> list[rrb.TimeSeriesView | rrb.Tabs]:
         more += [_against_time(f"program/curve/{name}", titled(name)) for name in content.values]
     if more:
         curves.append(rrb.Tabs(*more))
-    return [*curves, _against_time("radio/frames", "Frames a period by outcome, stacked")]
+    # The heading has the colours of the outcomes already.
+    return [*curves, _against_time("radio/frames", "Frames a period by outcome, stacked", legend=False)]
 
 
 def program(vehicle: str, content: Content) -> rrb.Vertical:
@@ -165,8 +166,14 @@ def _around_truth(origin: str, name: str, half_m: float) -> rrb.Spatial2DView:
     return rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
 
 
-def _against_time(origin: str, name: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=rrb.PlotLegend("LeftTop"))
+def _against_time(origin: str, name: str, legend: bool = True) -> rrb.TimeSeriesView:
+    """Figures on one axis of time with all others; errors fall, so that the legend's corner is mostly free."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend("RightTop", visible=legend),
+    )
 
 
 def _bars(origin: str, name: str, legend: bool = False) -> rrb.BarChartView:

@@ -50,6 +50,7 @@ class VehicleScene:
         self._tried, self._heard = Window(periods), Window(periods)
         self._weights = np.full(len(self._node_ids), np.nan)
         self._next_s = self._next_slow_s = 0.0
+        self._is_there = True
         self._set_styles()
         canvas.rings("vehicle/position", POSITION_RINGS_M)
         canvas.rings("vehicle/common", COMMON_RINGS_M)
@@ -60,7 +61,14 @@ class VehicleScene:
         canvas.series("vehicle/frames", (("delivered", GREEN, 2.0), ("not delivered", RED, 1.0)))
 
     def period(self, period: Period) -> None:
-        """Draw a period."""
+        """Draw a period; nothing while the vehicle is not in the network."""
+        is_there = bool(np.isfinite(period.points("position_m")[self._number, 0]))
+        if not is_there:
+            if self._is_there:
+                self._clear()
+            self._is_there = False
+            return
+        self._is_there = True
         self._errors(period)
         self._frames(period)
         weights = period.weights().get(self._vehicle)
@@ -69,6 +77,22 @@ class VehicleScene:
         if period.time_s >= self._next_s:
             self._next_s = next_charts_s(period.time_s)
             self._table(period)
+
+    def _clear(self) -> None:
+        """Draw nothing of the vehicle, which has not entered yet or has left."""
+        canvas, nothing = self._canvas, np.empty((0, 2), dtype=np.float32)
+        for name in (
+            "position/fix",
+            "position/estimate",
+            "common/estimate",
+            "common/particles",
+            "hears/neighbours",
+        ):
+            canvas.points(f"vehicle/{name}", nothing)
+        for name in ("position/ellipse", "common/ellipse", "hears/links"):
+            canvas.strips(f"vehicle/{name}", np.empty((0, 2, 2), dtype=np.float32))
+        text = f"{self._vehicle} is not in the network: it has not entered yet, or has left."
+        canvas.log("vehicle/table", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
     def _set_styles(self) -> None:
         canvas = self._canvas

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from emulator.checks.fault_effects import _wrong_fixes
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, judge
 from emulator.records.run_folder import Event
 from emulator.records.states import STATES
@@ -493,3 +494,8 @@ def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> Non
     run = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     both = recorded.scenario.model_copy(update={"run": run, "fault": (*recorded.scenario.fault, other)})
     assert verdict(replace(recorded, scenario=both), "copies") is Verdict.VALID
+
+
+@pytest.mark.parametrize(("count", "text"), [(1, "1 fix is missing, "), (2000, "2,000 fixes are missing, ")])
+def test_what_shows_an_effect_is_counted_properly(count: int, text: str) -> None:
+    assert _wrong_fixes("effect:gnss_outage-0", count).text.startswith(text)

@@ -137,7 +137,31 @@ def test_checks_that_failed_come_first(beacon: Path) -> None:
     verdict["verdict"] = verdict["checks"][0]["verdict"] = "invalid"
     (beacon / "verdict.json").write_text(json.dumps(verdict))
     page = page_of(beacon)
-    assert page.ids.index("checks") < page.ids.index("program")
+    assert page.ids.index("problems") < page.ids.index("program") < page.ids.index("checks")
+    first = page.text[page.text.index("What is not valid ✗") :]
+    assert first.split("Reported by the program")[0].count("valid") == 2, "the checks that are valid come later"
+
+
+def test_outcomes_over_time_say_how_many_they_are(beacon: Path) -> None:
+    attempted = RecordedRun.open(beacon).record.in_range
+    found = re.search(
+        rf"Outcomes of the {attempted:,} attempted receptions .*?: (\d+) to (\d+) a second", page_of(beacon).text
+    )
+    assert found is not None
+    assert int(found[1]) <= attempted / 2 <= int(found[2])
+
+
+def test_what_a_run_cost_is_a_table_of_its_vehicles(beacon: Path) -> None:
+    page = page_of(beacon)
+    cost = json.loads((beacon / "verdict.json").read_text())["cost"]
+    slowest = cost["vehicles"][0]
+    row = f"{slowest['node']} {slowest['cpu_s']:.3f} {slowest['wake_ups']} {slowest['payload']['frames']}"
+    assert page.ids.index("checks") < page.ids.index("cost") < page.ids.index("events")
+    assert "vehicle CPU time (s) wake-ups frames payload: mean (bytes) 95 % most" in page.text
+    assert row in page.text and f"most by {slowest['node']}" in page.text
+    verdict = json.loads((beacon / "verdict.json").read_text()) | {"cost": None}
+    (beacon / "verdict.json").write_text(json.dumps(verdict))
+    assert "cost" not in page_of(beacon).ids
 
 
 def test_a_shared_medium_is_shown(tmp_path: Path) -> None:
@@ -234,6 +258,9 @@ def test_runs_of_programs_that_report_other_values_are_compared(beacon: Path, tm
     done = vnet(["compare", str(beacon), str(other)])
     assert done.exit_code == 0, done.output
     assert "neighbours" in done.stdout and "hops" in done.stdout
+    page = Page(comparison_page(Comparison.of(beacon, other)))
+    assert {"own-0", "own-1"} <= set(page.ids)
+    assert "Mean of the vehicles. B is not shown: its programs do not report neighbours." in page.text
     rows = Comparison.of(beacon, other).reported
     assert [row["figure"] for row in rows] == ["neighbours", "hops"]
     assert [(row["A"], row["B"], row["B − A"]) for row in rows] == [

@@ -371,6 +371,25 @@ def test_the_vehicle_that_is_looked_at_closely(told: Told, entities: dict[str, E
     assert "| v03 (itself) |" in table
 
 
+def test_nothing_is_drawn_of_a_vehicle_that_has_left(told: Told, tmp_path: Path) -> None:
+    def without_v03(message: dict[str, Any]) -> dict[str, Any]:
+        if "up" not in message or message["time_ns"] < 1.5e9:
+            return message
+        up, position = bytearray(message["up"]), np.frombuffer(message["position_m"], "<f4").copy()
+        up[2], position[4:6] = 0, np.nan
+        return {**message, "up": bytes(up), "position_m": position.tobytes()}
+
+    write([(stream, without_v03(message)) for stream, message in told], tmp_path / "left.rrd", "v03")
+    found = read_back(tmp_path / "left.rrd")
+    table = found["/vehicle/table"].at["TextDocument:text"]
+    assert max(table) == pytest.approx(1.5)
+    assert table[max(table)] == ["v03 is not in the network: it has not entered yet, or has left."]
+    assert max(found["/vehicle/errors"].at["Scalars:scalars"]) < 1.5
+    for name in ("position/estimate", "common/particles", "hears/neighbours"):
+        last = found[f"/vehicle/{name}"].at["Points2D:positions"]
+        assert max(last) == pytest.approx(1.5) and len(last[max(last)]) == 0, name
+
+
 def test_the_heading_says_what_run_it_is(entities: dict[str, Entity]) -> None:
     text = entities["/about"].static["TextDocument:text"][0]
     assert text.startswith("### told\n")
