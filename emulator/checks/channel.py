@@ -13,8 +13,9 @@ from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, Recor
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.faults import StaleMessages
+from emulator.world.neighbours import Links
 from vnet.counted import counted
-from vnet.types import Array, IntArray, Mask
+from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 
 LOSS_BAND = 0.999
@@ -117,8 +118,9 @@ def _missing_numbers(recorded: RecordedRun) -> int:
     first = np.unique(recorded.emission, return_index=True)[1]
     originals = first[recorded.copy[first] == 0]
     missing = 0
-    for sender in np.unique(recorded.sender[originals]).tolist():
-        rows = originals[recorded.sender[originals] == sender]
+    by_sender = originals[np.argsort(recorded.sender[originals], kind="stable")]
+    for rows in np.split(by_sender, np.flatnonzero(np.diff(recorded.sender[by_sender])) + 1):
+        sender = int(recorded.sender[rows[0]]) if len(rows) else 0
         seqs = np.concatenate([[-1], recorded.seq[rows]])
         lonely = recorded.places.was_lonely(sender, np.concatenate([[0], recorded.sent_ns[rows]]))
         missing += int((np.diff(seqs) - 1)[~lonely].sum())
@@ -184,20 +186,22 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
         if len(rows):
             up = ~recorded.is_down(everybody, np.full(len(everybody), start_ns))
             admitted = admitted_by_cap(recorded, up, start_ns)
-            wrong[rows] = judged[rows] & (admitted[recorded.sender[rows], recorded.receiver[rows]] == capped[rows])
+            is_admitted = admitted.contain(recorded.sender[rows], recorded.receiver[rows])
+            wrong[rows] = judged[rows] & (is_admitted == capped[rows])
     return wrong
 
 
-def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Mask:
-    """Return the links (N, N), rows are senders, that the receivers' caps admit when these nodes (N,) are up."""
-    index = int(recorded.places.index(np.array([time_ns]))[0])
-    in_range = recorded.places.in_range(index) & up[:, None]
-    distance_m: Array = np.where(in_range, recorded.places.distance_m(index), np.inf)
-    # Nearest first, equally near ones by number, those out of range last.
-    nearest = np.argsort(distance_m, axis=0, kind="stable")[: recorded.scenario.radio.max_peers]
-    admitted = np.zeros_like(in_range)
-    np.put_along_axis(admitted, nearest, True, axis=0)
-    return np.asarray(admitted & in_range)
+def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Links:
+    """Return the pairs of a sender and a receiver whose cap admits it when these nodes (N,) are up."""
+    pairs = recorded.places.links(int(recorded.places.index(np.array([time_ns]))[0]))
+    pairs = pairs.of(up[pairs.sender])
+    # For each receiver the nearest first, equally near ones by number.
+    order = np.lexsort((pairs.sender, pairs.distance_m, pairs.receiver))
+    first = np.cumsum(pairs.in_degrees()) - pairs.in_degrees()
+    rank = np.arange(len(order)) - first[pairs.receiver[order]]
+    admitted = np.zeros(len(order), dtype=bool)
+    admitted[order] = rank < recorded.scenario.radio.max_peers
+    return pairs.of(admitted)
 
 
 def check_loss_rate(recorded: RecordedRun) -> Finding:

@@ -11,7 +11,7 @@ from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, first_divergen
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
-from emulator.world.graph import weak_components
+from emulator.world.graph import components_of_links
 from vnet.counted import counted
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
@@ -41,9 +41,9 @@ def ups(recorded: RecordedRun) -> Mask:
 
 def _components(recorded: RecordedRun, among: Mask, time_ns: int) -> list[Mask]:
     """The connected components by links in both directions among some nodes (N,), of two nodes or more."""
-    linked = admitted_by_cap(recorded, among, time_ns)
-    linked &= linked.T & among[:, None]
-    label = weak_components(linked)
+    pairs = admitted_by_cap(recorded, among, time_ns)
+    both = pairs.contain(pairs.receiver, pairs.sender)
+    label = components_of_links(pairs.sender[both], pairs.receiver[both], pairs.count)
     parts = [np.asarray((label == number) & among) for number in range(int(label.max(initial=-1)) + 1)]
     return [part for part in parts if part.sum() > 1]
 

@@ -18,7 +18,7 @@ from emulator.drivers.log_book import LogBook
 from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
-from emulator.radio.connectivity import connectivity_of, distances_m
+from emulator.radio.connectivity import connectivity_of
 from emulator.radio.engine import Delivery, Engine
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics, PeriodFigures
@@ -27,6 +27,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
+from emulator.world.neighbours import Links
 from emulator.world.world import Instant, World, components
 from vnet.node import Report
 from vnet.transport import wire
@@ -101,18 +102,17 @@ class Emulation:
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""
         world = self.world
-        degree = self._in_range(period).sum(axis=0)
+        degree = self._links(period).in_degrees()
         return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
 
-    def _in_range(self, period: int) -> NDArray[np.bool_]:
+    def _links(self, period: int) -> Links:
         if period == self._placed:
-            return self.engine.in_range
-        position_m = self.world.position_m(period)
-        return self._connectivity.in_range(position_m, distances_m(position_m))
+            return self.engine.links
+        return self._connectivity.links(self.world.position_m(period))
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Connected component of each vehicle."""
-        return components(self.world.position_m(period), self.scenario.radio.range_m, self._in_range(period))
+        return components(self.world.position_m(period), self.scenario.radio.range_m, self._links(period))
 
     def _absent(self, period: int) -> set[str]:
         """Vehicles that are not in the network."""

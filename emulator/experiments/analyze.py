@@ -117,7 +117,7 @@ def hears_matrix(scenario: Scenario, world: World) -> Links:
     """Directed links at the start, (N, N), row i hears column j: range, links or path loss, and the peer cap."""
     connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
     topology = Topology(world.at(0).position_m, connectivity, scenario.radio.max_peers)
-    return np.asarray(topology.now.admitted.T)
+    return topology.admitted_links().matrix().T
 
 
 def mutual(hears: Links) -> Links:

@@ -8,6 +8,7 @@ import numpy as np
 
 from emulator.radio.propagation import MeanPower
 from emulator.scenario.scenario import Radio
+from emulator.world.neighbours import Links, links_within
 from vnet.types import Array, Mask
 
 
@@ -16,6 +17,9 @@ class Connectivity(Protocol):
 
     `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them.
     """
+
+    def links(self, position_m: Array) -> Links:
+        """Return the pairs of a sender and a receiver in its range."""
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """Return the mask (N, N) of receivers (columns) in range of each sender (rows)."""
@@ -40,6 +44,10 @@ def distances_m(position_m: Array) -> Array:
 class _EqualPower:
     """Connectivity without a path loss: all signals in range are equally strong, so overlapping frames are lost."""
 
+    def links(self, position_m: Array) -> Links:
+        """See `Connectivity`."""
+        raise NotImplementedError
+
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""
         raise NotImplementedError
@@ -57,6 +65,10 @@ class Disc(_EqualPower):
     def __init__(self, range_m: float) -> None:
         self._range_m = range_m
 
+    def links(self, position_m: Array) -> Links:
+        """See `Connectivity`."""
+        return links_within(position_m, self._range_m)
+
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""
         return _without_itself(distance_m <= self._range_m)
@@ -67,6 +79,10 @@ class Matrix(_EqualPower):
 
     def __init__(self, links: Mask) -> None:
         self._links = links
+
+    def links(self, position_m: Array) -> Links:
+        """See `Connectivity`."""
+        return Links.of_matrix(self.in_range(position_m, position_m[:, :1] - position_m[:, 0]), position_m)
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""
@@ -79,6 +95,10 @@ class AboveFloor:
     def __init__(self, mean: MeanPower, floor_dbm: float) -> None:
         self.mean = mean
         self._floor_dbm = floor_dbm
+
+    def links(self, position_m: Array) -> Links:
+        """See `Connectivity`."""
+        return Links.of_matrix(self.in_range(position_m, distances_m(position_m)), position_m)
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""

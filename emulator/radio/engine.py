@@ -44,6 +44,7 @@ from emulator.radio.stages import (
 from emulator.radio.topology import Topology
 from emulator.radio.trace import Trace, payload_digest
 from emulator.scenario.scenario import Radio
+from emulator.world.neighbours import Links
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
 
@@ -114,9 +115,9 @@ class Engine:
         self._topology.move(position_m)
 
     @property
-    def in_range(self) -> NDArray[np.bool_]:
-        """Mask (N, N) of the receivers (columns) in range of each sender (rows) at the present positions."""
-        return self._topology.now.in_range
+    def links(self) -> Links:
+        """Links of a sender and a receiver in its range at the present positions."""
+        return self._topology.links
 
     def set_up(self, node: int, up: bool) -> None:
         """Set a node up or down. A node that is down sends nothing; what arrives there is `receiver_down`."""
@@ -187,13 +188,13 @@ class Engine:
 
     def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Append the receptions in range to the trace, and put the pending ones in flight."""
-        for (number, node), flips in receptions.flips.items():
-            frames[number].altered[node] = _flipped(frames[number].payload, flips)
-        count = len(self._node_ids)
+        receivers = receptions.receivers()
+        for (number, column), flips in receptions.flips.items():
+            frames[number].altered[int(receivers[number, column])] = _flipped(frames[number].payload, flips)
         near = receptions.outcome != OUT_OF_RANGE
         each = np.count_nonzero(near, axis=1)
-        receiver = np.broadcast_to(np.arange(count), near.shape)[near]
-        self._counts[Outcome.out_of_range] += len(frames) * (count - 1) - len(receiver)
+        receiver = receivers[near]
+        self._counts[Outcome.out_of_range] += len(frames) * (len(self._node_ids) - 1) - len(receiver)
         self._enter(
             frames, each, receiver, receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
         )
@@ -204,7 +205,7 @@ class Engine:
                 frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
                 each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
                 arrival_ns = receptions.arrival_ns[number, again] + later_ns
-                self._enter([frame], each, again, pending, arrival_ns, np.int16(cause))
+                self._enter([frame], each, receivers[number, again], pending, arrival_ns, np.int16(cause))
 
     def _enter(
         self,

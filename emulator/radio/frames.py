@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,14 +89,14 @@ class LinkEffects(Protocol):
         """True if a reception may arrive more than once."""
 
     def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
-        """Yield, in the order in which faults act, a fault's number and the receivers (N,) that lose the frame."""
+        """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
 
     def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
         """Delay, duplicate or alter the pending receptions of frame number `index`."""
 
 
 class Copied(NamedTuple):
-    """Duplicates of frame number `frame_index`: mask of receivers (N,), delay in ns, and number of the fault."""
+    """Duplicates of frame number `frame_index`: mask of columns (M,), delay in ns, and number of the fault."""
 
     frame_index: int
     receivers: NDArray[np.bool_]
@@ -106,39 +106,68 @@ class Copied(NamedTuple):
 
 @dataclass(slots=True)
 class Receptions:
-    """The receptions of K frames at all N nodes: arrays (K, N), whose columns are receiver numbers.
+    """The receptions of K frames: arrays (K, M), whose columns are those of their frames' topology snapshots.
+
+    `receiver` holds the receivers' numbers; if it is None, then M = N, and the columns are receivers' numbers.
 
     `outcome` holds values of `Outcome`; `arrival_ns` is the arrival time of a frame that arrives; `cause` is the
     number of the fault behind an outcome `fault` or behind altered bytes, else NO_CAUSE. `copies` are the
-    duplicates that also arrive. `flips` are the altered bytes by (frame, receiver): position in the payload, and
+    duplicates that also arrive. `flips` are the altered bytes by (frame, column): position in the payload, and
     XOR mask.
     """
 
     outcome: NDArray[np.uint8]
     arrival_ns: NDArray[np.int64]
     cause: NDArray[np.int16]
+    receiver: NDArray[np.intp] | None = None
     copies: list[Copied] = field(default_factory=list)
     flips: dict[tuple[int, int], list[tuple[int, int]]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, frames: Sequence[Frame], count: int) -> Receptions:
-        """Return the receptions of frames at `count` nodes, all pending."""
-        shape = len(frames), count
+        """Return the receptions of frames among `count` nodes, all pending."""
+        receiver = None if frames[0].topology.receiver is None else rows(frames, "receiver")
+        shape = (len(frames), count) if receiver is None else receiver.shape
         arrival_ns = np.zeros(shape, np.int64)
         arrival_ns += _column(frame.end_ns for frame in frames)
         cause = np.zeros(shape, np.int16)
         cause += _column(frame.cause for frame in frames).astype(np.int16)
-        return cls(np.zeros(shape, np.uint8), arrival_ns, cause)
+        return cls(np.zeros(shape, np.uint8), arrival_ns, cause, receiver)
+
+    def receivers(self) -> NDArray[np.intp]:
+        """Return the receivers' numbers (K, M)."""
+        if self.receiver is None:
+            return np.broadcast_to(np.arange(self.outcome.shape[1]), self.outcome.shape)
+        return self.receiver
 
     def decide(self, mask: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
-        """Give `outcome` to the pending receptions of a mask that broadcasts to (K, N)."""
+        """Give `outcome` to the pending receptions of a mask that broadcasts to (K, M)."""
         self.outcome[(self.outcome == PENDING) & mask] = outcome.value
 
-    def fault(self, index: int, receivers: NDArray[np.bool_], cause: int) -> None:
-        """Lose the frame at row `index` by fault number `cause` at the receivers (N,) where it is still pending."""
-        decided = (self.outcome[index] == PENDING) & receivers
-        self.outcome[index, decided] = Outcome.fault
-        self.cause[index, decided] = cause
+    def fault(self, index: int, columns: NDArray[np.bool_], cause: int) -> None:
+        """Lose the frame at row `index` by fault number `cause` where it is still pending.
+
+        `columns` are a mask of the first columns; those beyond it are no receptions.
+        """
+        width = len(columns)
+        decided = (self.outcome[index, :width] == PENDING) & columns
+        self.outcome[index, :width][decided] = Outcome.fault
+        self.cause[index, :width][decided] = cause
+
+
+def rows(frames: Sequence[Frame], name: str) -> NDArray[Any]:
+    """Return (K, M): for each frame, its sender's row of the array `name` of its topology snapshot.
+
+    Shorter rows are filled up with zeros, or False.
+    """
+    first = frames[0].topology
+    if all(frame.topology is first for frame in frames):
+        return np.asarray(getattr(first, name)[[frame.sender for frame in frames]])
+    each = [getattr(frame.topology, name)[frame.sender] for frame in frames]
+    filled = np.zeros((len(each), max(map(len, each))), each[0].dtype)
+    for index, row in enumerate(each):
+        filled[index, : len(row)] = row
+    return filled
 
 
 def _column(numbers: Iterable[int]) -> NDArray[np.int64]:

@@ -22,6 +22,9 @@ from emulator.scenario.random_streams import Draws
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_MS
 
+_Columns = slice | NDArray[np.intp]
+"""Index that takes the columns of a frame's receptions from an array over all nodes (N,)."""
+
 
 @dataclass
 class _RandomFault:
@@ -63,34 +66,36 @@ class ActiveLinkFaults:
         return bool(self.copying)
 
     def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
-        """Yield, in the order in which faults act, a fault's number and the receivers (N,) that lose the frame."""
+        """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
+        at = frame.topology.receivers(frame.sender)
         for number, cut in self.cut:
-            yield number, cut[frame.sender]
+            yield number, cut[frame.sender][at]
         for number, nodes, range_m in self.shortened:
             beyond = frame.topology.distance_m[frame.sender] > range_m
-            yield number, beyond & (nodes | nodes[frame.sender])
+            yield number, beyond & (nodes[at] | nodes[frame.sender])
         for one in self.losing:
-            yield one.planned.number, _lost(one, frame) & _links(one)[frame.sender]
+            yield one.planned.number, (_lost(one, frame) & _links(one)[frame.sender])[at]
 
     def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
         """Delay, duplicate or alter the pending receptions of frame number `index`."""
         pending = receptions.outcome[index] == PENDING
-        count = len(pending)
+        at: _Columns = slice(None) if receptions.receiver is None else receptions.receiver[index]
         for one in self.delaying:
-            draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
-            later = _links(one)[frame.sender] & pending
+            draws, links = _drawn(one, frame, at)
+            later = links & pending
             receptions.arrival_ns[index] += np.where(later, _extra_delay_ns(one.planned, draws), 0)
         for one in self.copying:
             fault = one.planned.fault
             assert isinstance(fault, Duplicate)
-            draws = one.draws.uniform(frame.sender, frame.seq, count, frame.draw)
-            again = _links(one)[frame.sender] & (draws < fault.probability)
+            draws, links = _drawn(one, frame, at)
+            again = links & (draws < fault.probability)
             receptions.copies += [
                 Copied(index, again, round((number + 1) * fault.delay_ms * NS_PER_MS), one.planned.number)
                 for number in range(fault.copies)
             ]
         for one in self.corrupting:
-            _corrupt(one, frame, index, receptions, pending)
+            draws, links = _drawn(one, frame, at)
+            _corrupt(one, frame, index, receptions, draws, pending & links)
 
 
 class LinkFaults:
@@ -153,19 +158,26 @@ def _lost(one: _RandomFault, frame: Frame) -> Mask:
     return fault.lost(draws, one.bad[frame.sender])
 
 
-def _corrupt(one: _RandomFault, frame: Frame, index: int, receptions: Receptions, pending: Mask) -> None:
+def _drawn(one: _RandomFault, frame: Frame, at: _Columns) -> tuple[Array, Mask]:
+    """Return a fault's draws (M,) for a frame and the mask (M,) of its links, at the columns that `at` takes."""
+    links = _links(one)
+    return one.draws.uniform(frame.sender, frame.seq, len(links), frame.draw)[at], links[frame.sender][at]
+
+
+def _corrupt(
+    one: _RandomFault, frame: Frame, index: int, receptions: Receptions, draws: Array, pending: Mask
+) -> None:
     fault = one.planned.fault
     assert isinstance(fault, Corrupt)
-    draws = one.draws.uniform(frame.sender, frame.seq, len(pending), frame.draw)
-    hit = _links(one)[frame.sender] & pending & (draws < fault.probability)
-    for receiver in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
+    hit = pending & (draws < fault.probability)
+    for column in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
         # The draw, conditioned on being below the probability, seeds the altered bytes of each receiver.
-        rng = np.random.default_rng(int(draws[receiver] * 2**53))
+        rng = np.random.default_rng(int(draws[column] * 2**53))
         positions = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
         masks = rng.integers(1, 256, size=len(positions))
         flips = zip(positions.tolist(), masks.tolist(), strict=True)
-        receptions.flips.setdefault((index, receiver), []).extend(flips)
-        receptions.cause[index, receiver] = one.planned.number
+        receptions.flips.setdefault((index, column), []).extend(flips)
+        receptions.cause[index, column] = one.planned.number
 
 
 def _links(one: _RandomFault) -> Mask:

@@ -1,19 +1,18 @@
 """The stages of the channel: functions or callable objects that decide the receptions of a batch of frames.
 
 Stages run in the order of the engine's chain. Each acts only on the receptions that are still pending, so the first
-stage that decides a reception is final. All random numbers come from `Draws`, indexed by receiver number. A
+stage that decides a reception is final. All random numbers come from `Draws`, by the receiver's number. A
 reception does not depend on other receivers, nor on the number of frames in a batch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.radio.frames import Frame, Receptions
+from emulator.radio.frames import Frame, Receptions, rows
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.signals import latency_draws
 from emulator.scenario.random_streams import Draws
@@ -25,20 +24,17 @@ MIN_LATENCY_NS = 1_000
 """Least latency of a reception: time passes in every exchange between nodes."""
 
 
-def rows(frames: Sequence[Frame], name: str) -> NDArray[Any]:
-    """Return (K, N): for each frame, its sender's row of the matrix `name` of its topology snapshot."""
-    first = frames[0].topology
-    matrix = getattr(first, name)
-    if all(frame.topology is first for frame in frames):
-        return np.asarray(matrix[[frame.sender for frame in frames]])
-    return np.stack([getattr(frame.topology, name)[frame.sender] for frame in frames])
-
-
-def frame_draws(draws: Draws, frames: Sequence[Frame], count: int) -> Array:
-    """Return the draws of each frame, (K, count), to be indexed by receiver number."""
-    drawn = np.empty((len(frames), count))
-    for index, frame in enumerate(frames):
-        drawn[index] = draws.uniform(frame.sender, frame.seq, count, frame.draw)
+def frame_draws(draws: Draws, frames: Sequence[Frame], receptions: Receptions) -> Array:
+    """Return the draws of the pending receptions, and 1 for the others (K, M)."""
+    drawn = np.ones(receptions.outcome.shape)
+    if receptions.receiver is None:
+        count = receptions.outcome.shape[1]
+        for index, frame in enumerate(frames):
+            drawn[index] = draws.uniform(frame.sender, frame.seq, count, frame.draw)
+        return drawn
+    pending = receptions.outcome == PENDING
+    keys = np.array([(frame.sender, frame.seq, frame.draw) for frame in frames], np.uint64)
+    drawn[pending] = draws.uniform_at(keys, pending.sum(axis=1), receptions.receiver[pending])
     return drawn
 
 
@@ -85,9 +81,7 @@ class Loss:
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Decide `lost`."""
         if self._loss > 0:
-            receptions.decide(
-                frame_draws(self._draws, frames, receptions.outcome.shape[1]) < self._loss, Outcome.lost
-            )
+            receptions.decide(frame_draws(self._draws, frames, receptions) < self._loss, Outcome.lost)
 
 
 class Latency:
@@ -101,16 +95,16 @@ class Latency:
 
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Set the arrival time of each reception."""
-        draws = self._draws_of(frames, receptions.outcome.shape[1])
+        draws = self._draws_of(frames, receptions)
         latency_ns = (self._latency_ns + self._jitter_ns * draws).astype(np.int64)
         arrival_ns = receptions.arrival_ns + np.maximum(latency_ns, MIN_LATENCY_NS)
         if self._tick_ns:
             arrival_ns = -(-arrival_ns // self._tick_ns) * self._tick_ns
         receptions.arrival_ns = arrival_ns
 
-    def _draws_of(self, frames: Sequence[Frame], count: int) -> NDArray[np.float64]:
-        """Return the latency draws (K, count), from the frames' signals if they have any."""
+    def _draws_of(self, frames: Sequence[Frame], receptions: Receptions) -> NDArray[np.float64]:
+        """Return the latency draws (K, M), from the frames' signals if they have any."""
         if all(frame.signal is None for frame in frames):
-            return frame_draws(self._draws, frames, count)
-        zeros = np.zeros(count, np.uint64)
+            return frame_draws(self._draws, frames, receptions)
+        zeros = np.zeros(receptions.outcome.shape[1], np.uint64)
         return latency_draws(np.array([zeros if f.signal is None else f.signal.random_draws for f in frames]))

@@ -9,23 +9,36 @@ from numpy.typing import NDArray
 
 from emulator.radio.connectivity import Connectivity, distances_m
 from emulator.radio.propagation import Nakagami
-from vnet.types import Array
+from emulator.world.neighbours import Links
+from vnet.types import Array, Mask
+
+MOST_IN_MATRICES = 64
+"""Largest number of vehicles whose links are kept as matrices of all pairs, the fastest way for few vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopologySnapshot:
-    """The links at one time: matrices (N, N) whose rows are senders; immutable.
+    """The links at one time: arrays (N, M) whose rows are senders; immutable.
+
+    Column j of a sender's row is the receiver numbered j if `receiver` is None: then M = N, and the arrays are
+    matrices of all pairs. Else it is the receiver `receiver[sender, j]`: a row begins with the receivers in range,
+    by number, and is filled up with columns that are not in range.
 
     `in_range` marks the links in range, and `admitted` those that the receiver's peer cap admits. `power_mw` is the
     mean received power in mW and `fading` the shape of the fading as `Nakagami.shape` returns it; both are None
-    without a physical radio.
+    without a physical radio, and with one the arrays are matrices.
     """
 
     distance_m: Array
-    in_range: NDArray[np.bool_]
-    admitted: NDArray[np.bool_]
+    in_range: Mask
+    admitted: Mask
     power_mw: Array | None = None
     fading: NDArray[np.uint64] | None = None
+    receiver: NDArray[np.intp] | None = None
+
+    def receivers(self, sender: int) -> NDArray[np.intp] | slice:
+        """Return the index that takes the columns of a sender's row from an array over all nodes (N,)."""
+        return slice(None) if self.receiver is None else self.receiver[sender]
 
 
 class Topology:
@@ -40,11 +53,48 @@ class Topology:
         self._connectivity = connectivity
         self._max_peers = max_peers
         self._nakagami = nakagami
+        self._position_m = position_m
+        self._links: Links | None = None
+        self._is_ranked = False
         self.up = np.ones(len(position_m), dtype=bool)
+        self._now: TopologySnapshot
         self.move(position_m)
+
+    @property
+    def now(self) -> TopologySnapshot:
+        """The present snapshot."""
+        if not self._is_ranked:
+            self._now = replace(self._now, admitted=self._admitted())
+            self._is_ranked = True
+        return self._now
+
+    @property
+    def links(self) -> Links:
+        """The present pairs of a sender and a receiver in its range."""
+        if self._links is None:
+            self._links = Links.of_matrix(self._now.in_range, self._position_m)
+        return self._links
+
+    def admitted_links(self) -> Links:
+        """Return the present pairs of a sender and a receiver whose peer cap admits it."""
+        links = self.now
+        if links.receiver is None:
+            return Links.of_matrix(links.admitted, self._position_m)
+        sender, column = np.nonzero(links.admitted)
+        return Links(len(self.up), sender, links.receiver[sender, column], links.distance_m[sender, column])
 
     def move(self, position_m: Array) -> None:
         """Move the vehicles to `position_m` (N, 2)."""
+        self._position_m, self._links = position_m, None
+        if self._nakagami is None and len(position_m) > MOST_IN_MATRICES:
+            self._links = self._connectivity.links(position_m)
+            self._now = _snapshot_of(self._links)
+        else:
+            self._now = self._matrices(position_m)
+        self._is_ranked = False
+
+    def _matrices(self, position_m: Array) -> TopologySnapshot:
+        """Return the snapshot as matrices of all pairs."""
         distance_m = distances_m(position_m)
         power_mw = fading = None
         if self._nakagami is None:
@@ -54,25 +104,50 @@ class Topology:
             in_range = power_mw > 0  # computing the powers twice would double the time of this method
             np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
-        self.now = TopologySnapshot(
+        return TopologySnapshot(
             distance_m=distance_m, in_range=in_range, admitted=in_range, power_mw=power_mw, fading=fading
         )
-        self._rank()
 
     def set_up(self, node: int, up: bool) -> None:
         """Set a node up or down. A node that is down does not count towards any peer cap."""
+        self._is_ranked = self._is_ranked and bool(self.up[node]) == up
         self.up[node] = up
-        self._rank()
 
     def is_up(self, node: int) -> bool:
         """Return true if a node is up."""
         return bool(self.up[node])
 
-    def _rank(self) -> None:
-        """Set `admitted[s, r]`: sender s is among the `max_peers` nearest live senders in range of receiver r."""
-        candidate = self.now.in_range & self.up[:, None]
-        far_m = np.where(candidate, self.now.distance_m, np.inf)
-        order = np.argsort(far_m, axis=0, kind="stable")  # ties go to the lower number
-        rank = np.empty_like(order)
-        np.put_along_axis(rank, order, np.arange(len(order))[:, None], axis=0)
-        self.now = replace(self.now, admitted=candidate & (rank < self._max_peers))
+    def _admitted(self) -> Mask:
+        """Return the mask of the links whose sender is among the `max_peers` nearest live ones of the receiver.
+
+        It has the shape of `in_range`, in which the links must be. Of senders at one distance the lower number goes
+        first.
+        """
+        links = self._now
+        candidate: Mask = links.in_range & self.up[:, None]
+        if links.receiver is None:
+            if (candidate.sum(axis=0) <= self._max_peers).all():
+                return candidate
+            far_m = np.where(candidate, links.distance_m, np.inf)
+            order = np.argsort(far_m, axis=0, kind="stable")
+            rank = np.empty_like(order)
+            np.put_along_axis(rank, order, np.arange(len(order))[:, None], axis=0)
+            return np.asarray(candidate & (rank < self._max_peers))
+        sender, column = np.nonzero(candidate)
+        receiver = links.receiver[sender, column]
+        each = np.bincount(receiver, minlength=len(candidate))
+        order = np.lexsort((links.distance_m[sender, column], receiver))  # stable: pairs are ordered by sender
+        rank = np.arange(len(order)) - np.repeat(np.cumsum(each) - each, each)
+        beyond = order[rank >= self._max_peers]
+        candidate[sender[beyond], column[beyond]] = False
+        return candidate
+
+
+def _snapshot_of(pairs: Links) -> TopologySnapshot:
+    """Return the snapshot of these pairs, with nobody's peer cap applied."""
+    each = pairs.out_degrees()
+    shape = pairs.count, int(each.max(initial=0))
+    in_range = np.arange(shape[1]) < each[:, None]
+    distance_m, receiver = np.full(shape, np.inf), np.zeros(shape, np.intp)
+    distance_m[in_range], receiver[in_range] = pairs.distance_m, pairs.receiver
+    return TopologySnapshot(distance_m=distance_m, in_range=in_range, admitted=in_range, receiver=receiver)

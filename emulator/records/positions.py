@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.connectivity import Connectivity, distances_m
+from emulator.world.neighbours import Links
 from vnet.types import Array, IntArray, Mask
 
 
@@ -45,9 +45,9 @@ class Places:
         """(N, N) between vehicles."""
         return distances_m(self.position_m(index))
 
-    def in_range(self, index: int) -> Mask:
-        """(N, N), rows are senders: who is in range of whom."""
-        return self._connectivity.in_range(self.position_m(index), self.distance_m(index))
+    def links(self, index: int) -> Links:
+        """Links of a sender and a receiver in its range."""
+        return self._connectivity.links(self.position_m(index))
 
     def power_mw(self, index: int) -> Array:
         """(N, N), rows are senders: the mean power of signals, 0 out of range."""
@@ -64,35 +64,33 @@ class Places:
 
     def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Mask:
         """Mask (n,) of the senders and receivers in range at these instants; False where that is not known."""
-        return np.asarray(self._of_pairs(self.in_range, sender, receiver, time_ns) > 0)
+        found = np.zeros(len(time_ns), dtype=bool)
+        for index, rows in self._rows_by_index(time_ns):
+            found[rows] = self.links(index).contain(sender[rows], receiver[rows])
+        return found
 
     def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
         """With which mean power signals arrive at these instants; 0 out of range, or where that is not known."""
-        return self._of_pairs(self.power_mw, sender, receiver, time_ns)
-
-    def _of_pairs(
-        self,
-        matrix: Callable[[int], NDArray[Any]],
-        sender: NDArray[np.intp],
-        receiver: NDArray[np.intp],
-        time_ns: IntArray,
-    ) -> Array:
-        """The entries for pairs (n,) of the matrices of their times; 0 where positions are not known."""
         found = np.zeros(len(time_ns))
+        for index, rows in self._rows_by_index(time_ns):
+            found[rows] = self.power_mw(index)[sender[rows], receiver[rows]]
+        return found
+
+    def _rows_by_index(self, time_ns: IntArray) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Yield each index of a position, of the K, and the instants (of n) to which it belongs, if it is known."""
         rows = np.flatnonzero(self.known(time_ns))
         index = self.index(time_ns)[rows]
         order = np.argsort(index, kind="stable")
         rows, index = rows[order], index[order]
         for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(index)) + 1):
             if len(some):
-                found[rows[some]] = matrix(int(index[some[0]]))[sender[rows[some]], receiver[rows[some]]]
-        return found
+                yield int(index[some[0]]), rows[some]
 
     @cached_property
     def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """(K, N) each: how many are in range of a sender, and how many a receiver has in range."""
-        matrices = (self.in_range(index) for index in range(len(self._position_m)))
-        both = [(in_range.sum(axis=1), in_range.sum(axis=0)) for in_range in matrices]
+        all_pairs = (self.links(index) for index in range(len(self._position_m)))
+        both = [(pairs.out_degrees(), pairs.in_degrees()) for pairs in all_pairs]
         out, into = zip(*both, strict=True) if both else ((), ())
         shape = self._position_m.shape[:2]
         return np.array(out, np.intp).reshape(shape), np.array(into, np.intp).reshape(shape)

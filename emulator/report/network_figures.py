@@ -139,7 +139,7 @@ def degrees(source: Source) -> Drawing:
             made,
             f"Number of vehicles that each can hear, {how}; mean over its time in the network.",
         )
-    parts = int(components(recorded.places.position_m(0), radio.range_m, recorded.places.in_range(0)).max()) + 1
+    parts = int(components(recorded.places.position_m(0), radio.range_m, recorded.places.links(0)).max()) + 1
     network = "one component" if parts == 1 else f"{parts} components out of range of each other"
     return Drawing(made, f"Number of vehicles that each can hear, {how}: {network}.")
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.connectivity import connectivity_of, distances_m
+from emulator.radio.connectivity import connectivity_of
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
@@ -62,8 +62,7 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
     """
     radio = scenario.radio
     connectivity = connectivity_of(radio, scenario.run.seed, world.links)
-    in_range = connectivity.in_range(world.position_m, distances_m(world.position_m))
-    label = components(world.position_m, radio.range_m, in_range)
+    label = components(world.position_m, radio.range_m, connectivity.links(world.position_m))
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),

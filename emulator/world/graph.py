@@ -1,4 +1,4 @@
-"""Connected components of a dense graph."""
+"""Connected components of a graph."""
 
 from __future__ import annotations
 
@@ -14,16 +14,24 @@ def weak_components(linked: Mask) -> NDArray[np.intp]:
     Components are numbered from 0 in the order of their first nodes, as scipy.sparse.csgraph does; importing that
     takes longer than many a run.
     """
-    joined = linked | linked.T
-    label = np.full(len(joined), -1, dtype=np.intp)
-    number = 0
-    for start in range(len(joined)):
-        if label[start] >= 0:
-            continue
-        label[start] = number
-        frontier = np.array([start])
-        while len(frontier):
-            frontier = np.flatnonzero(joined[frontier].any(axis=0) & (label < 0))
-            label[frontier] = number
-        number += 1
-    return label
+    sender, receiver = np.nonzero(linked)
+    return components_of_links(sender, receiver, len(linked))
+
+
+def components_of_links(sender: NDArray[np.intp], receiver: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+    """Return the component (N,) of each of `count` nodes linked by pairs (n,), numbered as by `weak_components`.
+
+    Each round gives the first node of a component to those that it is linked with, and follows the first nodes' own
+    first nodes to the end, so that the number of rounds grows with the logarithm of the diameter.
+    """
+    first = np.arange(count)
+    while True:
+        lower = np.minimum(first[sender], first[receiver])
+        joined = first.copy()
+        np.minimum.at(joined, first[sender], lower)
+        np.minimum.at(joined, first[receiver], lower)
+        while (joined[joined] != joined).any():
+            joined = joined[joined]
+        if (joined == first).all():
+            return np.asarray(np.unique(first, return_inverse=True)[1], dtype=np.intp)
+        first = joined

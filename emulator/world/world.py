@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Gnss, Scenario
-from emulator.world.graph import weak_components
+from emulator.world.graph import components_of_links
 from emulator.world.lateral import lateral_offsets_m
 from emulator.world.links import load_links
+from emulator.world.neighbours import Links, links_within
 from emulator.world.networks import Network, generate_network, load_network
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
@@ -222,19 +223,21 @@ def build_world(scenario: Scenario) -> World:
     return _stand_on_lanes(scenario, generate_network(network.layout, network.vehicles, network.seed))
 
 
-def components(position_m: Array, range_m: float, links: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
+def components(
+    position_m: Array, range_m: float, links: NDArray[np.bool_] | Links | None = None
+) -> NDArray[np.intp]:
     """Return the connected component (N,) of each vehicle as a label; -1 for an absent vehicle.
 
-    Positions (N, 2) and the range are in metres. `links` (N, N), if given, replaces the range; a link in one
-    direction connects too (weak components).
+    Positions (N, 2) and the range are in metres. `links`, a matrix (N, N) or a list, replaces the range; a link in
+    one direction connects too (weak components).
     """
+    pairs = links_within(position_m, range_m) if links is None else links
+    if not isinstance(pairs, Links):
+        pairs = Links.of_matrix(pairs, position_m)
     present = np.isfinite(position_m[:, 0])
-    present_m = position_m[present]
-    offset = present_m[:, None] - present_m[None]
-    if links is None:
-        linked = np.hypot(offset[..., 0], offset[..., 1]) <= range_m
-    else:
-        linked = links[np.ix_(present, present)]
+    number = np.cumsum(present) - 1
+    both = present[pairs.sender] & present[pairs.receiver]
     label = np.full(len(present), -1, dtype=np.intp)
-    label[present] = weak_components(linked)
+    sender, receiver = number[pairs.sender[both]], number[pairs.receiver[both]]
+    label[present] = components_of_links(sender, receiver, int(present.sum()))
     return label

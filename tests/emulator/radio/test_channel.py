@@ -1,6 +1,7 @@
 """The stages of the channel one by one: each decides what is its business, and draws only what it must."""
 
 from typing import NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from emulator.radio.mac import TransmitQueue
 from emulator.radio.outcomes import Outcome
 from emulator.radio.stages import Latency, Loss, in_range, peer_cap, sender_side
 from emulator.radio.topology import Topology
-from emulator.scenario.random_streams import Draws
+from emulator.scenario.random_streams import Draws, philox_words_at, uniform_of
 from emulator.scenario.scenario import Radio
 
 MS = 1_000_000
@@ -75,6 +76,41 @@ def test_draws_depend_on_the_frame_and_not_on_what_was_drawn_before(
     assert np.array_equal(used.uniform(*frame, count), fresh)
     assert np.array_equal(used.uniform(*frame, count + 3)[:count], fresh), "another receiver changes no other draw"
     assert np.all((fresh >= 0) & (fresh < 1))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, st.lists(st.tuples(frames_of, st.integers(0, 99)), min_size=1, max_size=6), st.data())
+def test_single_draws_are_those_of_the_frames_whole_vectors(
+    seed: int, frames: list[tuple[tuple[int, int], int]], data: st.DataObject
+) -> None:
+    receivers = [data.draw(st.lists(st.integers(0, 70), max_size=9)) for _ in frames]
+    draws = Draws(seed, "loss")
+    expected = [
+        float(draws.uniform(*frame, 71, copy)[receiver])
+        for (frame, copy), some in zip(frames, receivers, strict=True)
+        for receiver in some
+    ]
+    keys = np.array([(*frame, copy) for frame, copy in frames], np.uint64)
+    each, receiver = (
+        np.array([len(some) for some in receivers]),
+        np.array([r for some in receivers for r in some], np.intp),
+    )
+    assert draws.uniform_at(keys, each, receiver).tolist() == expected
+    alone = philox_words_at(draws.key, np.repeat(keys, each, axis=0), receiver)
+    assert uniform_of(alone).tolist() == expected
+
+
+def test_many_single_draws_are_computed_alone_and_few_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand frames to a dozen of a thousand receivers: no vector of a thousand draws is made for any."""
+    rng = np.random.default_rng(4)
+    keys = np.column_stack([np.arange(1000), rng.integers(0, 2**40, 1000), np.zeros(1000)]).astype(np.uint64)
+    each, receiver = np.full(1000, 12), rng.integers(0, 1000, 12_000)
+    draws, frame = Draws(3, "loss"), keys[17].tolist()
+    expected = draws.uniform(frame[0], frame[1], 1000)[receiver[17 * 12 : 18 * 12]]
+    monkeypatch.setattr(Draws, "uniform", Mock(side_effect=AssertionError))
+    assert draws.uniform_at(keys, each, receiver)[17 * 12 : 18 * 12].tolist() == expected.tolist()
+    with pytest.raises(AssertionError):
+        draws.uniform_at(keys[:1], each[:1], receiver[:12])
 
 
 def test_seed_stage_sender_and_sequence_each_give_other_draws() -> None:
