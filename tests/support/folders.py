@@ -18,7 +18,7 @@ from emulator.report.comparison import Comparison
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from emulator.stream.playback import messages
-from tests.support.recordings import read_back
+from tests.support.recordings import Entity, read_back
 
 READERS = ("check", "report", "play", "compare", "pcapng", "mcap", "csv", "radio")
 Readings = dict[str, str | bytes]
@@ -47,11 +47,18 @@ def readings(folder: Path, other: Path, scratch: Path) -> Readings:
 
 
 def rendered(folder: Path) -> str:
-    """Return the drawing that `vnet render` makes of a run."""
+    """Return the drawing that `vnet render` makes of a run.
+
+    Sorted: Rerun writes what has come in since its last tick, so the order in a file depends on the machine.
+    """
     command("render", str(folder))
     drawn = read_back(folder / "recording.rrd")
     del drawn["/__properties"]  # when it was made
-    return repr(sorted(drawn.items()))
+    return repr([(path, _sorted(entity)) for path, entity in sorted(drawn.items())])
+
+
+def _sorted(entity: Entity) -> object:
+    return sorted(entity.static.items()), [(name, sorted(at.items())) for name, at in sorted(entity.at.items())]
 
 
 def command(*arguments: str) -> str:
