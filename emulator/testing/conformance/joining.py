@@ -72,8 +72,11 @@ def absence(scene: Scene) -> None:
     ask_stack(scene, RETURN_WITHIN_S)
 
 
-def ask_stack(scene: Scene, timeout_s: float) -> None:
-    """Ask for the stack until it comes: also how an emulator finds out whether messages pass."""
+def ask_stack(scene: Scene, timeout_s: float, stays: str = "stays") -> None:
+    """Ask for the stack until it comes: also how an emulator finds out whether messages pass.
+
+    `stays` is the check that has failed if the agent ends instead.
+    """
     deadline_s = time.monotonic() + timeout_s
     scene.findings.expect("stack")
     while time.monotonic() < deadline_s:
@@ -84,6 +87,6 @@ def ask_stack(scene: Scene, timeout_s: float) -> None:
                 for _ in scene.until_quiet():  # answers to earlier requests
                     pass
                 return
-        scene.check_stays()
+        scene.check_stays(stays)
     scene.findings.fail("stack", f"no StackDump within {timeout_s:g} s")
     raise SceneOverError

@@ -139,7 +139,7 @@ def say_malformed(scene: Scene) -> None:
     for said in scene.until_quiet():
         if isinstance(said.message, wire.Yield):
             scene.findings.fail("malformed", "a Yield", said.data)
-    scene.check_stays("malformed")
+    ask_stack(scene, scene.patience_s, stays="malformed")  # its answer comes after all of them
 
 
 def lost(scene: Scene) -> None:

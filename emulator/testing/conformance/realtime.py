@@ -13,6 +13,8 @@ from vnet.units import NS_PER_S
 
 ACKNOWLEDGE_S = 2.0
 """An agent gives a sign of life once a second; as long again for the way and a busy machine."""
+FINAL_S = 1.0
+"""Time that an agent may take for its last message."""
 GAP = (4, 5)
 """Batches that are not sent."""
 HELD = 8
@@ -142,12 +144,12 @@ class Clock:
         scene = self.scene
         scene.findings.expect("final")
         scene.bench.say(wire.End(None, "the run is over"))
-        deadline_ns = self._now_ns() + NS_PER_S
+        deadline_ns = self._now_ns() + round(FINAL_S * NS_PER_S)
         while not self.final and self._now_ns() < deadline_ns:
             if scene.hear((deadline_ns - self._now_ns()) / 1e9) is None:
                 break
         if not self.final:
-            scene.findings.fail("final", "no such Frames within 1 s")
+            scene.findings.fail("final", f"no such Frames within {FINAL_S:g} s")
         scene.await_exit("ends", scene.patience_s, fails=False)
 
 
