@@ -5,7 +5,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-PYTEST := $(BIN)/pytest -n auto --dist worksteal
+PYTEST := $(BIN)/pytest --dist worksteal -n
+# The slow tests wait for processes, connections and timers for a quarter of their time: half as many workers again.
+CORES := $(shell nproc 2>/dev/null || echo 1)
+WAITING := $(shell expr \( 3 \* $(CORES) + 1 \) / 2)
 COVERAGE := --cov --cov-report=
 
 # Bytecode is kept, also where the environment says otherwise: without it each worker compiles all tests, and each
@@ -34,16 +37,16 @@ demo: $(READY)
 # whole suite beyond eight minutes: with Python 3.11 it is at work in the tests that are not slow, and in no other.
 test: lint
 	@if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 12))'; then \
-		echo "all tests, with coverage"; COVERAGE_CORE=sysmon $(PYTEST) $(COVERAGE); \
+		echo "all tests, with coverage"; COVERAGE_CORE=sysmon $(PYTEST) $(WAITING) $(COVERAGE); \
 	else \
-		echo "the tests that are not slow, with coverage"; $(PYTEST) -m "not slow" $(COVERAGE); fast=$$?; \
-		echo "the slow tests"; $(PYTEST) -m slow && exit $$fast; \
+		echo "the tests that are not slow, with coverage"; $(PYTEST) auto -m "not slow" $(COVERAGE); fast=$$?; \
+		echo "the slow tests"; $(PYTEST) $(WAITING) -m slow && exit $$fast; \
 	fi
 	@echo "Lines that ran with coverage, in total and in the ten files with the fewest:"
 	@$(BIN)/coverage report --sort=cover | sed -n '1,12p;$$p'
 
 quick: $(READY)
-	$(PYTEST) -m "not slow"
+	$(PYTEST) auto -m "not slow"
 
 test-all:
 	@tested=; failed=; for version in $(PYTHONS); do \
