@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -220,7 +221,16 @@ def build_world(scenario: Scenario) -> World:
         return _drive(scenario)
     if network.path is not None:
         return _stand_on_lanes(scenario, load_network(network.path))
-    return _stand_on_lanes(scenario, generate_network(network.layout, network.vehicles, network.seed))
+    return _stand_on_lanes(scenario, _generated(network.layout, network.vehicles, network.seed))
+
+
+@lru_cache(64)
+def _generated(layout: str, vehicles: int, seed: int) -> Network:
+    """Draw a network once a process: annealing one of 50 vehicles takes longer than many a run."""
+    network = generate_network(layout, vehicles, seed)
+    for array in (network.position_m, network.heading_rad):
+        array.flags.writeable = False
+    return network
 
 
 def components(
