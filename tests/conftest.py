@@ -11,8 +11,9 @@ from vnet.runtime.environment import use_one_blas_thread
 
 use_one_blas_thread()  # as in the commands, whose results some tests compare with those of this process
 
-# The same examples in each run, so that it fails for what was changed. Others: --hypothesis-profile=default.
-settings.register_profile("same", derandomize=True)
+# The same examples in each run, so that it fails for what was changed, and however slow the machine.
+# Others: --hypothesis-profile=default.
+settings.register_profile("same", derandomize=True, deadline=None)
 settings.load_profile("same")
 
 
