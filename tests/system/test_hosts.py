@@ -1,11 +1,20 @@
-"""Several hosts: the same run as on one, and what becomes of it when a host goes."""
+"""Several hosts: the same run as on one, and what becomes of it when a host goes.
 
+Where root may make them, hosts are network namespaces, which share nothing but a bridge.
+"""
+
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pytest
 import tomli_w
 
-from tests.system.conftest import Vnet
+from tests.support.namespaces import NetworkHost, network, why_impossible
+from tests.support.paths import ROOT
+from tests.system.conftest import PATIENT, TIMEOUT_S, VNET, Finished, Vnet
 
 SCENARIO: dict[str, Any] = {
     "run": {"name": "hosts", "duration_s": 4.0, "settle_s": 0.5},
@@ -41,3 +50,74 @@ def test_on_two_hosts_the_run_is_that_of_one_process(vnet: Vnet, tmp_path: Path)
     measured = {event["node"] for event in there.events_of("memory")}
     assert measured >= {"v01", "v02", "v03", "v04", "v05"}
     assert all(each["cpu_s"] > 0 for each in there.verdict["cost"]["vehicles"])
+
+
+NAMES = ["a", "b", "c"]
+LOST = {"run": {"name": "lost", "duration_s": 2.0, "stall_timeout_s": 3.0}, "network": {"vehicles": 6}, "fault": []}
+"""A run of three hosts with two vehicles each."""
+
+
+@pytest.fixture
+def three_hosts() -> Iterator[list[NetworkHost]]:
+    if why := why_impossible():
+        pytest.skip(why)
+    with network(3) as hosts:
+        yield hosts
+
+
+def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str, *options: str) -> Finished:
+    """Run a scenario with the emulator on the first of these hosts, and a host of the run on each."""
+    access, folder = tmp_path / "access", tmp_path / "run"
+    endpoint = f"{scheme}/{hosts[0].address}:7447"
+    command = [*VNET, "access", scenario, "--hosts", ",".join(NAMES), "--listen", endpoint, "--out", str(access)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=TIMEOUT_S)
+    with ExitStack() as stack:
+        words = [*VNET, "emulator", scenario, "--access", str(access), "--listen", endpoint, "--out", str(folder)]
+        emulator = subprocess.Popen(
+            hosts[0].command(*words, *options), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        stack.enter_context(emulator)
+        stack.callback(emulator.kill)
+        assert emulator.stderr is not None
+        heading = ""
+        while "waiting for 3 hosts" not in heading:
+            heading = emulator.stderr.readline()
+            assert heading, "it ended early"
+        for name, host in zip(NAMES, hosts, strict=True):
+            words = [*VNET, "host", "--connect", endpoint, "--run", Path(scenario).stem]
+            words += ["--credentials", str(access / "credentials" / f"host-{name}.json")]
+            process = stack.enter_context(subprocess.Popen(host.command(*words), cwd=ROOT))
+            stack.callback(process.kill)
+        stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
+    return Finished(emulator.returncode, stdout, stderr, folder)
+
+
+def test_on_three_hosts_over_tls_the_run_is_that_of_one_process(
+    vnet: Vnet, three_hosts: list[NetworkHost], tmp_path: Path
+) -> None:
+    scenario = write(tmp_path / "hosts.toml")
+    there, here = run_on(three_hosts, scenario, tmp_path, "tls", *PATIENT), vnet("simulate", scenario)
+    assert there.status == here.status == 0, there.stdout + there.stderr
+    assert there.fingerprint == here.fingerprint
+
+
+def test_a_host_that_is_killed_is_missed_at_that_barrier(three_hosts: list[NetworkHost], tmp_path: Path) -> None:
+    program = {"entry": "tests.system.programs:kills_its_host", "options": {"vehicle": "v06"}}
+    done = run_on(three_hosts, write(tmp_path / "lost.toml", program=program, **LOST), tmp_path, "tcp")
+    assert done.status == 1 and done.check("agents_alive")["verdict"] == "invalid", done.stdout + done.stderr
+    assert done.check("progress")["verdict"] == "valid"
+    assert [(event["host"], event["time_ns"]) for event in done.events_of("host_gone")] == [("c", 10**9)]
+    died = {event["node"]: (event["time_ns"], event["how"]) for event in done.events_of("died")}
+    assert died == dict.fromkeys(["v05", "v06"], (10**9, "the connection of host c closed"))
+    spoke = {node: {row["sent_ns"] for row in done.trace() if row["sender"] == node} for node in ("v01", "v05")}
+    assert max(spoke["v05"]) < 10**9 < max(spoke["v01"])
+
+
+def test_a_host_that_is_cut_off_ends_the_run_as_unknown(three_hosts: list[NetworkHost], tmp_path: Path) -> None:
+    program = {"entry": "tests.system.programs:cuts_its_host", "options": {"vehicle": "v06"}}
+    done = run_on(three_hosts, write(tmp_path / "lost.toml", program=program, **LOST), tmp_path, "tcp")
+    assert done.status == 3, done.stdout + done.stderr
+    stalled = {event["node"]: event["time_ns"] for event in done.events_of("stalled")}
+    assert stalled == {"v05": 10**9, "v06": 10**9}
+    assert [event["host"] for event in done.events_of("host_silent")] == ["c"]
+    assert (done.folder / "logs" / "v01.log").exists(), "the other hosts have handed in what they have"

@@ -31,8 +31,6 @@ from vnet.transport.access import Access
 
 DETACH_PATIENCE_S = 1.0
 """Seconds that a process which was told to end has for it, before its host kills it."""
-SILENCE_S = 10.0
-"""Seconds after which a host that hands in nothing more, at the end of a run, is not waited for any longer."""
 
 
 @dataclass
@@ -319,16 +317,19 @@ class Fleet:
 
     # The end.
 
-    async def hand_in(self, patience_s: float) -> None:
-        """Have all agents ended after so many seconds, and take what they leave; hosts that are silent are left."""
+    async def hand_in(self, patience_s: float, silence_s: float) -> None:
+        """Have all agents ended after `patience_s`, and take what they leave.
+
+        A host that hands in nothing more for `silence_s` is not waited for any longer.
+        """
         left = [host for host in self._hosts.values() if host.is_ready and not host.is_gone]
         for host in left:
             self._order(host, messages.HandIn(patience_s))
-        silent_at = time.monotonic() + patience_s + SILENCE_S
+        silent_at = time.monotonic() + patience_s + silence_s
         while left := [host for host in left if not (host.has_handed_in or host.is_gone)]:
             if not await self._changes.wait(silent_at - time.monotonic()):
                 break
-            silent_at = max(silent_at, time.monotonic() + SILENCE_S)
+            silent_at = max(silent_at, time.monotonic() + silence_s)
         for host in left:
             self._folder.event(self._time_ns(), "host_silent", None, host=host.name, where=host.where)
         for host in self._hosts.values():

@@ -288,7 +288,10 @@ class LiveSession:
             while self._inbox.connected and await self._changes.wait(deadline_s - time.monotonic()):
                 pass
         if self._fleet is not None:
-            await self._fleet.hand_in(FULL_PATIENCE_S if completed else PATIENCE_S)
+            if completed:
+                await self._fleet.hand_in(FULL_PATIENCE_S, RECORDER_WAIT_S)
+            else:
+                await self._fleet.hand_in(PATIENCE_S, FULL_PATIENCE_S)
         self._feed.end()
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)

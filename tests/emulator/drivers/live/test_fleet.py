@@ -233,7 +233,7 @@ def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent(monkeypatch:
         play = Play()
         play.join()
         await play.bundles()
-        ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
+        ending = asyncio.ensure_future(play.fleet.hand_in(1.0, 5.0))
         assert [host for host, _ in await play.bundles()] == ["a", "b"]
         play.news("a", HandedIn())
         play.fleet.take_token("a", False)
