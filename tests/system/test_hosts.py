@@ -53,7 +53,7 @@ def test_on_two_hosts_the_run_is_that_of_one_process(vnet: Vnet, tmp_path: Path)
 
 
 NAMES = ["a", "b", "c"]
-LOST = {"run": {"name": "lost", "duration_s": 2.0, "stall_timeout_s": 3.0}, "network": {"vehicles": 6}, "fault": []}
+LOST = {"run": {"name": "lost", "duration_s": 2.0, "stall_timeout_s": 2.0}, "network": {"vehicles": 6}, "fault": []}
 """A run of three hosts with two vehicles each."""
 
 

@@ -10,7 +10,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
         config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
         session = _open(config, f"cannot listen on {listen}")
-    with session:
+    with _closed_at_end(session):
         yield session
 
 
@@ -76,8 +76,18 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
         usrpwd = {"user": credentials.user, "password": credentials.password}
         config["transport"]["auth"] = {"usrpwd": usrpwd}
     who = f" as {credentials.user}" if credentials else " without credentials"
-    with _open(config, f"cannot connect to {endpoint}{who}") as session:
+    with _closed_at_end(_open(config, f"cannot connect to {endpoint}{who}")) as session:
         yield session
+
+
+@contextmanager
+def _closed_at_end(session: zenoh.Session) -> Iterator[zenoh.Session]:
+    """Close a session at the end of the block, also one whose peer does not answer any more (its cable is out)."""
+    try:
+        yield session
+    finally:
+        with suppress(zenoh.ZError):  # after ten seconds: the connection is given up
+            session.close()  # type: ignore[no-untyped-call]
 
 
 def router_endpoint(session: zenoh.Session) -> str:

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from tests.support.paths import ROOT
-from vnet.transport import keys, wire
+from vnet.transport import keys, session, wire
 from vnet.transport.access import Access, node_user
 from vnet.transport.session import open_client, open_router, router_endpoint
 
@@ -69,3 +69,20 @@ def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
     said = done.stdout + done.stderr
     assert "over" in said and "tell-nobody" not in said
     assert ("zenoh" in said) == (wanted not in (None, "off"))
+
+
+def test_a_peer_that_does_not_answer_does_not_keep_a_session_from_ending(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Unanswered:
+        closed = 0
+
+        def close(self) -> None:
+            self.closed += 1
+            raise zenoh.ZError("close operation timed out!")
+
+    opened = Unanswered()
+    monkeypatch.setattr(session, "_open", lambda *_: opened)
+    with open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]]), LEASE_MS):
+        pass
+    with open_client("tcp/127.0.0.1:1", None, LEASE_MS):
+        pass
+    assert opened.closed == 2
