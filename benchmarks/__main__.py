@@ -1,4 +1,7 @@
-"""Run all benchmarks: a table on stderr, JSON on stdout. `python -m benchmarks [NAME ...]` runs some."""
+"""Run all benchmarks: a table on stderr, JSON on stdout. `python -m benchmarks [NAME ...]` runs some.
+
+`python -m benchmarks scale` prints the table of large runs instead.
+"""
 
 import json
 import statistics
@@ -289,6 +292,11 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
 
 def main() -> None:
     """Run the benchmarks that the command line names, or all."""
+    if sys.argv[1:2] == ["scale"]:  # a table of its own, with options
+        from benchmarks import scale
+
+        scale.main(sys.argv[2:])
+        return
     names = sys.argv[1:] or list(BENCHMARKS)
     for name in names:
         if name not in BENCHMARKS:
