@@ -124,7 +124,7 @@ def each_done(
                         f"cell {dict(job.labels)}: the executor is broken; run it again to go on"
                     ) from None
                 except Exception as error:
-                    if not _worker_died(error):
+                    if not worker_died(error):
                         raise
                     if tries == MOST_TRIES:
                         raise VnetError(f"cell {dict(job.labels)}: {error}, {tries} times") from None
@@ -136,7 +136,7 @@ def each_done(
             own.shutdown(cancel_futures=True)
 
 
-def _worker_died(error: Exception) -> bool:
+def worker_died(error: Exception) -> bool:
     """Return whether it is the worker that failed, and not the job. Dask's error is known by its name alone."""
     return isinstance(error, WorkerDiedError) or type(error).__name__ == "KilledWorker"
 

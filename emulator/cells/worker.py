@@ -85,12 +85,14 @@ def is_fit() -> bool:
     return sys.flags.hash_randomization == 0 and all(os.environ.get(n) == v for n, v in ONE_BLAS_THREAD.items())
 
 
-def call_fitly(place: Place, function: Callable[..., T], *arguments: Any) -> T:
+def call_fitly(place: Place, function: Callable[..., T], *arguments: Any, limit_s: float | None = None) -> T:
     """Return what a function returns in a fit process, whose programs are found as in `place`.
 
-    Raises what the function raises, and WorkerDiedError if the process ends before.
+    With `limit_s` that is never this process, so that it can be ended after so many seconds of wall clock.
+    Raises what the function raises, WorkerDiedError if the process ends before, and WorkerTimeoutError.
     """
-    if is_fit() and threading.current_thread() is threading.main_thread() and _entered in ([], [place]):
+    is_here = is_fit() and threading.current_thread() is threading.main_thread() and _entered in ([], [place])
+    if is_here and limit_s is None:
         _entered[:] = [place]
         place.enter()
         return function(*arguments)
@@ -98,7 +100,7 @@ def call_fitly(place: Place, function: Callable[..., T], *arguments: Any) -> T:
         if worker is not None:
             worker.close()
         worker = _kept.worker = Worker(place)
-    return worker.call(function, *arguments)
+    return worker.call(function, *arguments, limit_s=limit_s)
 
 
 _kept = threading.local()

@@ -22,6 +22,9 @@ from emulator.cli.options import (
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.standard_output import result_only
 
+RUNS_ON_DASK = 64
+"""Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
+
 
 def analyze(
     scenario: ScenarioArgument,
@@ -56,7 +59,11 @@ def campaign(
     option: ProgramOptionsOption = None,
     checks: ChecksOption = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores, or 64 on Dask."),
+    ] = None,
+    executor: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of Dask: dask://HOST:PORT.")
     ] = None,
     shrink_steps: Annotated[
         int, typer.Option(min=0, max=50, metavar="N", help="Runs to shrink a failure with.")
@@ -66,13 +73,16 @@ def campaign(
     ] = 300.0,
 ) -> None:
     """Run a scenario many times under random faults, and shrink each failure to the least that still fails."""
+    from emulator.cells.executors import open_executor
     from emulator.testing.campaign import run_campaign
     from emulator.testing.campaign_plan import Plan
 
     with one_line_errors(), result_only(True):
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
+        jobs = jobs or (RUNS_ON_DASK if executor else None)
         limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
         plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)
         if plan.note:
             tell(plan.note)
-        raise typer.Exit(run_campaign(plan, out, Console(stderr=True)))
+        with open_executor(executor) as pool:
+            raise typer.Exit(run_campaign(plan, out, Console(stderr=True), pool))

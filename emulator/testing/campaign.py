@@ -9,10 +9,9 @@ from __future__ import annotations
 import json
 import shlex
 import signal
-import tempfile
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import count
@@ -124,11 +123,11 @@ def _lines(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
 class Campaign:
     """A campaign as it runs, in a new folder of its own."""
 
-    def __init__(self, plan: Plan, folder: Path, progress: Progress) -> None:
+    def __init__(self, plan: Plan, folder: Path, progress: Progress, executor: Executor | None = None) -> None:
         self._plan = plan
         self._folder = folder
         self._progress = progress
-        self._workshop = TrialPool(plan.limit_s, plan.scenario)
+        self._workshop = TrialPool(plan.limit_s, plan.scenario, executor)
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 
@@ -149,7 +148,7 @@ class Campaign:
         return failure_kinds((o.label, {n: t for n, t in o.trial.texts.items() if is_broken(n)}) for o in runs)
 
     def run(self) -> None:
-        """All runs, on all cores; returns early, with what is there, after Ctrl-C."""
+        """All runs, so many at once as are planned; returns early, with what is there, after Ctrl-C."""
         self._task = self._progress.add_task("campaign", total=self._plan.runs)
         with ThreadPoolExecutor(self._plan.jobs) as pool:
             futures = [pool.submit(self._one, number) for number in range(self._plan.runs)]
@@ -184,13 +183,9 @@ class Campaign:
 
     def _one(self, number: int) -> Outcome:
         scenario = self._plan.draw(number)
-        trial = self._try(scenario)
+        trial = self._workshop.run_anywhere(scenario)
         outcome = Outcome(number + 1, scenario, trial)
         return self._shrink(outcome) if trial.failed else outcome
-
-    def _try(self, scenario: Scenario) -> Trial:
-        with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-            return self._workshop.run(scenario, Path(name) / "run")
 
     def _shrink(self, outcome: Outcome) -> Outcome:
         """Shrink a failure, and run the smallest once more where it is kept."""
@@ -200,7 +195,7 @@ class Campaign:
             if self._workshop.closed:
                 return False
             smaller = make_scenario(outcome.scenario, {"faults": schedule})
-            return bool(wanted & {column_of(name) for name in self._try(smaller).failed})
+            return bool(wanted & {column_of(name) for name in self._workshop.run_anywhere(smaller).failed})
 
         smallest, steps = shrink(outcome.scenario.fault, still_fails, self._plan.shrink_steps)
         shrunk = make_scenario(outcome.scenario, {"faults": smallest})
@@ -288,8 +283,10 @@ def _interrupted_once() -> Iterator[None]:
             signal.signal(each, handler)
 
 
-def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
+def run_campaign(plan: Plan, out: Path | None, console: Console, executor: Executor | None = None) -> int:
     """Run a campaign, print its result and return the exit status. Raises VnetError.
+
+    Its runs are simulated on `executor`, by default on this machine; those that are kept always are.
 
     0 if no run failed, 1 if one did, 3 if none did but a check of the user's own could not be made, 130 if it was
     interrupted.
@@ -301,7 +298,7 @@ def run_campaign(plan: Plan, out: Path | None, console: Console) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with _interrupted_once(), Progress(*columns, console=console) as progress:
-        campaign = Campaign(plan, folder, progress)
+        campaign = Campaign(plan, folder, progress, executor)
         campaign.run()
     if folder.resolve().parent.name == RUNS.name:
         write_index(folder.resolve().parent)

@@ -5,16 +5,19 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
+import tempfile
 import time
 import traceback
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pyarrow.compute as pc
 
-from emulator.cells.executors import WorkerPool
-from emulator.cells.worker import Place, WorkerDiedError, WorkerTimeoutError
+from emulator.cells.executors import WorkerPool, worker_died
+from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
@@ -22,12 +25,15 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from vnet.errors import VnetError
 
 GREATEST = 1e6
 """No number that a vehicle reports grows beyond it: metres, and their squares, of vehicles in one town."""
 HUNG, EMULATOR, GROWTH = "hung", "emulator", "growth"
 STDOUT = 1
 """Descriptor of standard output."""
+LOOK_S = 0.5
+"""Interval at which a trial on an executor is looked at: a campaign may have been interrupted."""
 STACKS_AT = 0.9
 """At this share of its time limit a trial writes down where it stands."""
 
@@ -83,29 +89,59 @@ def _greatest(emulation: Emulation) -> float:
 class TrialPool:
     """Runs trials in worker processes, each of which serves many, `limit_s` seconds each.
 
-    May be used from several threads at once, each with a worker of its own. `close` ends all that are left.
+    May be used from several threads at once, each with a worker of its own. `close` ends all that are left, but for
+    those on an executor, for which nobody waits any more.
     """
 
-    def __init__(self, limit_s: float, scenario: Scenario) -> None:
+    def __init__(self, limit_s: float, scenario: Scenario, executor: Executor | None = None) -> None:
         """Trials of changes of `scenario`, which have its programs and checks."""
         self.limit_s = limit_s
         self.closed = False
         self._place = Place.here(scenario)
         self._pool = WorkerPool()
+        self._executor = executor
 
     def run(self, scenario: Scenario, folder: Path) -> Trial:
-        """A trial; one that hangs, or ends its process, has failed. Once closed: one that nothing is known of."""
+        """Return a trial on this machine, whose files stay in `folder`.
+
+        One that hangs, or ends its process, has failed. Nothing is known of one that was begun once closed.
+        """
+        return self._judged(lambda: self._here(scenario, folder))
+
+    def run_anywhere(self, scenario: Scenario) -> Trial:
+        """Return a trial that leaves no files, on the executor if there is one; VnetError if that is broken."""
+        return self._judged(lambda: self._away(scenario))
+
+    def _judged(self, run: Callable[[], Trial]) -> Trial:
         try:
             if not self.closed:
-                self._pool.call(self._place, _get_ready)
-                return self._pool.call(
-                    self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s
-                )
+                return run()
         except WorkerTimeoutError as error:
             return Trial.failure(HUNG, f"{error}; logs/stacks.txt says where it stood")
-        except WorkerDiedError as error:
+        except BrokenExecutor:
+            raise VnetError("the executor is broken") from None
+        except Exception as error:
+            if not worker_died(error):
+                raise
             if not self.closed:
                 return Trial.failure(EMULATOR, str(error))
+        return UNKNOWN
+
+    def _here(self, scenario: Scenario, folder: Path) -> Trial:
+        self._pool.call(self._place, _get_ready)
+        return self._pool.call(self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s)
+
+    def _away(self, scenario: Scenario) -> Trial:
+        if self._executor is None:
+            with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
+                return self._here(scenario, Path(name) / "run")
+        future: Future[Trial] = self._executor.submit(
+            call_fitly, self._place, _run_without_folder, scenario, self.limit_s, limit_s=self.limit_s
+        )
+        while not self.closed:
+            if wait([future], timeout=LOOK_S).done:
+                return future.result()
+        future.cancel()
         return UNKNOWN
 
     def close(self) -> None:
@@ -116,6 +152,12 @@ class TrialPool:
 
 def _get_ready() -> None:
     """Have a worker import all of this module before the time of a trial is measured."""
+
+
+def _run_without_folder(scenario: Scenario, limit_s: float) -> Trial:
+    """Run a trial in a worker on any machine."""
+    with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
+        return _run_in_worker(scenario, Path(name) / "run", limit_s)
 
 
 def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:

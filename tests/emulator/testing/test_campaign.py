@@ -7,7 +7,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import Future
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from emulator.cells.worker import WorkerDiedError, WorkerTimeoutError
 from emulator.checks.judge import Verdict
 from emulator.scenario.faults import Pause
 from emulator.scenario.scenario import Scenario, load_scenario
@@ -23,6 +24,7 @@ from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.scenarios import make_scenario
+from emulator.testing.trial import TrialPool
 from tests.support.paths import ROOT
 from vnet.errors import ProgramError, ScenarioError, VnetError
 
@@ -76,6 +78,47 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
     text = (folder / "campaign.html").read_text()
     assert f"<h2>Failures: {len(failed)}</h2>" in text
     assert "vnet simulate" in text
+
+
+def test_on_an_executor_a_campaign_finds_the_same(tmp_path: Path) -> None:
+    plan = Plan.of(planted("impatient"), "pause", 1, seed=1, shrink_steps=1)
+    quiet = Console(quiet=True)
+    here = run_campaign(plan, tmp_path / "here", quiet)
+    with ThreadPoolExecutor(2) as executor:
+        there = run_campaign(plan, tmp_path / "there", quiet, executor)
+    assert here == there == 1
+    told = [
+        [{**row, "wall_s": 0, "folder": ""} for row in results_of(tmp_path / name)] for name in ("here", "there")
+    ]
+    assert told[0] == told[1]
+    kept = next(row for row in results_of(tmp_path / "there") if "failed" in row)
+    assert (Path(kept["folder"]) / "verdict.json").exists(), "what has failed is kept on this machine"
+
+
+@pytest.mark.parametrize(
+    ("error", "failed"),
+    [(WorkerTimeoutError("not over within 2 s"), ["hung"]), (WorkerDiedError("killed"), ["emulator"])],
+    ids=["hung", "killed"],
+)
+def test_what_hangs_or_dies_on_an_executor_has_failed(error: VnetError, failed: list[str]) -> None:
+    assert TrialPool(2.0, planted("proud"), Failing(error)).run_anywhere(planted("proud")).failed == failed
+
+
+def test_an_executor_that_is_broken_ends_a_campaign() -> None:
+    with pytest.raises(VnetError, match="the executor is broken"):
+        TrialPool(2.0, planted("proud"), Failing(BrokenExecutor())).run_anywhere(planted("proud"))
+
+
+class Failing(Executor):
+    """Fails whatever it is to do."""
+
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    def submit(self, *_: Any, **__: Any) -> Future[Any]:
+        failed: Future[Any] = Future()
+        failed.set_exception(self._error)
+        return failed
 
 
 def test_a_failed_check_of_the_users_own_is_shrunk_and_a_broken_one_is_unknown(tmp_path: Path) -> None:
