@@ -49,6 +49,7 @@ class Attachment:
         self.inbox: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self._set_aside: deque[Item] = deque()
         self.on_message: Callable[[bytes], None] = no_wake
+        self.time_ns: Callable[[], int | None] = no_time
         self.orphan_timeout_s = 5.0
         self._patience_until = 0.0
         self._malformed = 0
@@ -82,7 +83,7 @@ class Attachment:
     def _on_rx(self, sample: zenoh.Sample) -> None:
         payload = sample.payload.to_bytes()
         if payload == _WHERE:  # the program's thread may be stuck: this one answers
-            self.say(wire.StackDump(self.nonce, self._stack()))
+            self.say(wire.StackDump(self.nonce, self._stack(), self.time_ns()))
             return
         self.inbox.put((payload, time.monotonic_ns()))
         self.on_message(payload)
@@ -112,12 +113,22 @@ class Attachment:
         """Say hello for each node on its own `tx`."""
         for node, publisher in self._publishers.items():
             hello = wire.Hello(
-                node, self.nodes[0], self.nonce, os.getpid(), self._host, ready=ready, failure=failure
+                node,
+                self.nodes[0],
+                self.nonce,
+                os.getpid(),
+                self._host,
+                ready=ready,
+                failure=failure,
+                version=wire.VERSION,
             )
             publisher.put(wire.encode(hello))
 
     def join(self, timeout_s: float) -> list[wire.Welcome]:
-        """Repeat hello until every node is welcome. Raises TransportError on refusal and after `timeout_s`."""
+        """Repeat hello until every node is welcome.
+
+        Raises TransportError on refusal, after `timeout_s`, and if the emulator speaks another version.
+        """
         welcomes: dict[str, wire.Welcome] = {}
         deadline = time.monotonic() + timeout_s
         while True:
@@ -126,6 +137,8 @@ class Attachment:
             while (wait_s := next_hello - time.monotonic()) > 0:
                 message = self._next(wait_s)
                 if isinstance(message, wire.Welcome) and message.nonce == self.nonce:
+                    if message.version != wire.VERSION:
+                        raise TransportError(wire.other_version("emulator", message.version, "agent"))
                     welcomes[message.node] = message
                 if len(welcomes) == len(self.nodes):
                     self.orphan_timeout_s = message.orphan_timeout_s  # type: ignore[union-attr]
@@ -210,6 +223,11 @@ class Attachment:
     def orphaned(self, patience_s: float) -> str:
         """The one line of an agent that has lost its emulator for so long."""
         return f"{self.nodes[0]}: the emulator has been gone for {patience_s:.3g} s; ending"
+
+
+def no_time() -> int | None:
+    """In real time, and before the first grant, there is no instant to tell of."""
+    return None
 
 
 def no_wake(payload: bytes) -> None:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host, load_programs
-from vnet.runtime.programs import Programs
+from vnet.runtime.host import Host
+from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
 from vnet.transport.credentials import Credentials
@@ -78,9 +78,13 @@ def _run_lockstep(
     seq = 0
 
     def exchange(next_timer_ns: int | None) -> int:
+        next_ns = host.next_instant(next_timer_ns)
+        if next_ns is not None:
+            return next_ns
         message = host.make_yield(attachment.nonce, seq, next_timer_ns)
         attachment.say(message)
-        attachment.publish(message.traffic)
+        for step in message.steps:
+            attachment.publish(step.traffic)
         return next_grant()
 
     def next_grant() -> int:
@@ -90,11 +94,11 @@ def _run_lockstep(
             message = attachment.next_message()
         seq = message.seq
         host.apply_clock_error(message.clocks, loop)
-        host.deliver(message.packets, message.fixes)
-        return message.time_ns
+        return host.open_window(message)
 
     loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
     host = Host(welcomes, lambda: loop.now_ns, on_line=write_line, disks=disks, debugger=debugger)
+    attachment.time_ns = lambda: loop.now_ns
     asyncio.set_event_loop(loop)
     try:
         loop.start_at(next_grant())
@@ -108,7 +112,7 @@ def _run_lockstep(
                 host.end_exited(leave)
     except RunOverError:
         host.close(loop)
-        attachment.say(wire.Final(attachment.nonce, host.take_traffic()))
+        attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:
         loop.close()
 

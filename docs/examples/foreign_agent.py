@@ -21,11 +21,10 @@ from typing import Any
 import msgpack
 import zenoh
 
-HELLO_PERIOD_S = 0.5
-SIGN_OF_LIFE_S = 1.0  # real time: longest silence towards the emulator
+VERSION = 2  # of the messages; an emulator of another version refuses the hello
+HELLO_PERIOD_S, SIGN_OF_LIFE_S = 0.5, 1.0  # the latter in real time: longest silence towards the emulator
 HEAD_START_NS = 200_000_000  # real time: time 0 is this long after the first batch
-LATENESS_BINS = 80
-LIMIT_BIN = 44  # the bin that begins at the limit
+LATENESS_BINS, LIMIT_BIN = 80, 44  # LIMIT_BIN begins at the limit
 LIMIT_NS = 20_000_000  # deliveries that are later count against the run
 
 
@@ -75,15 +74,15 @@ class Agent:
         block = zenoh.CongestionControl.BLOCK
         self.tx = session.declare_publisher(f"{key}/tx", congestion_control=block, express=True)
         self.rx = session.declare_subscriber(f"{key}/rx", self.on_rx)
-        self.token = session.liveliness().declare_token(f"{key}/alive")
-        alive = f"vnet/{run}/emulator/alive"
-        self.emulator = session.liveliness().declare_subscriber(alive, self.on_emulator, history=True)
+        liveliness = session.liveliness()
+        self.token = liveliness.declare_token(f"{key}/alive")
+        self.emulator = liveliness.declare_subscriber(f"vnet/{run}/emulator/alive", self.on_emulator, history=True)
 
     def on_rx(self, sample: zenoh.Sample) -> None:
         """Queue a message with the instant of its arrival."""
         message = unpack(sample.payload.to_bytes())
         if message == ["StackRequest"]:  # answered here: the main thread may be busy
-            self.say("StackDump", self.nonce, "")
+            self.say("StackDump", self.nonce, "", None)
         elif isinstance(message, list) and message:  # anything else is malformed, and dropped
             self.inbox.put((message, time.monotonic_ns()))
 
@@ -116,28 +115,29 @@ class Agent:
         hello: list[Any] = ["Hello", self.node, self.node, self.nonce, os.getpid(), socket.gethostname()]
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
-            self.say(*hello, False, None)
+            self.say(*hello, False, None, VERSION)
             message, _ = self.next(HELLO_PERIOD_S)
             if message[0] == "Welcome" and message[2] == self.nonce:
-                self.say(*hello, True, None)
+                self.say(*hello, True, None, VERSION)
                 return message
         sys.exit(f"{self.node}: no welcome within {timeout_s:g} s: is the emulator running?")
 
     def run_lockstep(self, vehicle: Vehicle) -> None:
-        """Answer each grant with one yield: this vehicle waits for fixes, and has no timers."""
+        """Answer each grant with a yield. The vehicle acts at fixes alone: at the first instant of a window."""
+        mail: list[Any] = []  # packets; those that arrive later in a window are for the next one
         while True:
             message, _ = self.next(60.0)
             if message[0] == "Grant":
-                _, seq, time_ns, packets, fixes, clocks, *_ = message
-                waiting_gnss = [self.node] if vehicle.runs else []
-                traffic = vehicle.step(time_ns, packets, fixes, clocks)
-                self.say("Yield", self.nonce, seq, None, [], waiting_gnss, traffic)
+                _, seq, time_ns, _end_ns, packets, fixes, clocks, *_ = message
+                mail += packets
+                steps = [[time_ns, vehicle.step(time_ns, [p for p in mail if p[3] <= time_ns], fixes, clocks)]]
+                mail = [packet for packet in mail if packet[3] > time_ns]
+                self.say("Yield", self.nonce, seq, None, [], [self.node] * vehicle.runs, steps, 1)
 
     def run_realtime(self, vehicle: Vehicle, same_machine: bool) -> None:
         """Send frames at each fix, acknowledge batches at least once a second, and mark the last message."""
         seq, expected, origin_ns, said_s = 0, 0, 0, math.inf  # nothing is said before batch 0
-        missed: list[list[int]] = []
-        lateness = [0] * LATENESS_BINS
+        missed, lateness = list[list[int]](), [0] * LATENESS_BINS
         while True:
             traffic: list[Any] = [[], [], []]
             try:
@@ -163,18 +163,18 @@ class Agent:
 
 def client_config(endpoint: str, credentials: dict[str, Any]) -> zenoh.Config:
     """A client of the emulator's router: user and password, and a certificate where the router asks for one."""
+    login = {name: credentials[name] for name in ("user", "password")}
     link: dict[str, Any] = {"tx": {"lease": 60_000}}  # a starved machine must not look like a dead one
     if tls := credentials.get("tls"):
         pem = {"root_ca_certificate": tls["authority"], "connect_certificate": tls["own"]["certificate"]}
         pem["connect_private_key"] = tls["own"]["private_key"]
         link["tls"] = {f"{name}_base64": base64.b64encode(text.encode()).decode() for name, text in pem.items()}
         link["tls"] |= {"enable_mtls": True, "verify_name_on_connect": True}
-    usrpwd = {name: credentials[name] for name in ("user", "password")}
     config = {
         "mode": "client",
         "connect": {"endpoints": [endpoint], "timeout_ms": 5000, "exit_on_failure": True},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"shared_memory": {"enabled": False}, "link": link, "auth": {"usrpwd": usrpwd}},
+        "transport": {"shared_memory": {"enabled": False}, "link": link, "auth": {"usrpwd": login}},
     }
     return zenoh.Config.from_json5(json.dumps(config))
 

@@ -153,6 +153,7 @@ class Emulation:
             scenario.run.spin_limit,
             wire.boot_id(),
             not self.presence.has_ended(node),
+            wire.VERSION,
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -311,9 +312,11 @@ class Emulation:
         self._arrived = []
         return deliveries
 
-    def look_ahead(self, time_ns: int, nodes: Iterable[str]) -> None:
-        """Let the radio come as far as anybody can act: `time_ns`, or an arrival at one of these nodes before."""
-        self.engine.look_ahead(time_ns, [self.number[node] for node in nodes])
+    def pass_to(self, time_ns: int) -> None:
+        """As `advance`, where everything that arrives by then has been foreseen and handed out."""
+        self.close_periods(time_ns)
+        self.engine.advance(time_ns)
+        self._arrived = []
 
     def fix_time_ns(self, period: int) -> int | None:
         """Time at which the fix of a period is due; None after the end of the run."""

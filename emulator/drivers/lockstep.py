@@ -1,33 +1,50 @@
 """The barrier of a run in lockstep, without any transport.
 
 Lockstep is a conservative discrete-event simulation whose entities are event loops: it is told what each process
-yields and says which processes to grant which instant. The live driver moves these messages over Zenoh,
+yields and says which processes to grant which window of time. The live driver moves these messages over Zenoh,
 `vnet simulate` by calling; so both give the same trace.
+
+No frame arrives sooner than L, `least_latency_ns`, after it was sent. So what arrives in a window [T, T + L) was
+sent before T, the next instant at which anything happens: each process may pass through the window by itself.
+Arrivals are *shown* to processes before the window, and *decided* after it, in the order of time with what the
+processes did: a program that ends within the window does not receive what arrives later. A window ends with the
+period at the latest, and before faults and the horizon.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from heapq import heappop, heappush
+from itertools import count
 from typing import Any
+
+import numpy as np
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
+from emulator.radio.stages import least_latency_ns
 from vnet.node import INBOX_LIMIT
 from vnet.transport import wire
 
 
 class _Process:
-    """One event loop: its nodes, what they last said, and what waits for its next wake-up."""
+    """One event loop: its nodes, what they last said, and what waits for its next wake-up.
 
-    def __init__(self, nodes: Sequence[str]) -> None:
+    `order` is its place among all processes. `plan` numbers its planned wake-up: earlier ones are void.
+    """
+
+    def __init__(self, nodes: Sequence[str], order: int) -> None:
+        self.id = nodes[0]
         self.nodes = tuple(nodes)
+        self.order = order
+        self.plan = -1
         self.seq = 0
+        self.granted_ns = 0
         self.next_timer_ns: int | None = None
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
-        self.traffic: wire.Traffic | None = None
-        self.packets: dict[str, deque[wire.WirePacket]] = {node: deque(maxlen=INBOX_LIMIT) for node in self.nodes}
+        self.steps: Sequence[wire.Step] = ()
+        self.packets: dict[str, list[wire.WirePacket]] = {node: [] for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.affected: set[str] = set()
@@ -48,6 +65,24 @@ class _Process:
         changed, self.clocks = self.clocks, []
         return changed
 
+    def check(self, message: wire.Yield, end_ns: int) -> None:
+        """Raise ProtocolError if a yield does not fit the window that ends at `end_ns`."""
+        if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
+            raise ProtocolError(
+                f"yield {message.seq} of {self.id}: its next timer, {message.next_timer_ns}, lies before the end "
+                f"of its window, {end_ns}"
+            )
+        check_ownership(self.nodes, wire.Traffic(), [*message.waiting_radio, *message.waiting_gnss])
+        earliest_ns = self.granted_ns
+        for step in message.steps:
+            if not earliest_ns <= step.time_ns < end_ns:
+                raise ProtocolError(
+                    f"yield {message.seq} of {self.id}: a step at {step.time_ns}, where {earliest_ns} to "
+                    f"{end_ns - 1} are allowed"
+                )
+            earliest_ns = step.time_ns + 1
+            check_ownership(self.nodes, step.traffic)
+
 
 class Lockstep:
     """The barrier of a run. `processes` are the node ids of each event loop; the first is its id.
@@ -65,23 +100,45 @@ class Lockstep:
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], hosts_all: bool = False) -> None:
         self._emulation = emulation
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
+        self._order = {process_id: order for order, process_id in enumerate(self._groups)}
         self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
-        there = [nodes for nodes in processes if hosts_all or any(emulation.up[node] for node in nodes)]
-        self._processes = {nodes[0]: _Process(nodes) for nodes in there}
+        self._processes: dict[str, _Process] = {}
         self._hosts_all = hosts_all
         self._actions: list[ProcessActions] = []
         self._woken: set[str] = set()
+        self._wakes: list[tuple[int, int, int, str]] = []
+        """Heap of planned wake-ups: time, order, plan and id of a process."""
+        self._plans = count()
+        self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
+        """Nodes (N,) that an arrival wakes."""
+        self._yielded: list[_Process] = []
+        self._crowded: set[str] = set()
+        """Nodes for which more packets wait than a mailbox holds."""
+        self._end_ns = 0
+        radio = emulation.scenario.radio
+        self._lookahead_ns = least_latency_ns(radio) if emulation.scenario.run.windows else 1
         self.owed: dict[str, int] = {}
         self.now_ns = 0
+        """Emulated time: the beginning of the window, or the last change."""
         self.horizon_ns: int | None = None
         self.held = False
+        for nodes in processes:
+            if hosts_all or any(emulation.up[node] for node in nodes):
+                self._add(nodes[0])
+
+    @property
+    def decided_ns(self) -> int:
+        """Emulated time up to which nothing can be changed any more: new faults act after it."""
+        passed_ns = self.horizon_ns - 1 if self.held and self.horizon_ns is not None else 0
+        return max(self.now_ns, self._end_ns - 1, passed_ns)
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
         if self._emulation.next_change_ns() == 0:
             self._act(0)
         if first := [process_id for process_id, process in self._processes.items() if process.running]:
-            return self._grant(first)
+            self._open_window(0)
+            return self._grant(dict.fromkeys(first, 0))
         return self._go_on()  # all are dead or paused
 
     def take_actions(self) -> list[ProcessActions]:
@@ -92,47 +149,58 @@ class Lockstep:
     def receive(self, process_id: str, message: wire.Yield) -> None:
         """A process has yielded.
 
-        Raises ProtocolError if it was not owed, speaks for others' nodes, or asks for the same instant again.
+        Raises ProtocolError if it was not owed, speaks for others' nodes, or does not keep to its window.
         """
         process = self._processes[process_id]
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
-        if message.next_timer_ns is not None and message.next_timer_ns <= self.now_ns:
-            raise ProtocolError(
-                f"yield {message.seq} of {process_id}: its next timer is not later than {self.now_ns}"
-            )
-        waiting = [*message.waiting_radio, *message.waiting_gnss]
-        check_ownership(process.nodes, message.traffic, waiting)
+        process.check(message, self._end_ns)
         del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns
         process.waiting_radio = message.waiting_radio
         process.waiting_gnss = message.waiting_gnss
-        process.traffic = message.traffic
+        process.steps = message.steps
+        self._yielded.append(process)
+        self._plan(process)
+        self._emulation.costs.wake_ups[process_id] += message.instants
 
     def died(self, process_id: str, **details: Any) -> None:
-        """A process has ended: its nodes are down from this instant on, and nothing is owed by it."""
-        process = self._processes.pop(process_id, None)
+        """A process has ended: its nodes are down from the beginning of the window on, and nothing is owed by it.
+
+        What it did within the window is lost with it.
+        """
+        process = self._processes.get(process_id)
         if process is None:  # a fault was faster
             return
+        self._remove(process_id)
         self.owed.pop(process_id, None)
         for node in process.nodes:
             self._emulation.died(self.now_ns, node, **details)
 
     def step(self) -> dict[str, wire.Grant]:
-        """Do what was yielded, go to the next instant, and say who is granted it; none at the end, or if held."""
+        """Do what was yielded, go to the next window, and say who is granted it; none at the end, or if held."""
+        self._settle()
+        return self._go_on()
+
+    def _settle(self) -> None:
+        """Take what was enqueued in the window, in the order of time, and decide what has arrived in it."""
         assert not self.owed, self.owed
         emulation = self._emulation
-        emulation.take(self.now_ns, [p.traffic for p in self._processes.values() if p.traffic is not None])
-        for process in self._processes.values():
-            process.traffic = None
-        return self._go_on()
+        instants: dict[int, list[wire.Traffic]] = {}
+        for process in sorted(self._yielded, key=lambda process: process.order):
+            for step in process.steps:
+                instants.setdefault(step.time_ns, []).append(step.traffic)
+        self._yielded = []
+        for time_ns in sorted(instants):
+            if any(traffic.endings for traffic in instants[time_ns]):
+                emulation.pass_to(time_ns)  # what arrives at the same instant is still received
+            emulation.take(time_ns, instants[time_ns])
+        emulation.pass_to(self._end_ns - 1)
 
     def _go_on(self) -> dict[str, wire.Grant]:
         emulation = self._emulation
         while True:
-            self._look_ahead()
-            wakes = {process_id: self._wake_ns(process) for process_id, process in self._processes.items()}
-            next_ns = min((wake for wake in wakes.values() if wake is not None), default=emulation.duration_ns)
+            next_ns = self._next_instant_ns()
             change_ns = emulation.next_change_ns()
             if self._hold(next_ns if change_ns is None else min(next_ns, change_ns)):
                 return {}
@@ -142,32 +210,127 @@ class Lockstep:
         if next_ns >= emulation.duration_ns:
             emulation.finish(emulation.duration_ns)
             return {}
-        self.now_ns = next_ns
-        self._collect_packets(next_ns)
-        return self._grant([process_id for process_id, wake in wakes.items() if wake == next_ns])
+        self._open_window(next_ns)
+        return self._grant(self._wakes_in_window())
 
-    def _look_ahead(self) -> None:
-        """Let the radio come as far as the first instant at which anything else happens, and no further.
+    def _next_instant_ns(self) -> int:
+        """Return the next instant at which a process has something to do, or the end of the run.
 
-        Arrivals depend on what others send before; so far nobody will, but for those whom an arrival wakes.
+        The radio comes as far as this instant, and no further: arrivals depend on what others send before, and so
+        far nobody will but for those whom an arrival wakes.
         """
         emulation = self._emulation
-        stops_ns = [emulation.duration_ns, emulation.next_change_ns(), self.horizon_ns]
-        stops_ns += [self._wake_ns(process, by_radio=False) for process in self._processes.values()]
-        waiting = [n for p in self._processes.values() for n in p.waiting_radio if n not in p.paused]
-        emulation.look_ahead(min(time_ns for time_ns in stops_ns if time_ns is not None), waiting)
+        stops_ns = (emulation.duration_ns, self._next_planned_ns())
+        next_ns = min(time_ns for time_ns in stops_ns if time_ns is not None)
+        until_ns = [next_ns, emulation.next_change_ns(), self.horizon_ns]
+        listening = np.flatnonzero(self._listens)
+        emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
+        if len(listening):
+            next_ns = min(next_ns, int(emulation.engine.next_arrivals_ns()[listening].min()))
+        return max(next_ns, self.now_ns)
 
     def _hold(self, next_ns: int) -> bool:
         """Return whether what comes next lies beyond the horizon; all before it is then done and recorded."""
         self.held = self.horizon_ns is not None and next_ns >= self.horizon_ns
         if self.horizon_ns is not None and self.held:
-            self._collect_packets(self.horizon_ns - 1)
+            self._pass_to(self.horizon_ns - 1)
             self._emulation.close_periods(self.horizon_ns)
         return self.held
 
+    # Windows.
+
+    def _open_window(self, time_ns: int) -> None:
+        """Begin the window at `time_ns`, and show what arrives in it."""
+        emulation = self._emulation
+        period_ns = emulation.world.period_ns
+        ends_ns = [time_ns + self._lookahead_ns, (time_ns // period_ns + 1) * period_ns, emulation.duration_ns]
+        ends_ns += [end_ns for end_ns in (emulation.next_change_ns(), self.horizon_ns) if end_ns is not None]
+        self.now_ns, self._end_ns = time_ns, min(ends_ns)
+        self._show(self._end_ns - 1)
+        emulation.close_periods(time_ns)
+
+    def _pass_to(self, time_ns: int) -> None:
+        """Show and decide what arrives up to `time_ns`, before which no process has anything to do."""
+        self._show(time_ns)
+        self._emulation.pass_to(time_ns)
+
+    def _show(self, time_ns: int) -> None:
+        """Put what arrives up to `time_ns` where its receiver will find it."""
+        node_ids = self._emulation.world.node_ids
+        for node in self._crowded:
+            if process := self._processes.get(self._process_of[node]):
+                del process.packets[node][:-INBOX_LIMIT]
+        self._crowded.clear()
+        for delivery in self._emulation.engine.foresee(time_ns):
+            node = node_ids[delivery.receiver]
+            packets = self._processes[self._process_of[node]].packets[node]
+            packets.append(wire_packet(node, delivery.packet))
+            if len(packets) > INBOX_LIMIT:
+                self._crowded.add(node)
+
+    def _wakes_in_window(self) -> dict[str, int]:
+        """Return the first instant in the window of each process that has one, in the order of the processes."""
+        wakes: dict[str, int] = {}
+        while (next_ns := self._next_planned_ns()) is not None and next_ns < self._end_ns:
+            wakes[heappop(self._wakes)[3]] = next_ns
+        arrivals_ns = self._emulation.engine.next_arrivals_ns()
+        for number in np.flatnonzero(self._listens & (arrivals_ns < self._end_ns)).tolist():
+            process_id = self._process_of[self._emulation.world.node_ids[number]]
+            wakes[process_id] = min(wakes.get(process_id, self._end_ns), int(arrivals_ns[number]))
+        in_order = sorted(wakes, key=self._order.__getitem__)
+        return {process_id: max(wakes[process_id], self.now_ns) for process_id in in_order}
+
+    # Processes, and when they run next.
+
+    def _add(self, process_id: str) -> _Process:
+        process = _Process(self._groups[process_id], self._order[process_id])
+        self._processes[process_id] = process
+        return process
+
+    def _remove(self, process_id: str) -> None:
+        process = self._processes.pop(process_id, None)
+        for node in () if process is None else process.nodes:
+            self._listens[self._emulation.number[node]] = False
+
+    def _plan(self, process: _Process) -> None:
+        """Note what a process waits for: an arrival, or a time that is known."""
+        for node in process.nodes:
+            self._listens[self._emulation.number[node]] = False
+        for node in process.waiting_radio:
+            self._listens[self._emulation.number[node]] = node not in process.paused
+        process.plan = next(self._plans)
+        wake_ns = self._known_wake_ns(process)
+        if wake_ns is not None:
+            heappush(self._wakes, (wake_ns, process.order, process.plan, process.id))
+
+    def _known_wake_ns(self, process: _Process) -> int | None:
+        """Return when a process runs next without an arrival: at a timer, at a fix, or now if it was woken."""
+        if not process.running:
+            return None
+        if process.id in self._woken:
+            return self.now_ns
+        fixes_ns = [
+            self._emulation.fix_time_ns(process.next_fix[node])
+            for node in process.waiting_gnss
+            if node not in process.paused
+        ]
+        return min((time_ns for time_ns in (process.next_timer_ns, *fixes_ns) if time_ns is not None), default=None)
+
+    def _next_planned_ns(self) -> int | None:
+        """Return the earliest of the planned wake-ups, having dropped those that are void."""
+        while self._wakes:
+            wake_ns, _, plan, process_id = self._wakes[0]
+            process = self._processes.get(process_id)
+            if process is not None and process.plan == plan:
+                return wake_ns
+            heappop(self._wakes)
+        return None
+
+    # Changes.
+
     def _act(self, time_ns: int) -> None:
         """Let faults act: after all that came before this instant, and before anything that happens at it."""
-        self._collect_packets(time_ns - 1)
+        self._pass_to(time_ns - 1)
         self.now_ns = time_ns
         actions = self._emulation.act(time_ns)
         self._actions.append(actions)
@@ -178,11 +341,12 @@ class Lockstep:
         for process in self._processes.values():
             paused = actions.paused & set(process.nodes)
             if process.paused - paused:
-                self._woken.add(process.nodes[0])
+                self._woken.add(process.id)
             process.paused = paused
             for clock in actions.clocks:
                 if clock.node in process.next_fix:
                     self._apply_clock_error(process, clock)
+            self._plan(process)
 
     def _apply_clock_error(self, process: _Process, clock: wire.ClockError) -> None:
         if clock.is_wrong or clock.node in process.affected:
@@ -194,63 +358,34 @@ class Lockstep:
         if self._hosts_all:
             self._processes[process_id].packets[node].clear()
         else:
-            self._processes.pop(process_id, None)
+            self._remove(process_id)
 
     def _start(self, node: str) -> None:
         process_id = self._process_of[node]
-        if process_id not in self._processes:
-            # In the order of the first processes, so that nothing depends on who was gone when.
-            self._processes[process_id] = _Process(self._groups[process_id])
-            self._processes = {
-                process_id: self._processes[process_id]
-                for process_id in self._groups
-                if process_id in self._processes
-            }
-        process = self._processes[process_id]
+        process = self._processes.get(process_id) or self._add(process_id)
         process.next_fix[node] = -(-self.now_ns // self._emulation.world.period_ns)
         self._woken.add(process_id)
 
-    def _wake_ns(self, process: _Process, by_radio: bool = True) -> int | None:
-        """Time at which a process must run next: its next timer, or what its nodes' tasks wait for.
+    # Grants.
 
-        With or without what is on its way to them.
-        """
-        if not process.running:
-            return None
-        if process.nodes[0] in self._woken:
-            return self.now_ns
-        emulation = self._emulation
-        candidates = [process.next_timer_ns]
-        awaited = set(process.running)
-        if by_radio:
-            hearing = [n for n in process.waiting_radio if n in awaited]
-            candidates += [emulation.engine.next_arrival_ns(emulation.number[n]) for n in hearing]
-        candidates += [emulation.fix_time_ns(process.next_fix[n]) for n in process.waiting_gnss if n in awaited]
-        due = [time_ns for time_ns in candidates if time_ns is not None]
-        return max(min(due), self.now_ns) if due else None
+    def _grant(self, wakes: Mapping[str, int]) -> dict[str, wire.Grant]:
+        return {
+            process_id: self._grant_one(self._processes[process_id], time_ns)
+            for process_id, time_ns in wakes.items()
+        }
 
-    def _collect_packets(self, time_ns: int) -> None:
-        """Put what has arrived by then where its receiver will find it at its next wake-up."""
-        node_ids = self._emulation.world.node_ids
-        queues = {node: queue for p in self._processes.values() for node, queue in p.packets.items()}
-        for delivery in self._emulation.advance(time_ns):
-            node = node_ids[delivery.receiver]
-            queues[node].append(wire_packet(node, delivery.packet))
+    def _grant_one(self, process: _Process, time_ns: int) -> wire.Grant:
+        self._woken.discard(process.id)
+        process.granted_ns = time_ns
+        fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
+        packets, clocks = process.take_packets(), process.take_clocks()
+        grant = wire.Grant(process.seq, time_ns, self._end_ns, packets, fixes, clocks)
+        self.owed[process.id] = process.seq
+        process.seq += 1
+        return grant
 
-    def _grant(self, process_ids: Sequence[str]) -> dict[str, wire.Grant]:
-        grants = {}
-        for process_id in process_ids:
-            process = self._processes[process_id]
-            self._woken.discard(process_id)
-            fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
-            packets, clocks = process.take_packets(), process.take_clocks()
-            grants[process_id] = wire.Grant(process.seq, self.now_ns, packets, fixes, clocks)
-            self.owed[process_id] = process.seq
-            self._emulation.costs.wake_ups[process_id] += 1
-            process.seq += 1
-        return grants
-
-    def _take_fixes(self, process: _Process, node: str) -> list[wire.WireFix]:
+    def _take_fixes(self, process: _Process, node: str) -> Iterable[wire.WireFix]:
+        """Return the fixes that are due: a window ends with the period, so none is due within it."""
         world = self._emulation.world
         last = self.now_ns // world.period_ns
         first = max(process.next_fix[node], last - INBOX_LIMIT + 1)

@@ -23,8 +23,9 @@ from emulator.records.node_logs import NodeLogs
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host, load_programs
+from vnet.runtime.host import Host
 from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -47,8 +48,8 @@ def simulate(
 ) -> tuple[float, bool]:
     """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
 
-    Ctrl-C ends the run early, between two instants and with the event `interrupted`; a second one ends it wherever
-    it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
+    Ctrl-C ends the run early, with the event `interrupted` and without the window in which it comes; a second one
+    ends it wherever it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
     a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program.
@@ -58,7 +59,7 @@ def simulate(
     started = time.monotonic()
     interrupted = False
     try:
-        with _ending_between_instants(simulation, on_interrupt):
+        with _ending_between_windows(simulation, on_interrupt):
             simulation.run()
     except KeyboardInterrupt:
         interrupted = True
@@ -68,7 +69,7 @@ def simulate(
 
 
 @contextmanager
-def _ending_between_instants(simulation: _Simulation, on_interrupt: Callable[[], None]) -> Iterator[None]:
+def _ending_between_windows(simulation: _Simulation, on_interrupt: Callable[[], None]) -> Iterator[None]:
     """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
 
     def ask(number: int, frame: object) -> None:
@@ -163,9 +164,12 @@ class _Simulation:
 
     def _close(self, time_ns: int) -> None:
         self._host.close(self.loop)
-        self._emulation.take_final(time_ns, [self._host.take_traffic()])
+        self._emulation.take_final(time_ns, [self._host.take_final()])
 
     def _exchange(self, next_timer_ns: int | None) -> int:
+        next_ns = self._host.next_instant(next_timer_ns)
+        if next_ns is not None:
+            return next_ns
         if self.stop.is_set():
             raise KeyboardInterrupt
         self._lockstep.receive(self._process_of, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
@@ -182,8 +186,7 @@ class _Simulation:
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self.loop)
         self._apply_process_faults(self._lockstep.take_actions())
-        self._host.deliver(grant.packets, grant.fixes)
-        return grant.time_ns
+        return self._host.open_window(grant)
 
     def _apply_process_faults(self, actions: Sequence[ProcessActions]) -> None:
         """Do to the programs what faults do to processes."""

@@ -21,6 +21,7 @@ from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from emulator.radio.connectivity import connectivity_of
+from emulator.radio.stages import least_latency_ns
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import METRICS_FILE
@@ -30,6 +31,7 @@ from vnet.cmm.linear_model import convergence_factor, deviation_covariance
 from vnet.cmm.weights import max_degree_weights, metropolis_weights
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
+from vnet.units import NS_PER_MS
 
 Links = NDArray[np.bool_]
 FASTEST = "fastest-mixing"
@@ -39,6 +41,7 @@ NO_CVXPY = "fastest-mixing weights left out: cvxpy is not installed (pip install
 def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     """Analyze the scenario's network before any run, as plain numbers; `analysis_table` prints them.
 
+    `lookahead_ms` is the longest window of a run in lockstep (docs/virtual-time.md).
     `components` are sizes, largest first, of who is linked both ways (`weak_components` counts links of one
     direction as well, as the metrics of a run do). Of each of the `rules`: `convergence_factor` (r_asym, 1.0 where
     the network is not connected), `spectral_gap` (1 less that), `deviation_variance`, the steady variance
@@ -52,6 +55,7 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     hears = hears_matrix(scenario, world)
     weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
     result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
+    result["lookahead_ms"] = least_latency_ns(scenario.radio) / NS_PER_MS
     if run is not None:
         result["measured"] = _measured(run, result["rules"])
     return result
@@ -251,6 +255,7 @@ def _graph_rows(analysis: dict[str, Any]) -> list[tuple[str, str]]:
         ("degree:vehicles", histogram),
         ("diameter (hops)", str(analysis["diameter"])),
         ("algebraic connectivity", "–" if connectivity is None else f"{connectivity:.4g}"),
+        *([("lookahead (ms)", f"{analysis['lookahead_ms']:g}")] if "lookahead_ms" in analysis else []),
     ]
 
 

@@ -45,6 +45,7 @@ from emulator.radio.topology import Topology
 from emulator.radio.trace import Trace, payload_digest
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links
+from vnet.types import IntArray
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
 
@@ -244,6 +245,11 @@ class Engine:
         self._settle()
         return self._in_flight.next_ns(node)
 
+    def next_arrivals_ns(self) -> IntArray:
+        """Return the time of the next arrival at each node (N,), as `next_arrival_ns`, or `NO_ARRIVAL_NS`."""
+        self._settle()
+        return self._in_flight.by_receiver()
+
     def next_time(self) -> int | None:
         """Return the time of the next arrival or MAC event, at which `advance` must be called, or None."""
         self._settle()
@@ -252,7 +258,7 @@ class Engine:
         times_ns = (self._in_flight.soonest_ns(), None if air_ns is None else air_ns + 1)
         return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
-    def look_ahead(self, time_ns: int, nodes: Sequence[int]) -> None:
+    def look_ahead(self, time_ns: int, nodes: Sequence[int] | IntArray) -> None:
         """Process the events of the MAC up to `time_ns`, or up to the first arrival at one of these nodes.
 
         The caller guarantees that no frame is enqueued before that.
@@ -265,10 +271,9 @@ class Engine:
             if self._csma.sent:
                 until_ns = self._first_ns(time_ns, nodes)
 
-    def _first_ns(self, time_ns: int, nodes: Sequence[int]) -> int:
+    def _first_ns(self, time_ns: int, nodes: Sequence[int] | IntArray) -> int:
         """Return `time_ns`, or the first arrival at one of these nodes if that is earlier."""
-        arrivals_ns = [self.next_arrival_ns(node) for node in nodes]
-        return min([time_ns, *(arrival_ns for arrival_ns in arrivals_ns if arrival_ns is not None)])
+        return min(time_ns, int(self.next_arrivals_ns()[nodes].min())) if len(nodes) else time_ns
 
     def pending_rows(self) -> list[int]:
         """Return the row numbers of the trace whose receptions are in flight."""
@@ -281,6 +286,15 @@ class Engine:
         if any(frame.end_ns + MIN_LATENCY_NS <= time_ns for frame in self._mac.sent):
             self._settle()
         return self._arrive(time_ns)
+
+    def foresee(self, time_ns: int) -> Deliveries:
+        """Return all packets that will arrive up to `time_ns` at nodes that are up now, in the order of `advance`.
+
+        They stay in flight: `advance` decides them, by the nodes that are up then. The caller guarantees that no
+        frame that is enqueued, or goes on air, later arrives by `time_ns`.
+        """
+        self._settle()
+        return self._in_flight.foresee(time_ns, self._topology.up, self._trace)
 
     def _arrive(self, time_ns: int) -> Deliveries:
         table = self._in_flight.take(time_ns)

@@ -95,6 +95,7 @@ class InFlight:
         self._by_receiver: IntArray = np.full(count, NO_ARRIVAL_NS)
         self._by_receiver_is_valid = True
         self._soonest_ns = NO_ARRIVAL_NS
+        self._foreseen_ns = -1
 
     def add(
         self,
@@ -104,9 +105,14 @@ class InFlight:
         row: IntArray,
         arrival_ns: IntArray,
     ) -> None:
-        """Add receptions, arrays (n,) each; `frame_index` are indices into `frames`, `row` rows of the trace."""
+        """Add receptions, arrays (n,) each; `frame_index` are indices into `frames`, `row` rows of the trace.
+
+        None of them arrives by a time up to which arrivals have been foreseen.
+        """
         if not len(row):
             return
+        soonest_ns = int(arrival_ns.min())
+        assert soonest_ns > self._foreseen_ns, f"arrival at {soonest_ns} ns: foreseen up to {self._foreseen_ns} ns"
         self._make_room(len(row))
         new = self._table[:, self._length : self._length + len(row)]
         new[_ARRIVAL], new[_RECEIVER], new[_ROW] = arrival_ns, receiver, row
@@ -114,7 +120,7 @@ class InFlight:
         self._frames.update(enumerate(frames, self._next_frame))
         self._next_frame += len(frames)
         self._length += len(row)
-        self._soonest_ns = min(self._soonest_ns, int(arrival_ns.min()))
+        self._soonest_ns = min(self._soonest_ns, soonest_ns)
         if self._by_receiver_is_valid:
             np.minimum.at(self._by_receiver, receiver, arrival_ns)
 
@@ -130,13 +136,28 @@ class InFlight:
 
     def next_ns(self, receiver: int) -> int | None:
         """Return the time of the next arrival at `receiver`, or None."""
+        next_ns = int(self.by_receiver()[receiver])
+        return None if next_ns == NO_ARRIVAL_NS else next_ns
+
+    def by_receiver(self) -> IntArray:
+        """Return the time of the next arrival at each receiver (N,), or `NO_ARRIVAL_NS`; not to be changed."""
         if not self._by_receiver_is_valid:
             self._by_receiver[:] = NO_ARRIVAL_NS
             flying = self._table[:, : self._length]
             np.minimum.at(self._by_receiver, flying[_RECEIVER], flying[_ARRIVAL])
             self._by_receiver_is_valid = True
-        next_ns = int(self._by_receiver[receiver])
-        return None if next_ns == NO_ARRIVAL_NS else next_ns
+        return self._by_receiver
+
+    def foresee(self, time_ns: int, up: NDArray[np.bool_], trace: Trace) -> Deliveries:
+        """Return what arrives up to `time_ns` at receivers that are `up` (N,); it stays in flight.
+
+        None that is added later may arrive by then.
+        """
+        self._foreseen_ns = max(self._foreseen_ns, time_ns)
+        flying = self._table[:, : self._length]
+        due = flying[_ARRIVAL] <= time_ns
+        due[due] = up[flying[_RECEIVER, due]]
+        return Deliveries(flying[:, due], self._frames, trace)
 
     def rows(self) -> list[int]:
         """Return the row numbers of the trace of all receptions in flight."""

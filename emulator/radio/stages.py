@@ -24,6 +24,11 @@ MIN_LATENCY_NS = 1_000
 """Least latency of a reception: time passes in every exchange between nodes."""
 
 
+def least_latency_ns(radio: Radio) -> int:
+    """Return the shortest time from the end of a frame to its arrival: faults and jitter only add to it."""
+    return max(int(radio.latency_ms * NS_PER_MS), MIN_LATENCY_NS)
+
+
 def frame_draws(draws: Draws, frames: Sequence[Frame], receptions: Receptions) -> Array:
     """Return the draws of the pending receptions, and 1 for the others (K, M)."""
     drawn = np.ones(receptions.outcome.shape)

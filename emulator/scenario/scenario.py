@@ -60,8 +60,11 @@ class Run(Section):
     """Agent processes: `fork` them from one that has imported what they need (on Linux) or `spawn` interpreters."""
     join_timeout_s: float = Field(60.0, gt=0, le=DAY_S)
     """Time for agents to join, or to come back after a fault (wall clock)."""
+    windows: bool = True
+    """Lockstep: processes run alone for as long as no frame sent meanwhile can arrive (`radio.latency_ms`), and not
+    for one instant. The run is the same; `false` is for agents that know no windows."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
-    """A process that does not yield for so long (wall clock) ends the run as unknown; lockstep, live."""
+    """A process that makes no progress for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
     """An agent that has lost its emulator for so long (wall clock) ends."""
     spin_limit: int = Field(100_000, ge=100, le=MANY)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from agents.attachment import Attachment
+from vnet.errors import TransportError
 from vnet.transport import wire
 
 
@@ -28,7 +29,7 @@ def test_malformed_messages_are_dropped_counted_and_logged_once(
     data: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     attached = attachment()
-    grant = wire.Grant(0, 7, [], [], [])
+    grant = wire.Grant(0, 7, 8, [], [], [])
     for message in (data, data, wire.encode(grant)):
         attached.inbox.put((message, 0))
     assert attached.next_message() == grant
@@ -41,3 +42,15 @@ def test_malformed_messages_are_dropped_counted_and_logged_once(
 def test_where_nothing_was_dropped_nothing_is_said_of_it(capsys: pytest.CaptureFixture[str]) -> None:
     attachment().write_total()
     assert capsys.readouterr().err == ""
+
+
+def test_an_emulator_of_another_version_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    attached = attachment()
+    monkeypatch.setattr(attached, "say_hello", lambda: None)
+    lanes = [[0.0, 0.0], [0.0], 0.85]
+    welcome = wire.Welcome("v01", attached.nonce, 0, "lockstep", "x:y", {}, lanes, 1, 10**8, 1400, 5.0, 1000, "")
+    attached.inbox.put((wire.encode(welcome), 0))
+    with pytest.raises(
+        TransportError, match=r"the emulator speaks version 1 of the messages, this agent version 2"
+    ):
+        attached.join(5.0)

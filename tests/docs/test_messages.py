@@ -31,6 +31,7 @@ OF_THE_EMULATOR = {
     kind.__name__: kind for kind in (wire.Welcome, wire.Grant, wire.Batch, wire.StackRequest, wire.Await, wire.End)
 }
 PARTS = {
+    "Step": wire.Step,
     "Traffic": wire.Traffic,
     "Frame": wire.Frame,
     "Ending": wire.Ending,
@@ -57,6 +58,7 @@ welcomes = st.builds(
     times,
     names,
     st.booleans(),
+    times,
 )
 
 
@@ -174,15 +176,16 @@ def test_vnet_refuses_what_the_page_does_not_allow(kind: str, index: int, field:
 
 
 def test_an_agent_that_knows_nothing_of_exceptions_is_understood() -> None:
-    message = wire.decode_tx(msgpack.packb(["Yield", b"n", 0, None, [], [], [[["v01", b"x"]], [], []]]))
+    steps = [[0, [[["v01", b"x"]], [], []]]]
+    message = wire.decode_tx(msgpack.packb(["Yield", b"n", 0, None, [], [], steps, 1]))
     assert isinstance(message, wire.Yield)
-    assert message.traffic == wire.Traffic([wire.Frame("v01", b"x")], [], [])
+    assert message.steps == [wire.Step(0, wire.Traffic([wire.Frame("v01", b"x")], [], []))]
 
 
 def test_a_reader_that_is_told_nonsense_says_so() -> None:
-    assert "Hello.pid" in PAGE.problem_of("Hello", ["v01", "v01", b"n", "1", "here", False, None])
-    assert "not 7 values" in PAGE.problem_of("Hello", ["v01"])
-    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, [], [], []])
+    assert "Hello.pid" in PAGE.problem_of("Hello", ["v01", "v01", b"n", "1", "here", False, None, 2])
+    assert "not 8 values" in PAGE.problem_of("Hello", ["v01"])
+    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, 1, [], [], []])
     assert "Lateness.counts" in PAGE.problem_of("Lateness", [[0] * 79])
     assert "Scene: fields" in PAGE.problem_of("Scene", {"name": "a run"})
 

@@ -19,8 +19,10 @@ _DEEP = 100_000
 def _msgpack() -> dict[str, bytes]:
     """Return inputs with headers that claim 2 GB, at every position of a value of variable length."""
     whole = {
-        "yield": wire.encode(wire.Yield(b"n", 1, None, ["a"], [], wire.Traffic([wire.Frame("a", b"b")]))),
-        "grant": wire.encode(wire.Grant(1, 2, [wire.WirePacket("a", "b", 1, 2, b"c")])),
+        "yield": wire.encode(
+            wire.Yield(b"n", 1, None, ["a"], [], [wire.Step(2, wire.Traffic([wire.Frame("a", b"b")]))], 1)
+        ),
+        "grant": wire.encode(wire.Grant(1, 2, 3, [wire.WirePacket("a", "b", 1, 2, b"c")])),
         "observation": wire.encode_observation({"a": 1}),
     }
     nasty = {

@@ -47,12 +47,12 @@ TRAFFIC = wire.Traffic(
 PACKET = wire.WirePacket("v01", "v02", 5, 6, b"payload")
 FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5)
 TX: tuple[wire.AgentMessage, ...] = (
-    wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None),
-    wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import"),
-    wire.Yield(b"n" * 16, 3, 100, ["v01"], [], TRAFFIC),
+    wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None, 2),
+    wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import", 2),
+    wire.Yield(b"n" * 16, 3, 100, ["v01"], [], [wire.Step(50, TRAFFIC)], 1),
     wire.Frames(b"n" * 16, 3, 3, [(1, 2)], TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
     wire.Final(b"n" * 16, TRAFFIC),
-    wire.StackDump(b"n" * 16, "File …"),
+    wire.StackDump(b"n" * 16, "File …", 5),
 )
 RX: tuple[wire.EmulatorMessage, ...] = (
     wire.Welcome(
@@ -70,7 +70,7 @@ RX: tuple[wire.EmulatorMessage, ...] = (
         100,
         "b",
     ),
-    wire.Grant(1, 100, [PACKET], [FIX], [wire.ClockError("v01", 5, -3, 0.5)]),
+    wire.Grant(1, 100, 200, [PACKET], [FIX], [wire.ClockError("v01", 5, -3, 0.5)]),
     wire.Batch([FIX], 1, [PACKET], 12345, 5, True),
     wire.StackRequest(),
     wire.Await(1.5),

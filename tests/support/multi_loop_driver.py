@@ -22,7 +22,8 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host, load_programs
+from vnet.runtime.host import Host
+from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
@@ -146,10 +147,12 @@ class _Process:
         assert isinstance(grant, wire.Grant)
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self._loop)
-        self._host.deliver(grant.packets, grant.fixes)
-        return grant.time_ns
+        return self._host.open_window(grant)
 
     def _exchange(self, next_timer_ns: int | None) -> int:
+        next_ns = self._host.next_instant(next_timer_ns)
+        if next_ns is not None:
+            return next_ns
         self.yields.put(wire.encode(self._host.make_yield(b"n", self._seq, next_timer_ns)))
         return self._next_grant()
 
@@ -169,7 +172,7 @@ class _Process:
                     self._host.end_exited(leave)
         except Over:
             self._host.close(loop)
-            final = wire.decode_tx(wire.encode(wire.Final(b"n", self._host.take_traffic())))
+            final = wire.decode_tx(wire.encode(wire.Final(b"n", self._host.take_final())))
             assert isinstance(final, wire.Final)
             self._final = final.traffic
         finally:

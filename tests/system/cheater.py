@@ -30,10 +30,10 @@ def try_to_log_in(endpoint: str, credentials: Credentials | None) -> bool:
 def attack(session: zenoh.Session, run: str, seq: int) -> None:
     """One round of forged messages on everybody's keys but its own."""
     end = wire.encode(wire.End(None, "forged"))
-    grant = wire.encode(wire.Grant(seq, seq * 100_000_000))
-    hello = wire.encode(wire.Hello(VICTIM, VICTIM, b"forged", 1, "nowhere"))
-    frame = wire.Traffic([wire.Frame(VICTIM, b"forged")])
-    yielded = wire.encode(wire.Yield(b"forged", seq, None, [], [], frame))
+    grant = wire.encode(wire.Grant(seq, seq * 100_000_000, seq * 100_000_000 + 1))
+    hello = wire.encode(wire.Hello(VICTIM, VICTIM, b"forged", 1, "nowhere", version=wire.VERSION))
+    steps = [wire.Step(seq * 100_000_000, wire.Traffic([wire.Frame(VICTIM, b"forged")]))]
+    yielded = wire.encode(wire.Yield(b"forged", seq, None, [], [], steps, 1))
     for message in (grant, end):
         session.put(keys.node_rx(run, VICTIM), message)
     for message in (hello, yielded, b"not a message"):

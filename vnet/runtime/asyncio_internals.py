@@ -24,7 +24,7 @@ import asyncio
 import heapq
 import traceback
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
 from typing import Any, cast
@@ -142,3 +142,11 @@ class NumberedTimer(asyncio.TimerHandle):
 def _private(owner: object) -> Any:
     """The same object without its published type, which lacks the attributes of this module."""
     return owner
+
+
+def suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
+    """Yield the lines at which a suspended task waits, from its outermost coroutine inwards."""
+    coroutine: Any = task.get_coro()
+    while (frame := getattr(coroutine, "cr_frame", None)) is not None:
+        yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
+        coroutine = coroutine.cr_await

@@ -14,7 +14,7 @@ import logging
 import traceback
 import weakref
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,9 +25,10 @@ from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
 from vnet.runtime.disks import Disks
 from vnet.runtime.log_handler import NodeLogHandler
-from vnet.runtime.programs import Program, Programs, error_line, load_program
+from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
+from vnet.runtime.window import Window
 from vnet.transport import wire
 from vnet.units import NS_PER_S
 
@@ -38,11 +39,6 @@ LONGEST_NOTE = 4000
 """Characters of a line of a log that are told to the emulator."""
 MOST_LINES = 100_000
 """Lines of a node's log that are written by one process, so that a flood fills no disk."""
-
-
-def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
-    """The program of each node that is welcome. Raises ProgramError."""
-    return {welcome.node: load_program(welcome.entry) for welcome in welcomes}
 
 
 class Host:
@@ -73,6 +69,7 @@ class Host:
         self._frames: list[wire.Frame] = []
         self._reports: list[Report] = []
         self._endings: list[wire.Ending] = []
+        self._window = Window()
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = {welcome.node: welcome.runs for welcome in welcomes}
@@ -170,6 +167,7 @@ class Host:
         gone = self.nodes[node]
         gone.disconnect()
         self._active[node] = False
+        self._window.drop(node)
         if killed:
             self._unhandled.silence(gone)
             self._killed[gone] = self._tasks_of(gone)
@@ -247,18 +245,45 @@ class Host:
         self._frames, self._reports, self._endings, self._notes = [], [], [], []
         return traffic
 
-    def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
-        """Return the yield of the process when nothing is left to do at this instant (lockstep)."""
+    def take_final(self) -> wire.Traffic:
+        """Return what the emulator has not been told when the process ends: exceptions and notes."""
+        return self._window.take_final(self.take_traffic())
+
+    # Windows (lockstep).
+
+    def open_window(self, grant: wire.Grant) -> int:
+        """Take a grant; returns its first instant, with everything delivered that is due at it."""
+        self._window.open(grant)
+        self._deliver_due(grant.time_ns)
+        self.deliver((), grant.fixes)
+        return grant.time_ns
+
+    def next_instant(self, next_timer_ns: int | None) -> int | None:
+        """End an instant at which nothing is left to do; returns the window's next, with its packets delivered.
+
+        Returns None if there is none before the end of the window. Packets that nobody awaits make no instant.
+        """
         self._settle_stopped()
+        (window := self._window).end_instant(self._clock(), self.take_traffic())
+        next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
+        if window.has_packets:
+            awaiting = {id for id, node in self.nodes.items() if self._active[id] and node.radio.inbox.waiting}
+            next_ns = min(next_ns, window.first_packet_ns(awaiting - self._paused))
+        if next_ns >= window.end_ns:
+            return None
+        self._deliver_due(next_ns)
+        return next_ns
+
+    def _deliver_due(self, time_ns: int) -> None:
+        due = (packet for packet in self._window.take_packets(time_ns, self._paused) if self._active[packet.node])
+        self.deliver(due, ())
+
+    def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
+        """Return the yield of the process when `next_instant` has found no further one in its window."""
         nodes = self.nodes.values()
-        return wire.Yield(
-            nonce,
-            seq,
-            next_timer_ns,
-            waiting_radio=[node.id for node in nodes if node.radio.inbox.waiting],
-            waiting_gnss=[node.id for node in nodes if node.gnss.inbox.waiting],
-            traffic=self.take_traffic(),
-        )
+        radio = [node.id for node in nodes if node.radio.inbox.waiting]
+        gnss = [node.id for node in nodes if node.gnss.inbox.waiting]
+        return wire.Yield(nonce, seq, next_timer_ns, radio, gnss, *self._window.take_steps())
 
     def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
         """Record that a node's program is over, and cancel what it left running."""
@@ -325,7 +350,7 @@ class Host:
         lines = []
         for task in self._tasks_of(self.nodes[node]):
             lines.append(f"task {task.get_name()}:")
-            lines += [f"  {place}" for place in _suspended_at(task)]
+            lines += [f"  {place}" for place in asyncio_internals.suspended_at(task)]
         return "\n".join(lines)
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
@@ -408,14 +433,6 @@ class Host:
         self._tasks[task] = owner
         self._unhandled.watch(task, owner)
         return task
-
-
-def _suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
-    """Lines at which a suspended task waits, from its outermost coroutine inwards."""
-    coroutine: Any = task.get_coro()
-    while (frame := getattr(coroutine, "cr_frame", None)) is not None:
-        yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
-        coroutine = coroutine.cr_await
 
 
 def _no_clock_error() -> wire.ClockError | None:

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import os
 import sys
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # the check of a program before a run loads no more than the 
     from types import ModuleType
 
     from vnet.node import Node
+    from vnet.transport import wire
 
 Program = Callable[["Node"], Awaitable[None]]
 Programs = Mapping[str, Program]
@@ -89,3 +90,8 @@ def error_line(error: BaseException) -> str:
     except Exception as another:  # of the exception's own __str__
         text = f"(its text cannot be made: {type(another).__name__})"
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def load_programs(welcomes: Iterable[wire.Welcome]) -> dict[str, Program]:
+    """The program of each node that is welcome. Raises ProgramError."""
+    return {welcome.node: load_program(welcome.entry) for welcome in welcomes}

@@ -21,6 +21,8 @@ from vnet.node import Fix, Packet, Report
 TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
+VERSION = 2
+"""Version of the messages. 2: a grant is for a window, and a yield has steps."""
 HEAD_START_NS = 200_000_000
 """Real time: time from the announcement of time 0 to time 0, so that all processes receive it before."""
 LATENESS_LIMIT_NS = 20_000_000
@@ -124,13 +126,24 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
     unhandled: Sequence[Unhandled] = ()
     notes: Sequence[Note] = ()
 
+    def __bool__(self) -> bool:
+        """Return true if there is anything in it."""
+        return bool(self.frames or self.reports or self.endings or self.unhandled or self.notes)
+
+
+class Step(msgspec.Struct, frozen=True, array_like=True):
+    """Lockstep: what the nodes of one process enqueued at one instant of a window."""
+
+    time_ns: TimeNs
+    traffic: Traffic
+
 
 class Hello(Message, frozen=True):
     """A node's request to join. `process_id` is the first node of its process, whose keys carry its traffic.
 
     `nonce` is a secret of the process; later messages contain it, so that no other process can impersonate the
     node. The message is sent again with `ready` after the welcome, once the program is loaded, or with the
-    `failure` to load it.
+    `failure` to load it. An agent that knows no `version` speaks the first.
     """
 
     node: str
@@ -140,17 +153,23 @@ class Hello(Message, frozen=True):
     host: str
     ready: bool = False
     failure: str | None = None
+    version: Count = 1
 
 
 class Yield(Message, frozen=True):
-    """Lockstep: the process has nothing left to do at the time of grant `seq`."""
+    """Lockstep: the process has nothing left to do before the end of the window of grant `seq`.
+
+    `steps` are in the order of time; instants at which nothing was enqueued have none. `instants` is the number of
+    all instants of the window at which the process ran.
+    """
 
     nonce: bytes
     seq: Count
     next_timer_ns: TimeNs | None
     waiting_radio: Sequence[str]
     waiting_gnss: Sequence[str]
-    traffic: Traffic
+    steps: Sequence[Step]
+    instants: Count
 
 
 class Lateness(msgspec.Struct, frozen=True, array_like=True):
@@ -179,10 +198,11 @@ class Final(Message, frozen=True):
 
 
 class StackDump(Message, frozen=True):
-    """The answer to `StackRequest`: the stacks of the process's program threads."""
+    """The answer to `StackRequest`: the stacks of the process's program threads, and in lockstep its instant."""
 
     nonce: bytes
     text: str
+    time_ns: TimeNs | None = None
 
 
 class Welcome(Message, frozen=True):
@@ -205,6 +225,7 @@ class Welcome(Message, frozen=True):
     spin_limit: Count
     boot_id: str
     runs: bool = True
+    version: Count = 1
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):
@@ -230,13 +251,16 @@ class ClockError(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Grant(Message, frozen=True):
-    """Lockstep: the time `time_ns`, and the packets and fixes due. Grant 0 starts a process.
+    """Lockstep: the window from `time_ns` to just before `end_ns`. Grant 0 starts a process.
 
-    `clocks` are the clock errors that have changed.
+    `time_ns` is the first instant at which the process has something to do. `packets` are those that arrive before
+    the end, each at its `received_ns`; `fixes` are due at the first instant. `clocks` are the clock errors that
+    have changed.
     """
 
     seq: Count
     time_ns: TimeNs
+    end_ns: TimeNs
     packets: Sequence[WirePacket] = ()
     fixes: Sequence[WireFix] = ()
     clocks: Sequence[ClockError] = ()
@@ -322,6 +346,14 @@ def decode_observation(data: bytes) -> dict[str, Any]:
 def is_yield(data: bytes) -> bool:
     """Return true if an encoded message is a yield, judged by its first bytes without decoding it."""
     return data[1:7] == b"\xa5Yield"
+
+
+def other_version(speaker: str, version: int, listener: str) -> str:
+    """Return the one line for an agent or an emulator whose messages have another version."""
+    return (
+        f"the {speaker} speaks version {version} of the messages, this {listener} version {VERSION}: "
+        "use the same version of vnet"
+    )
 
 
 def is_batch(data: bytes) -> bool:

@@ -53,6 +53,11 @@ class Driver(ABC):
     def time_ns(self) -> int:
         """Emulated time, for events."""
 
+    @property
+    def decided_ns(self) -> int:
+        """Emulated time up to which nothing can be changed any more: new faults act after it."""
+        return self.time_ns
+
     @abstractmethod
     def take(self, process_id: str, message: Any) -> None:
         """Take a message of a process. Raises ProtocolError to refuse it."""

@@ -75,7 +75,7 @@ class Inbox:
         self.on_host_token: Callable[[str, bool], None] = lambda host, alive: None
         self.handlers: dict[type, Handler] = {wire.StackDump: self._take_stack, wire.Final: _ignore}
         self.connected: set[str] = set()
-        self.stacks: dict[str, str] = {}
+        self.stacks: dict[str, wire.StackDump] = {}
 
     # On Zenoh's threads: append, and wake the loop once.
 
@@ -151,7 +151,7 @@ class Inbox:
         self._changes.set()
 
     def _take_stack(self, node: str, message: wire.StackDump) -> None:
-        self.stacks[node] = message.text
+        self.stacks[node] = message
 
 
 def _ignore(node: str, message: Any) -> None:

@@ -57,7 +57,10 @@ class Joining:
 
     def take_hello(self, node: str, hello: wire.Hello) -> None:
         """Welcome a node, or tell it why it is refused."""
-        refusal = self._members.hello(node, hello)
+        refusal = None
+        if hello.version != wire.VERSION:
+            refusal = wire.other_version("agent", hello.version, "emulator")
+        refusal = refusal or self._members.hello(node, hello)
         if refusal is not None:
             self._refusals.add(node, refusal)
             if self._attachment.knows(node):

@@ -1,4 +1,7 @@
-"""The driver of a live run in lockstep: grants go out, and time goes on when every process has yielded."""
+"""The driver of a live run in lockstep: grants go out, and time goes on when every process has yielded.
+
+A run stalls if no process makes progress: none yields, and none that is asked has come to a later instant.
+"""
 
 from __future__ import annotations
 
@@ -39,13 +42,19 @@ class LockstepDriver(Driver):
         self._lockstep = Lockstep(parts.emulation, processes)
         self._before_horizon = before_horizon
         self._finals: dict[str, wire.Traffic] = {}
+        self._reached_ns: dict[str, int] = {}
         self._completed = False
         parts.inbox.handlers[wire.Final] = self._take_final
 
     @property
     def time_ns(self) -> int:
-        """Emulated time: the instant of the last grants."""
+        """Emulated time: the beginning of the window that was granted."""
         return self._lockstep.now_ns
+
+    @property
+    def decided_ns(self) -> int:
+        """Emulated time up to which processes may have come: new faults act after it."""
+        return self._lockstep.decided_ns
 
     def take(self, process_id: str, message: wire.Yield) -> None:
         """Take a yield."""
@@ -54,13 +63,14 @@ class LockstepDriver(Driver):
             self._changes.set()
 
     async def run(self) -> None:
-        """Grant and await yields, instant by instant."""
+        """Grant and await yields, window by window."""
         lockstep = self._lockstep
         await self._before_horizon(lockstep)
         grants = lockstep.start()
         while grants:
             for actions in lockstep.take_actions():
                 await self._apply_process_faults(actions)
+            self._reached_ns = {process_id: grant.time_ns for process_id, grant in grants.items()}
             for process_id, grant in grants.items():
                 self._send(process_id, grant)
             await self._all_yielded()
@@ -104,8 +114,10 @@ class LockstepDriver(Driver):
             for process_id, details in self._supervisor.take_deaths(owed.keys()).items():
                 self._lockstep.died(process_id, **details)
             patience_s = math.inf if self._waits_for_user(owed) else timeout_s
-            if owed and not await self._changes.wait(patience_s):
-                await self._stall(sorted(owed), timeout_s)
+            if not owed or await self._changes.wait(patience_s) or await self._has_progressed():
+                continue
+            if owed:  # yields that their host kept for the sake of another process have come since
+                self._stall(sorted(owed), timeout_s)
 
     def _waits_for_user(self, process_ids: Collection[str]) -> bool:
         """Return whether one of these processes may be in a debugger: its user takes what time it takes."""
@@ -123,21 +135,31 @@ class LockstepDriver(Driver):
                 raise Stalled
         self._supervisor.take_returned()
 
-    async def _stall(self, process_ids: Sequence[str], timeout_s: float) -> None:
-        """Give up: ask the processes that do not yield for their stacks, and write them down."""
+    async def _has_progressed(self) -> bool:
+        """Ask the processes that do not yield for their stacks; returns whether one is at a later instant."""
         parts = self._parts
-        for process_id in process_ids:
+        asked = sorted(self._lockstep.owed)
+        parts.inbox.stacks.clear()
+        for process_id in asked:
             self._send(process_id, wire.StackRequest())
             parts.agents.request_stack(process_id)
         await asyncio.sleep(STACKS_WAIT_S)
-        # Yields that their host kept for the sake of another process have come since.
-        silent = [process_id for process_id in process_ids if process_id in self._lockstep.owed]
-        for process_id in silent or process_ids:
+        before_ns = dict(self._reached_ns)
+        for process_id, dump in parts.inbox.stacks.items():
+            if dump.time_ns is not None and process_id in before_ns:
+                self._reached_ns[process_id] = max(dump.time_ns, before_ns[process_id])
+        return self._reached_ns != before_ns
+
+    def _stall(self, process_ids: Sequence[str], timeout_s: float) -> None:
+        """Give up, and write down where the processes are that do not yield."""
+        parts = self._parts
+        for process_id in process_ids:
+            dump = parts.inbox.stacks.get(process_id)
             self._emulation.folder.event(
                 self.time_ns,
                 "stalled",
                 process_id,
                 error=f"no yield within {timeout_s:g} s of wall clock; {parts.members.describe(process_id)}",
-                where=parts.inbox.stacks.get(process_id) or parts.agents.log_tail(process_id),
+                where=(dump.text if dump else "") or parts.agents.log_tail(process_id),
             )
         raise Stalled

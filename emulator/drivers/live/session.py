@@ -314,7 +314,8 @@ class LiveSession:
         own_router = self._options.router is not None
         with query:
             try:
-                answered = answer(self._emulation, self._status, verb, payload, self._time_ns(), own_router)
+                now_ns = 0 if self._driver is None else self._driver.decided_ns
+                answered = answer(self._emulation, self._status, verb, payload, now_ns, own_router)
                 query.reply(query.key_expr, json.dumps(answered))
             except VnetError as error:
                 query.reply_err(str(error))

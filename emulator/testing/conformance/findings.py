@@ -19,6 +19,7 @@ LONGEST_DECODED = 200
 CHECKS = {
     "starts": "the agent starts and connects with its credentials",
     "hello": "Hello names the node and its process, with ready = false and a nonce of at least 8 bytes",
+    "version": f"Hello bears the version of the messages, {wire.VERSION}",
     "hello_repeats": "Hello is repeated, with the same nonce, until the welcome",
     "others_nonce": "Welcome and End with another nonce are ignored",
     "token": "the token vnet/RUN/node/ID/alive is there",
@@ -29,7 +30,8 @@ CHECKS = {
     "new_nonce": "a process that is started again has another nonce",
     "yields": "each grant is answered with one Yield that repeats its seq",
     "unasked": "no Yield without a grant",
-    "timers": "next_timer_ns is later than the granted time",
+    "timers": "next_timer_ns is not before the end of the granted window",
+    "steps": "each step lies in the granted window, later than the one before",
     "wakes": "each Yield waits for a timer, the radio or a fix, or its program has ended",
     "own_node": "frames, reports, endings and waiting nodes are the agent's own",
     "payload": "no frame exceeds max_payload",

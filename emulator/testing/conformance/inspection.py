@@ -10,7 +10,7 @@ from vnet.node import Report
 from vnet.transport import wire
 
 OF_TRAFFIC = ("own_node", "payload", "numbers", "report_time")
-OF_YIELDS = ("timers", "wakes", *OF_TRAFFIC)
+OF_YIELDS = ("timers", "steps", "wakes", *OF_TRAFFIC)
 SLACK_NS = 50_000_000
 """Real time: how much the two clocks of one machine may seem to differ."""
 OLDEST_NS = 1_000_000_000
@@ -25,21 +25,27 @@ class Inspection:
         self._node = node
         self._max_payload = max_payload
 
-    def inspect_yield(self, message: wire.Yield, data: bytes, now_ns: int, shown_ns: int) -> None:
-        """Check the answer to a grant of `now_ns`, at which the vehicle's clock shows `shown_ns`."""
+    def inspect_yield(self, message: wire.Yield, data: bytes, grant: wire.Grant, offset_ns: int) -> None:
+        """Check the answer to a grant; the vehicle's clock is ahead by `offset_ns`."""
         self._findings.expect(*OF_YIELDS)
         timer_ns = message.next_timer_ns
-        if timer_ns is not None and timer_ns <= now_ns:
-            self._findings.fail("timers", f"next_timer_ns = {timer_ns} at {now_ns}", data)
+        if timer_ns is not None and timer_ns < grant.end_ns:
+            self._findings.fail("timers", f"next_timer_ns = {timer_ns} in a window to {grant.end_ns}", data)
         for node in [*message.waiting_radio, *message.waiting_gnss]:
             self._check_node(node, "a waiting node", data)
         waits = timer_ns is not None or message.waiting_radio or message.waiting_gnss
-        if not waits and not message.traffic.endings:
+        if not waits and not any(step.traffic.endings for step in message.steps):
             self._findings.fail("wakes", "it waits for nothing and is never granted again", data)
-        self._inspect_traffic(message.traffic, data)
-        for report in message.traffic.reports:
-            if report.time_ns != shown_ns:
-                self._findings.fail("report_time", f"time_ns = {report.time_ns}, and not {shown_ns}", data)
+        earliest_ns = grant.time_ns
+        for step in message.steps:
+            if not earliest_ns <= step.time_ns < grant.end_ns:
+                came = f"a step at {step.time_ns}, where {earliest_ns} to {grant.end_ns - 1} are allowed"
+                self._findings.fail("steps", came, data)
+            earliest_ns = step.time_ns + 1
+            self._inspect_traffic(step.traffic, data)
+            for report in step.traffic.reports:
+                if report.time_ns != (shown_ns := step.time_ns + offset_ns):
+                    self._findings.fail("report_time", f"time_ns = {report.time_ns}, and not {shown_ns}", data)
 
     def inspect_frames(self, message: wire.Frames, data: bytes, now_ns: int) -> None:
         """Check traffic in real time that came at `now_ns`."""

@@ -1,7 +1,11 @@
-"""Scenes in lockstep: a small emulator that grants what the agent waits for, and checks each yield."""
+"""Scenes in lockstep: a small emulator that grants what the agent waits for, and checks each yield.
+
+Windows are as long as the least latency of the scenario's radio, so some grants bring packets that are yet to come.
+"""
 
 from __future__ import annotations
 
+from emulator.radio.stages import least_latency_ns
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError
 from vnet.transport import wire
@@ -11,6 +15,8 @@ DURATION_NS = NS_PER_S
 MOST_GRANTS = 2000
 PACKET_AFTER_NS = 30_000_000
 """Time from each fix to the arrival of a packet."""
+EARLY_PACKET_AFTER_NS = 1_000_000
+"""Time from each fix to the arrival of a packet in the window that begins with the fix."""
 CLOCK_ERROR_NS = 5_000_000
 MALFORMED = (b"\xc1", b"", b"\x93\xa5Grant\xa1x", b"\x91\xa9Nonsense1", b"\x81\x01\x02")
 """No msgpack, nothing, a wrong type, an unknown kind, a map."""
@@ -25,13 +31,13 @@ class Barrier:
         self.seq = 0
         self._offset_ns = 0
         self._next_fix = -(-now_ns // scene.world.period_ns)
-        self._next_packet_ns = now_ns + PACKET_AFTER_NS
-        self._packets: list[wire.WirePacket] = []
+        self._start_ns = now_ns
+        self._window_ns = least_latency_ns(scene.scenario.radio)
         self._count = 0
         self._answer: wire.Yield | None = None
 
     def run(self, until_ns: int, clock_error_at_ns: int | None = None) -> None:
-        """Grant the first instant, and each before `until_ns` that the agent waits for."""
+        """Grant the first instant, and a window from each instant before `until_ns` that the agent waits for."""
         answer = self._answer or self.grant()
         while (wake_ns := self._wake_ns(answer)) is not None and wake_ns < until_ns and self.seq < MOST_GRANTS:
             self.now_ns = wake_ns
@@ -45,30 +51,34 @@ class Barrier:
         """Time of the agent's next grant."""
         due_ns = [answer.next_timer_ns]
         due_ns += [self._next_fix * self.scene.world.period_ns] if answer.waiting_gnss else []
-        due_ns += [self._next_packet_ns] if answer.waiting_radio else []
+        due_ns += [self._next_packet_ns()] if answer.waiting_radio else []
         return min((time_ns for time_ns in due_ns if time_ns is not None), default=None)
 
+    def _next_packet_ns(self) -> int:
+        after_ns = PACKET_AFTER_NS if self._count % 2 else EARLY_PACKET_AFTER_NS
+        return self._start_ns + self._count // 2 * self.scene.world.period_ns + after_ns
+
     def grant(self, clocks: list[wire.ClockError] | None = None) -> wire.Yield:
-        """Grant this instant with all that is due, and check the yield."""
+        """Grant the window from this instant on, with all that is due in it, and check the yield."""
         scene = self.scene
-        while self._next_packet_ns <= self.now_ns:
-            sent_ns = self._next_packet_ns - 1_000_000
-            self._packets.append(scene.packet(self._count, sent_ns, self._next_packet_ns))
+        end_ns = self.now_ns + self._window_ns
+        packets = []
+        while (received_ns := self._next_packet_ns()) < end_ns:
+            packets.append(scene.packet(self._count, max(received_ns - self._window_ns, 0), received_ns))
             self._count += 1
-            self._next_packet_ns += scene.world.period_ns
         fixes = []
         while self._next_fix * scene.world.period_ns <= self.now_ns:
             fixes.append(scene.fix(self._next_fix))
             self._next_fix += 1
-        packets, self._packets = self._packets, []
-        scene.bench.say(wire.Grant(self.seq, self.now_ns, packets, fixes, clocks or []))
+        grant = wire.Grant(self.seq, self.now_ns, end_ns, packets, fixes, clocks or [])
+        scene.bench.say(grant)
         answer, said = scene.await_message(wire.Yield, "yields", scene.patience_s)
         if answer.seq != self.seq:
             scene.findings.fail("yields", f"seq = {answer.seq}, and not {self.seq}", said.data)
             raise SceneOverError
         self.seq += 1
-        scene.inspection.inspect_yield(answer, said.data, self.now_ns, self.now_ns + self._offset_ns)
-        if answer.next_timer_ns is not None and answer.next_timer_ns <= self.now_ns:
+        scene.inspection.inspect_yield(answer, said.data, grant, self._offset_ns)
+        if answer.next_timer_ns is not None and answer.next_timer_ns < end_ns:
             raise SceneOverError
         self._answer = answer
         return answer
@@ -113,10 +123,10 @@ def ended(scene: Scene) -> None:
     """The program has ended before the process was started again: it takes part, and says nothing."""
     scene.join(incarnation=1, runs=False)
     scene.findings.expect("no_traffic")
-    scene.bench.say(wire.Grant(0, NS_PER_S, [], [scene.fix(NS_PER_S // scene.world.period_ns)]))
+    scene.bench.say(wire.Grant(0, NS_PER_S, NS_PER_S + 1, [], [scene.fix(NS_PER_S // scene.world.period_ns)]))
     answer, said = scene.await_message(wire.Yield, "yields", scene.patience_s)
-    traffic = answer.traffic
-    if traffic.frames or traffic.reports or answer.waiting_gnss or answer.waiting_radio:
+    has_traffic = any(step.traffic.frames or step.traffic.reports for step in answer.steps)
+    if has_traffic or answer.waiting_gnss or answer.waiting_radio:
         scene.findings.fail("no_traffic", "traffic, or a node that waits", said.data)
     scene.end()
 

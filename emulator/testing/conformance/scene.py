@@ -116,7 +116,7 @@ class Scene:
     def start(self) -> wire.Hello:
         """Start the agent and wait for its first hello."""
         self.bench.start_agent()
-        self.findings.expect("starts", "hello", "nonce")
+        self.findings.expect("starts", "hello", "version", "nonce")
         start_up_s = max(self.patience_s, START_UP_S)
         hello, said = self.await_message(wire.Hello, "hello", start_up_s, stays="starts")
         node = self.bench.node
@@ -124,6 +124,8 @@ class Scene:
             self.findings.fail("hello", f"node {hello.node!r}, process_id {hello.process_id!r}", said.data)
         if hello.ready or hello.failure is not None:
             self.findings.fail("hello", f"ready = {hello.ready}, failure = {hello.failure!r}", said.data)
+        if hello.version != wire.VERSION:
+            self.findings.fail("version", f"version = {hello.version}", said.data)
         if len(hello.nonce) < SHORTEST_NONCE:
             self.findings.fail("hello", f"a nonce of {counted(len(hello.nonce), 'byte')}", said.data)
         self.nonce = hello.nonce
@@ -170,6 +172,7 @@ class Scene:
             spin_limit=self.scenario.run.spin_limit,
             boot_id=wire.boot_id() if boot_id is None else boot_id,
             runs=runs,
+            version=wire.VERSION,
         )
 
     def end(self) -> None:

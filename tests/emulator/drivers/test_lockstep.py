@@ -1,5 +1,6 @@
 """The barrier, with processes that are nothing but what they yield."""
 
+import math
 import random
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.protocol import ProtocolError
+from emulator.radio.outcomes import Outcome
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
 
@@ -41,7 +43,8 @@ def yielded(
     gnss: Sequence[str] = (),
     frames: Sequence[wire.Frame] = (),
 ) -> wire.Yield:
-    return wire.Yield(b"n", grant.seq, timer_ns, radio, gnss, wire.Traffic(frames))
+    steps = [wire.Step(grant.time_ns, wire.Traffic(frames))] if frames else []
+    return wire.Yield(b"n", grant.seq, timer_ns, radio, gnss, steps, 1)
 
 
 def yield_all(lockstep: Lockstep, grants: dict[str, wire.Grant], **timers_ns: int) -> None:
@@ -88,11 +91,11 @@ def test_only_those_are_granted_an_instant_who_have_something_to_do_at_it() -> N
     assert times(lockstep.step()) == {"v01": 30 * MS}
 
 
-@pytest.mark.parametrize("next_ms", [10, 30])
-def test_a_timer_that_is_not_later_than_now_is_refused(next_ms: int) -> None:
-    lockstep, _ = barrier()
+@pytest.mark.parametrize("next_ms", [10, 33])
+def test_a_timer_before_the_end_of_the_window_is_refused(next_ms: int) -> None:
+    lockstep, _ = barrier(radio={"latency_ms": 4})
     yield_all(lockstep, lockstep.start(), v01=30 * MS)
-    with pytest.raises(ProtocolError, match="its next timer is not later than 30000000"):
+    with pytest.raises(ProtocolError, match=rf"its next timer, {next_ms}000000, lies before the end .*, 34000000"):
         yield_all(lockstep, lockstep.step(), v01=next_ms * MS)
 
 
@@ -145,7 +148,7 @@ def test_a_yield_that_does_not_fit_its_grant_is_refused_and_still_owed(
     lockstep, _ = barrier()
     grants = lockstep.start()
     with pytest.raises(ProtocolError):
-        lockstep.receive("v01", wire.Yield(b"n", seq, None, radio, gnss, traffic))
+        lockstep.receive("v01", wire.Yield(b"n", seq, None, radio, gnss, [wire.Step(0, traffic)], 1))
     assert lockstep.owed["v01"] == 0
     lockstep.receive("v01", yielded(grants["v01"]))
     with pytest.raises(ProtocolError):
@@ -209,6 +212,117 @@ def test_at_the_end_nobody_is_granted_anything_and_all_periods_are_recorded() ->
     assert len(emulation.metrics.rows) == emulation.duration_ns // PERIOD_NS
 
 
+# Windows.
+
+
+def window(grants: dict[str, wire.Grant]) -> tuple[int, int]:
+    """Earliest granted time and the end of the window, in ms."""
+    (end_ns,) = {grant.end_ns for grant in grants.values()}
+    return min(grant.time_ns for grant in grants.values()) // MS, end_ns // MS
+
+
+def test_a_window_is_as_long_as_the_least_latency_and_each_is_granted_its_own_first_instant() -> None:
+    lockstep, _ = barrier(radio={"latency_ms": 30.0})
+    yield_all(lockstep, lockstep.start(), v01=50 * MS, v02=60 * MS, v03=79 * MS, v04=80 * MS)
+    grants = lockstep.step()
+    assert times(grants) == {"v01": 50 * MS, "v02": 60 * MS, "v03": 79 * MS}
+    assert window(grants) == (50, 80)
+
+
+def test_without_windows_each_is_one_instant() -> None:
+    lockstep, _ = barrier(radio={"latency_ms": 30.0}, run={"windows": False})
+    yield_all(lockstep, lockstep.start(), v01=50 * MS, v02=50 * MS + 1)
+    (grant,) = lockstep.step().values()
+    assert (grant.time_ns, grant.end_ns) == (50 * MS, 50 * MS + 1)
+
+
+@pytest.mark.parametrize(
+    ("end_ms", "faults", "horizon_ms"),
+    [(200, [], None), (120, [fault("kill", 0.12, 0.1, "v04")], None), (130, [], 130)],
+    ids=["period", "fault", "horizon"],
+)
+def test_a_window_ends_before_anything_that_changes_the_network(
+    end_ms: int, faults: list[dict[str, Any]], horizon_ms: int | None
+) -> None:
+    lockstep, _ = barrier(faults, radio={"latency_ms": 1000.0})
+    lockstep.horizon_ns = None if horizon_ms is None else horizon_ms * MS
+    grants = lockstep.start()
+    assert window(grants) == (0, end_ms)
+    assert lockstep.decided_ns == end_ms * MS - 1, "what is injected now acts after the window"
+
+
+@pytest.mark.parametrize(
+    ("times_ms", "message"),
+    [([49], "a step at 49000000, where 50000000 to 79999999"), ([80], "80000000"), ([55, 55], "where 55000001 to")],
+)
+def test_a_step_outside_its_window_or_out_of_order_is_refused(times_ms: list[int], message: str) -> None:
+    lockstep, _ = barrier(radio={"latency_ms": 30.0})
+    yield_all(lockstep, lockstep.start(), v01=50 * MS)
+    (grant,) = lockstep.step().values()
+    steps = [wire.Step(time_ms * MS, wire.Traffic([wire.Frame("v01", b"x")])) for time_ms in times_ms]
+    with pytest.raises(ProtocolError, match=message):
+        lockstep.receive("v01", wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
+
+
+def test_packets_of_a_window_are_shown_before_it_and_decided_after_it() -> None:
+    lockstep, emulation = barrier(radio={"latency_ms": 30.0, "jitter_ms": 20.0, "access_jitter_ms": 0.0})
+    for process_id, grant in lockstep.start().items():
+        frames = [wire.Frame("v01", b"x")] if process_id == "v01" else []
+        lockstep.receive(process_id, yielded(grant, 30 * MS if process_id == "v01" else 31 * MS, frames=frames))
+    grants = lockstep.step()
+    assert window(grants) == (30, 60)
+    arrivals_ns = {node: grants[node].packets[0].received_ns for node in IDS[1:]}
+    assert all(31 * MS < arrival_ns < 60 * MS for arrival_ns in arrivals_ns.values())
+    assert [emulation.engine.counts[Outcome.delivered], emulation.engine.counts[Outcome.pending]] == [0, 3]
+    # v02's program ends a nanosecond before its packet arrives, and v03's as it arrives.
+    ends_ns = {"v02": arrivals_ns["v02"] - 1, "v03": arrivals_ns["v03"]}
+    for process_id, grant in grants.items():
+        steps = [
+            wire.Step(ends_ns[n], wire.Traffic((), (), [wire.Ending(n, "finished")]))
+            for n in ends_ns
+            if n == process_id
+        ]
+        lockstep.receive(process_id, wire.Yield(b"n", grant.seq, None, [], [], steps, 1))
+    assert lockstep.step() == {}
+    rows = {row["receiver"]: row["outcome"] for row in emulation.engine.trace.to_table().to_pylist()}
+    assert rows == {"v02": "receiver_down", "v03": "delivered", "v04": "delivered"}
+    events = [(event.node, event.time_ns) for event in emulation.folder.events if event.kind == "finished"]
+    assert sorted(events) == sorted(ends_ns.items())
+
+
+def test_a_window_longer_than_the_least_latency_is_noticed() -> None:
+    lockstep, _ = barrier(radio={"latency_ms": 1.0, "jitter_ms": 0.0})
+    lockstep._lookahead_ns = 4 * MS
+    grants = lockstep.start()
+    for process_id, grant in grants.items():
+        lockstep.receive(process_id, yielded(grant, 150 * MS, frames=[wire.Frame(process_id, b"x")]))
+    with pytest.raises(AssertionError, match="foreseen up to 3999999 ns"):
+        lockstep.step()
+
+
+def test_a_flood_that_nobody_takes_is_bounded_and_that_of_a_window_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulator.drivers.lockstep.INBOX_LIMIT", 5)
+    radio = {
+        "latency_ms": 30.0,
+        "jitter_ms": 0.0,
+        "access_jitter_ms": 0.0,
+        "bitrate_mbps": 1000.0,
+        "queue_frames": 50,
+        "loss": 0.0,
+    }
+    lockstep, _ = barrier(radio=radio)
+    for process_id, grant in lockstep.start().items():
+        frames = [wire.Frame("v01", bytes([n])) for n in range(20)] if process_id == "v01" else []
+        timers_ns = {"v01": 100 * MS, "v02": 30 * MS, "v03": 110 * MS}
+        lockstep.receive(process_id, yielded(grant, timers_ns.get(process_id), frames=frames))
+    grants = lockstep.step()
+    assert [packet.payload[0] for packet in grants["v02"].packets] == list(range(20)), "it may take each in turn"
+    yield_all(lockstep, grants)
+    grants = lockstep.step()
+    assert times(grants) == {"v01": 100 * MS, "v03": 110 * MS}
+    assert [packet.payload[0] for packet in grants["v03"].packets] == list(range(15, 20)), "of the past the newest"
+
+
 # All rules at once: vehicles that do something at random.
 
 
@@ -228,16 +342,23 @@ class Vehicle:
         self.draw = random.Random(f"{self.seed}/{self.node}/{self.incarnation}")
         self.hears, self.locates = self.draw.random() < 0.7, self.draw.random() < 0.6
 
+    @property
+    def next_ns(self) -> float:
+        """Time at which it has something to do, as far as it knows."""
+        arrivals_ns = [packet.received_ns for packet in self.packets] if self.hears else []
+        return min([math.inf if self.timer_ns is None else self.timer_ns, *arrivals_ns])
+
     def wake(self, now_ns: int, diary: list[tuple[Any, ...]]) -> list[wire.Frame]:
         """Do what is to be done at this instant, and write it down."""
-        packets, fixes = (self.packets if self.hears else []), (self.fixes if self.locates else [])
+        come = [packet for packet in self.packets if packet.received_ns <= now_ns]
+        packets, fixes = (come if self.hears else []), (self.fixes if self.locates else [])
         rings = self.timer_ns is not None and self.timer_ns <= now_ns
         if self.begun and not (packets or fixes or rings):
             return []
         self.begun = True
         told = [(p.sender, p.sent_ns, p.received_ns, p.payload) for p in packets], [f.time_ns for f in fixes]
         diary.append((now_ns, self.incarnation, *told, rings))
-        self.packets, self.fixes = [], []
+        self.packets, self.fixes = self.packets[len(come) :], []
         wait_ns = self.draw.choice([1, 10 * MS, 77_777_777, 200 * MS, None])
         self.timer_ns = None if wait_ns is None else now_ns + wait_ns
         if rings and wait_ns == 1:
@@ -266,15 +387,17 @@ class Course:
         self.sent_ns: dict[bytes, int] = {}
         self.seqs: dict[str, int] = {}
         self.paused: set[str] = set()
+        self.barriers = 0
 
     def run(self) -> tuple[str, dict[str, list[tuple[Any, ...]]]]:
         now_ns = 0
         grants = self.lockstep.start()
         while grants:
             self.apply_actions()
-            assert len({grant.time_ns for grant in grants.values()}) == 1, "one instant at a time"
-            assert next(iter(grants.values())).time_ns >= now_ns, "in order"
-            now_ns = next(iter(grants.values())).time_ns
+            (end_ns,) = {grant.end_ns for grant in grants.values()}
+            assert all(now_ns <= grant.time_ns < end_ns for grant in grants.values()), "windows are in order"
+            now_ns = end_ns
+            self.barriers += 1
             assert self.lockstep.owed.keys() == grants.keys()
             answers = [(process_id, self.answer(process_id, grant)) for process_id, grant in grants.items()]
             self.order.shuffle(answers)
@@ -294,24 +417,29 @@ class Course:
                     self.seqs.pop(node, None)
 
     def answer(self, process_id: str, grant: wire.Grant) -> wire.Yield:
-        """Give a process its grant, and let its vehicles yield."""
+        """Give a process its grant, let its vehicles pass through the window, and yield."""
         assert grant.seq == self.seqs.get(process_id, -1) + 1
         self.seqs[process_id] = grant.seq
         for packet in grant.packets:
             assert self.sent_ns[packet.payload] == packet.sent_ns, "nothing is delivered that was not sent before"
-            assert packet.sent_ns <= packet.received_ns <= grant.time_ns
+            assert packet.sent_ns <= packet.received_ns < grant.end_ns
             self.vehicles[packet.node].packets.append(packet)
         for fix in grant.fixes:
             assert fix.time_ns <= grant.time_ns
             self.vehicles[fix.node].fixes.append(fix)
         nodes = [node for node in self.groups[process_id] if self.emulation.up[node] and node not in self.paused]
-        frames = [f for node in nodes for f in self.vehicles[node].wake(grant.time_ns, self.diary[node])]
-        self.sent_ns |= {frame.payload: grant.time_ns for frame in frames}
+        steps = []
+        now_ns = grant.time_ns
+        while now_ns < grant.end_ns:
+            frames = [f for node in nodes for f in self.vehicles[node].wake(now_ns, self.diary[node])]
+            self.sent_ns |= {frame.payload: now_ns for frame in frames}
+            steps += [wire.Step(now_ns, wire.Traffic(frames))] if frames else []
+            now_ns = min([grant.end_ns, *(round(min(self.vehicles[node].next_ns, 2**62)) for node in nodes)])
         living = [self.vehicles[node] for node in self.groups[process_id] if self.emulation.up[node]]
         timers = [vehicle.timer_ns for vehicle in living if vehicle.timer_ns is not None]
         radio = [vehicle.node for vehicle in living if vehicle.hears]
         gnss = [vehicle.node for vehicle in living if vehicle.locates]
-        return yielded(grant, min(timers, default=None), radio, gnss, frames)
+        return wire.Yield(b"n", grant.seq, min(timers, default=None), radio, gnss, steps, 1)
 
 
 GROUPINGS = [ALONE, [["v01", "v02"], ["v03", "v04"]], [["v01"], ["v02", "v03", "v04"]], [IDS]]
@@ -334,16 +462,22 @@ schedules = st.lists(
 
 
 @pytest.mark.slow
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     faults=schedules,
     seed=st.integers(0, 1000),
     groups=st.sampled_from(GROUPINGS[1:]),
     order=st.randoms(use_true_random=False),
+    latency_ms=st.sampled_from([0.001, 2.3, 20, 300]),
 )
-def test_neither_the_grouping_of_nodes_nor_the_order_of_yields_changes_a_run(
-    faults: list[dict[str, Any]], seed: int, groups: list[list[str]], order: random.Random
+def test_neither_windows_nor_the_grouping_of_nodes_nor_the_order_of_yields_change_a_run(
+    faults: list[dict[str, Any]], seed: int, groups: list[list[str]], order: random.Random, latency_ms: float
 ) -> None:
-    scenario = scenario_of(faults, "agents.beacon:main", run={"duration_s": 1.6, "settle_s": 0.1, "seed": seed})
-    reference = Course(emulation_of(scenario), ALONE, seed, random.Random(0)).run()
-    assert Course(emulation_of(scenario), groups, seed, order).run() == reference
+    run = {"duration_s": 1.6, "settle_s": 0.1, "seed": seed}
+    one, windows = (
+        scenario_of(faults, "agents.beacon:main", run={**run, "windows": windows}, radio={"latency_ms": latency_ms})
+        for windows in (False, True)
+    )
+    reference = Course(emulation_of(one), ALONE, seed, random.Random(0)).run()
+    for processes in (ALONE, groups):
+        assert Course(emulation_of(windows), processes, seed, order).run() == reference

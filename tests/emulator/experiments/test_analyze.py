@@ -189,6 +189,8 @@ def test_a_scenario_is_seen_with_its_links_and_its_peer_cap() -> None:
     one_way = np.roll(np.eye(4, dtype=bool), 1, axis=1)
     found = analyze(scenario(one_way))
     assert (found["weak_components"], found["components"], found["one_way_links"]) == ([4], [1, 1, 1, 1], 4)
+    assert found["lookahead_ms"] == 2.0, "the least latency of the radio"
+    assert "lookahead (ms)" in printed(found)
     capped = analyze(scenario(complete(6), max_peers=2))
     assert capped["degree"]["max"] <= 2
     assert capped["one_way_links"] + 2 * capped["links"] == 12, "everybody hears two"

@@ -43,6 +43,7 @@ class Clocks:
         self._every_ns = packet_every_ns
 
     def _exchange(self, next_timer_ns: int | None) -> int:
+        assert self.host.next_instant(next_timer_ns) is None, "windows of one instant"
         message = self.host.make_yield(b"n", 0, next_timer_ns)
         now_ns = min([next_timer_ns or LAST_NS, *(self._packet_ns[node] for node in message.waiting_radio)])
         if now_ns >= LAST_NS:
@@ -61,11 +62,10 @@ class Clocks:
             while self._packet_ns[node] <= now_ns:
                 packets.append(wire.WirePacket(node, "other", 0, self._packet_ns[node], b""))
                 self._packet_ns[node] += self._every_ns
-        grant = wire.decode_rx(wire.encode(wire.Grant(0, now_ns, packets, (), clocks)))
+        grant = wire.decode_rx(wire.encode(wire.Grant(0, now_ns, now_ns + 1, packets, (), clocks)))
         assert isinstance(grant, wire.Grant)
         self.host.apply_clock_error(grant.clocks, self.loop)
-        self.host.deliver(grant.packets, grant.fixes)
-        return now_ns
+        return self.host.open_window(grant)
 
     def run(self, program: Program) -> None:
         self.host.start(self.loop, dict.fromkeys(self.host.nodes, program))
@@ -247,7 +247,7 @@ def test_any_drifts_together_go_on_without_a_jump_while_they_act_and_never_stand
     ends = {p.end_ns for p in faults}
     for one_ns, next_ns in pairwise(changes):
         clock = clock_of(faults, "v1", 0, one_ns)
-        again = wire.decode_rx(wire.encode(wire.Grant(0, one_ns, (), (), [clock])))
+        again = wire.decode_rx(wire.encode(wire.Grant(0, one_ns, one_ns + 1, (), (), [clock])))
         assert isinstance(again, wire.Grant)
         assert again.clocks[0] == clock, "the wire can carry it"
         assert clock.shown_ns(next_ns) > clock.shown_ns(one_ns)

@@ -40,6 +40,7 @@ class World:
         self._fix_ns = dict.fromkeys(nodes, 100_000_000)
 
     def exchange(self, next_timer_ns: int | None) -> int:
+        assert self.host.next_instant(next_timer_ns) is None, "windows of one instant"
         message = self.host.make_yield(b"n", len(self.yields), next_timer_ns)
         self.yields.append(message)
         wakes = [LAST_NS if next_timer_ns is None else next_timer_ns]
@@ -56,8 +57,7 @@ class World:
             while self._fix_ns[node] <= now_ns:
                 fixes.append(wire.WireFix(node, self._fix_ns[node], (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None))
                 self._fix_ns[node] += 100_000_000
-        self.host.deliver(packets, fixes)
-        return now_ns
+        return self.host.open_window(wire.Grant(len(self.yields), now_ns, now_ns + 1, packets, fixes))
 
     def run(self, program: Program) -> None:
         self.host.start(self.loop, dict.fromkeys(self.host.nodes, program))
@@ -74,7 +74,11 @@ class World:
 
     @property
     def endings(self) -> list[wire.Ending]:
-        return [ending for message in self.yields for ending in message.traffic.endings]
+        return [ending for traffic in self.traffic for ending in traffic.endings]
+
+    @property
+    def traffic(self) -> list[wire.Traffic]:
+        return [step.traffic for message in self.yields for step in message.steps]
 
 
 def test_a_program_that_only_waits_on_the_radio_is_woken_by_each_packet() -> None:
@@ -100,6 +104,58 @@ def test_a_program_that_never_waits_on_the_radio_finds_packets_with_their_true_t
     world.run(program)
     assert heard[0] == [250_000_000, 500_000_000, 750_000_000, 1_000_000_000]
     assert len(world.yields) == 10, "one barrier a second: packets do not wake it"
+
+
+def packet_at(node: str, received_ns: int) -> wire.WirePacket:
+    return wire.WirePacket(node, "other", 0, received_ns, b"hi")
+
+
+def test_a_process_passes_through_its_window_by_itself() -> None:
+    """v1 awaits packets, v2 has timers: each instant is a step with its own time, and the rest waits."""
+    world = World("v1", "v2")
+    log: list[tuple[str, int]] = []
+    fixes = [wire.WireFix("v1", 0, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), None)]
+    windows = [
+        wire.Grant(
+            0, 0, 10, [packet_at("v1", 3), packet_at("v2", 2), packet_at("v2", 5), packet_at("v2", 9)], fixes
+        ),
+        wire.Grant(1, 12, 20, [packet_at("v1", 12)]),
+    ]
+
+    async def program(node: Node) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            if node.id == "v1":
+                await node.radio.receive()
+                await node.radio.broadcast(b"answer")
+                log.append(("v1", node.now_ns))
+            else:
+                await asyncio.sleep(4e-9)
+                log.append(("v2", node.now_ns))
+                log.extend(("v2 has", packet.received_ns) for packet in node.radio.drain())
+        assert loop
+
+    def exchange(next_timer_ns: int | None) -> int:
+        next_ns = world.host.next_instant(next_timer_ns)
+        if next_ns is not None:
+            return next_ns
+        message = world.host.make_yield(b"n", len(world.yields), next_timer_ns)
+        world.yields.append(message)
+        if not windows:
+            raise Over
+        return world.host.open_window(windows.pop(0))
+
+    world.loop._exchange = exchange
+    world.run(program)
+    assert log == [
+        *(("v1", 3), ("v2", 4), ("v2 has", 2), ("v2", 8), ("v2 has", 5)),
+        *(("v1", 12), ("v2", 12), ("v2 has", 9), ("v2", 16)),
+    ]
+    start, first, second = world.yields
+    assert [(step.time_ns, len(step.traffic.frames)) for step in first.steps] == [(3, 1)]
+    assert (start.instants, first.instants, first.next_timer_ns) == (1, 4, 12)
+    assert [step.time_ns for step in second.steps] == [12]
+    assert (second.next_timer_ns, second.waiting_radio) == (20, ["v1"])
 
 
 def test_packets_come_before_fixes_and_fixes_before_timers() -> None:
@@ -154,7 +210,7 @@ def test_a_program_that_raises_ends_its_node_and_no_other() -> None:
         ("v2", "finished", ""),
     ]
     assert "raise ValueError" in world.endings[0].details
-    frames = [frame for message in world.yields for frame in message.traffic.frames]
+    frames = [frame for traffic in world.traffic for frame in traffic.frames]
     assert [(frame.node, frame.payload) for frame in frames] == [("v2", b"still here")]
 
 
@@ -183,7 +239,7 @@ def test_an_early_exit_takes_the_nodes_other_tasks_with_it() -> None:
 
     world = World("v1")
     world.run(program)
-    assert sum(len(message.traffic.frames) for message in world.yields) == 10
+    assert sum(len(traffic.frames) for traffic in world.traffic) == 10
 
 
 @pytest.mark.parametrize("stubborn", [False, True])
@@ -217,7 +273,7 @@ def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
 
     world = World("v1")
     world.run(program)
-    report = world.yields[1].traffic.reports[0]
+    report = world.traffic[0].reports[0]
     assert (report.time_ns, report.node, report.estimate_m) == (100_000_000, "v1", (1.0, 2.0))
     assert report.values == {"speed": 3.0, "cloud_m": [0.0, 0.0, 0.0, 0.0]}
 
@@ -261,7 +317,7 @@ def test_a_covariance_with_errors_of_rounding_is_one(factor: float) -> None:
 
     world = World("v1")
     world.run(program)
-    assert world.yields[0].traffic.reports[0].covariance_m2 == tuple(long_and_thin.ravel())
+    assert world.traffic[0].reports[0].covariance_m2 == tuple(long_and_thin.ravel())
 
 
 @pytest.mark.parametrize("payload", ["text", 5, None, [1, 2], {"a": 1}])
@@ -290,7 +346,7 @@ def test_whatever_holds_bytes_is_a_payload(payload: Any) -> None:
 
     world = World("v1")
     world.run(program)
-    assert world.yields[0].traffic.frames[0].payload == b"ab"
+    assert world.traffic[0].frames[0].payload == b"ab"
 
 
 def test_a_payload_above_the_limit_is_refused() -> None:

@@ -52,10 +52,15 @@ traffic = st.builds(
     st.lists(unhandled, max_size=2),
     st.lists(notes, max_size=2),
 )
+steps = st.builds(wire.Step, times, traffic)
 histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
 agent_messages = st.one_of(
-    st.builds(wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names),
-    st.builds(wire.Yield, st.binary(), times, st.none() | times, st.lists(names), st.lists(names), traffic),
+    st.builds(
+        wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names, times
+    ),
+    st.builds(
+        wire.Yield, st.binary(), times, st.none() | times, st.lists(names), st.lists(names), st.lists(steps), times
+    ),
     st.builds(
         wire.Frames,
         st.binary(),
@@ -67,10 +72,10 @@ agent_messages = st.one_of(
         st.booleans(),
     ),
     st.builds(wire.Final, st.binary(), traffic),
-    st.builds(wire.StackDump, st.binary(), names),
+    st.builds(wire.StackDump, st.binary(), names, st.none() | times),
 )
 emulator_messages = st.one_of(
-    st.builds(wire.Grant, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
+    st.builds(wire.Grant, times, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
     st.builds(
         wire.Batch,
         st.lists(fixes, max_size=3),
@@ -123,7 +128,7 @@ def test_damaged_messages_never_do_harm(message: wire.AgentMessage, data: st.Dat
 
 @pytest.mark.parametrize("time_ns", [-1, 2**62 + 1, 1.5, "1"])
 def test_times_are_integers_within_bounds(time_ns: object) -> None:
-    grant = wire.encode(wire.Grant(0, time_ns))  # type: ignore[arg-type]
+    grant = wire.encode(wire.Grant(0, time_ns, 9))  # type: ignore[arg-type]
     with pytest.raises(WireError):
         wire.decode_rx(grant)
 

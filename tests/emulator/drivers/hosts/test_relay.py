@@ -5,7 +5,7 @@ from emulator.drivers.hosts.messages import FromNode, Token
 from emulator.drivers.hosts.relay import Relay
 from vnet.transport import wire
 
-YIELD = wire.encode(wire.Yield(b"nonce", 0, None, [], [], wire.Traffic()))
+YIELD = wire.encode(wire.Yield(b"nonce", 0, None, [], [], [], 1))
 FINAL = wire.encode(wire.Final(b"nonce", wire.Traffic()))
 
 

@@ -117,7 +117,9 @@ class FakeAttachment:
 
 def hello(node: str, process_id: str | None = None, nonce: bytes = b"1", **more: Any) -> wire.Hello:
     """A hello, ready unless it says otherwise."""
-    return wire.Hello(node, process_id or node, nonce, 7, "host", **{"ready": True, **more})
+    return wire.Hello(
+        node, process_id or node, nonce, 7, "host", **{"ready": True, "version": wire.VERSION, **more}
+    )
 
 
 class Stage:

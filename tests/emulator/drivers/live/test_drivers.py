@@ -64,7 +64,8 @@ def yields(node: str, message: Any, nonce: bytes = b"1") -> wire.AgentMessage | 
     if not isinstance(message, wire.Grant):
         return None
     frames = [wire.Frame(node, b"x")] if node == "v01" else []
-    return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), wire.Traffic(frames))
+    steps = [wire.Step(message.time_ns, wire.Traffic(frames))]
+    return wire.Yield(nonce, message.seq, message.time_ns + 100 * MS, (), (), steps, 1)
 
 
 def fault(kind: str, at_s: float, duration_s: float, *nodes: str, **more: Any) -> dict[str, Any]:
@@ -156,6 +157,51 @@ def test_in_lockstep_a_process_that_does_not_yield_ends_the_run_with_its_stack(
         where = {e.node: e.details["where"] for e in play.stage.emulation.folder.events if e.kind == "stalled"}
         assert where == {"v02": "v02 is here", "v03": "v03 is here"}
         assert play.stage.launcher.done == [("stack", "v02"), ("stack", "v03")]
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_process_whose_instants_go_on_has_not_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        asked: list[int] = []
+        owed: list[wire.Yield] = []
+
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if isinstance(message, wire.Grant) and message.time_ns == 200 * MS and node == "v02":
+                owed.append(yields(node, message))  # type: ignore[arg-type]
+                return None
+            if isinstance(message, wire.StackRequest):
+                asked.append(len(asked))
+                if len(asked) == 3:
+                    play.inbox.put_message(node, wire.encode(owed[0]))
+                return wire.StackDump(b"1", "busy", 200 * MS + len(asked))
+            return yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        await play.driver.run()
+        assert len(asked) == 3, "asked each time that nothing has come for run.stall_timeout_s"
+        assert play.stage.events("stalled") == []
+        assert play.driver.time_ns == 500 * MS
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_lockstep_a_process_that_stays_at_its_instant_has_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        asked: list[str] = []
+
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if isinstance(message, wire.StackRequest):
+                asked.append(node)
+                return wire.StackDump(b"1", "stuck", 201 * MS)
+            stuck = isinstance(message, wire.Grant) and message.time_ns == 200 * MS and node == "v02"
+            return None if stuck else yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        assert asked == ["v02", "v02"], "once more, as it had come from 200 ms to 201 ms"
+        assert play.stage.events("stalled") == [("stalled", "v02")]
 
     in_virtual_time(run(), monkeypatch)
 

@@ -35,7 +35,7 @@ from vnet.transport import wire
 from vnet.transport.access import Access
 
 PROCESSES = [["v01", "v02"], ["v03"], ["v04"]]
-GRANT = wire.Grant(0, 0)
+GRANT = wire.Grant(0, 0, 1)
 
 
 def hello(host: str, nonce: bytes = b"1", **more: Any) -> bytes:

@@ -46,7 +46,7 @@ class Post:
 
 
 def yield_of(seq: int, nonce: bytes = b"1") -> bytes:
-    return wire.encode(wire.Yield(nonce, seq, None, (), (), wire.Traffic()))
+    return wire.encode(wire.Yield(nonce, seq, None, (), (), (), 1))
 
 
 def test_what_threads_put_comes_out_on_the_loop_in_order() -> None:
@@ -132,7 +132,7 @@ def test_stacks_and_connections_are_kept() -> None:
         post.inbox.put_token("v02", True)
         post.inbox.put_token("v01", False)
         await post.settle()
-        assert post.inbox.stacks == {"v02": "in main"}
+        assert post.inbox.stacks == {"v02": wire.StackDump(b"1", "in main", None)}
         assert post.inbox.connected == {"v02"}
 
     asyncio.run(run())

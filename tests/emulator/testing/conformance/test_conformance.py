@@ -87,7 +87,9 @@ def test_an_agent_passes_over_tls() -> None:
         ("CountsByItself", "lockstep", "yields", "seq = 1, and not 0"),
         ("YieldsTwice", "lockstep", "yields", "seq = 0, and not 1"),
         ("YieldsBeforeTheGrant", "lockstep-ended", "silence", "Yield"),
-        ("TimerInThePast", "lockstep", "timers", "next_timer_ns = 0 at 0"),
+        ("TimerInThePast", "lockstep", "timers", "next_timer_ns = 0 in a window to 2000000"),
+        ("StepsAfterItsWindow", "lockstep", "steps", "a step at 2000000, where 0 to 1999999 are allowed"),
+        ("KnowsNoWindows", "refusal", "version", "version = 1"),
         ("WaitsForNothing", "lockstep-lost", "wakes", "it waits for nothing"),
         ("AnswersLate", "lockstep-lost", "yields", "no Yield within 0.5 s"),
         ("SpeaksForOthers", "lockstep-lost", "own_node", "a frame of 'v02'"),
@@ -167,16 +169,18 @@ def conformance(*arguments: str) -> int:
 def test_the_command_prints_a_line_for_each_check_and_ends_with_0(capsys: pytest.CaptureFixture[str]) -> None:
     assert conformance("--scene", "refusal", "--", *FOREIGN) == 0
     *lines, last = capsys.readouterr().out.splitlines()
-    assert [line.split()[1] for line in lines] == ["starts", "hello", "decodes", "nonce", "refused"], "no others"
+    assert [line.split()[1] for line in lines] == ["starts", "hello", "version", "decodes", "nonce", "refused"], (
+        "no others"
+    )
     assert {line.split()[0] for line in lines} == {"ok"}
-    assert last == "5 checks: 0 wrong"
+    assert last == "6 checks: 0 wrong"
 
 
 def test_the_command_shows_the_bytes_of_what_is_wrong_and_ends_with_1(capsys: pytest.CaptureFixture[str]) -> None:
     assert conformance("--scene", "refusal", "--", *wrong("OfAnotherProcess")) == 1
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("wrong")]
     assert "came in refusal: node 'v01', process_id 'v02'; ['Hello', 'v01', 'v02', b" in line
-    assert "bytes: 98 a5 48 65 6c 6c 6f" in line
+    assert "bytes: 99 a5 48 65 6c 6c 6f" in line
 
 
 @pytest.mark.parametrize(
@@ -203,7 +207,7 @@ def test_a_command_that_cannot_know_the_node_is_refused() -> None:
 @pytest.mark.parametrize(
     ("data", "problem"),
     [
-        (b"\x97\xa5Yield\xc4\x01n\xa10\xc0\x90\x90\x93\x90\x90\x90", "(Yield.seq)"),
+        (b"\x98\xa5Yield\xc4\x01n\xa10\xc0\x90\x90\x90\x01", "(Yield.seq)"),
         (b"\x93\xa9StackDump\x01\xa0", "(StackDump.nonce)"),
         (b"\xc1", "not a message"),
         (b"\x91\xa9Nonsense1", "not a message"),

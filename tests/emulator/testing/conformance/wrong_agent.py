@@ -36,7 +36,7 @@ class Alters(Agent):
 
 class ReadyAtOnce(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:6], True, None] if fields[0] == "Hello" else fields
+        return [*fields[:6], True, *fields[7:]] if fields[0] == "Hello" else fields
 
 
 class ShortNonce(Alters):
@@ -56,7 +56,7 @@ class OfNoNode(Alters):
 
 class CannotLoadItsProgram(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:7], "no module beacon"] if fields[0] == "Hello" and fields[6] else fields
+        return [*fields[:7], "no module beacon", *fields[8:]] if fields[0] == "Hello" and fields[6] else fields
 
 
 class TakesAnyWelcome(Agent):
@@ -89,7 +89,7 @@ class YieldsTwice(Agent):
 
 class YieldsBeforeTheGrant(Agent):
     def run_lockstep(self, vehicle: Vehicle) -> None:
-        self.say("Yield", self.nonce, 0, None, [], [self.node], [[], [], []])
+        self.say("Yield", self.nonce, 0, None, [], [self.node], [], 1)
         super().run_lockstep(vehicle)
 
 
@@ -98,9 +98,21 @@ class TimerInThePast(Alters):
         return [*fields[:3], 0, *fields[4:]] if fields[0] == "Yield" else fields
 
 
+class StepsAfterItsWindow(Alters):
+    def alter(self, fields: list[Any]) -> list[Any]:
+        if fields[0] == "Yield":
+            fields[6] = [[time_ns + 2_000_000, traffic] for time_ns, traffic in fields[6]]
+        return fields
+
+
+class KnowsNoWindows(Alters):
+    def alter(self, fields: list[Any]) -> list[Any]:
+        return fields[:8] if fields[0] == "Hello" else fields
+
+
 class WaitsForNothing(Alters):
     def alter(self, fields: list[Any]) -> list[Any]:
-        return [*fields[:5], [], fields[6]] if fields[0] == "Yield" else fields
+        return [*fields[:5], [], *fields[6:]] if fields[0] == "Yield" else fields
 
 
 class AnswersLate(Alters):
@@ -114,9 +126,10 @@ class OtherTraffic(Alters):
     """Alters the traffic of its yields and frames."""
 
     def alter(self, fields: list[Any]) -> list[Any]:
-        at = {"Yield": 6, "Frames": 5}.get(fields[0])
-        if at is not None and fields[at][0]:
-            fields[at] = self.traffic(*fields[at])
+        if fields[0] == "Frames" and fields[5][0]:
+            fields[5] = self.traffic(*fields[5])
+        if fields[0] == "Yield":
+            fields[6] = [[time_ns, self.traffic(*traffic)] for time_ns, traffic in fields[6]]
         return fields
 
     def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:

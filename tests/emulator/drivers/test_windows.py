@@ -1,0 +1,174 @@
+"""Windows change nothing but the number of exchanges: traces, metrics, states and events are the same without."""
+
+import tomllib
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.simulate import simulate
+from emulator.scenario.faults import parse_fault
+from emulator.scenario.scenario import Scenario
+from emulator.testing.strategies import faults as schedules
+from tests.support.motion import along, scenario_of_trips, still, write_trips
+from tests.support.multi_loop_driver import emulation_of, run_apart, run_together, scenario_of
+from tests.support.paths import ROOT
+
+pytestmark = pytest.mark.slow
+
+IMPROVISES = "tests.support.window_programs:improvises"
+MS = 1_000_000
+Fingerprint = tuple[str, Any, Any, list[Any]]
+
+MEDIUM: dict[str, Any] = {
+    "max_peers": 1000,
+    "path_loss": {
+        "kind": "dual_slope",
+        "tx_power_dbm": 33.0,
+        "exponent": 1.9,
+        "far_exponent": 2.5,
+        "break_m": 500.0,
+    },
+    "fading": {},
+    "mac": {"access_category": "BE"},
+}
+"""A shared medium. At 3 Mbit/s some vehicles fill it: frames wait for each other, collide and are held back."""
+
+
+def fingerprint(emulation: Emulation) -> Fingerprint:
+    """All that a run leaves behind and that may be compared."""
+    rows = [repr(row) for row in emulation.metrics.rows]
+    events = [(event.time_ns, event.kind, event.node, event.details) for event in emulation.folder.events]
+    return emulation.engine.trace.sha256(), emulation.metrics.states_table().to_pydict(), rows, events
+
+
+def same(one: Sequence[Any], other: Sequence[Any]) -> bool:
+    return repr(one) == repr(other)  # by their text: NaN is not equal to itself
+
+
+def with_windows(scenario: Scenario, windows: bool) -> Scenario:
+    return scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": windows})})
+
+
+def simulated(scenario: Scenario, windows: bool) -> Emulation:
+    return run_together(with_windows(scenario, windows))
+
+
+# The shipped scenarios.
+
+
+@pytest.mark.parametrize("name", ["quickstart", "beacon", "twelve", "faults", "80211p", "city", "dense"])
+def test_shipped_scenarios_are_the_same_with_and_without_windows(name: str) -> None:
+    """A moment of each, with a few of its vehicles and particles."""
+    text = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
+    data = {key: value for key, value in tomllib.loads(text).items() if key != "fault"}
+    data["run"] |= {"duration_s": 0.3, "settle_s": 0}
+    data["network"] = {**data["network"], "vehicles": 6}
+    if data["program"]["entry"] != "agents.beacon:main":
+        data["program"]["options"] = {**data["program"].get("options", {}), "particles": 20}
+    scenario = Scenario.model_validate(data)
+    assert same(fingerprint(simulated(scenario, True)), fingerprint(simulated(scenario, False)))
+
+
+# Random scenarios and programs.
+
+radios = st.fixed_dictionaries(
+    {
+        "latency_ms": st.sampled_from([0.001, 0.3, 2.0, 2.3, 20.0, 250.0]),
+        "jitter_ms": st.sampled_from([0.0, 1.0, 30.0]),
+        "access_jitter_ms": st.sampled_from([0.0, 1.0]),
+        "delivery_tick_us": st.sampled_from([0, 0, 1000]),
+        "loss": st.sampled_from([0.0, 0.2]),
+    }
+)
+"""Radios without a shared medium; `MEDIUM` makes them ones with."""
+
+
+@st.composite
+def scenarios(draw: st.DrawFn) -> Scenario:
+    radio = {**draw(radios), **(draw(st.sampled_from([{}, {**MEDIUM, "bitrate_mbps": 3.0}])))}
+    if draw(st.booleans()) and "mac" in radio:
+        radio["congestion"] = {"kind": draw(st.sampled_from(["etsi", "limeric"]))}
+    vehicles = draw(st.integers(2, 5))
+    run = {
+        "duration_s": 1.0,
+        "settle_s": 0.2,
+        "seed": draw(st.integers(0, 10_000)),
+        "nodes_per_process": draw(st.sampled_from([1, 3, 1000])),
+    }
+    network = {"layout": "dense"}
+    scenario = scenario_of([], IMPROVISES, vehicles, run=run, radio=radio, network=network)
+    drawn = draw(schedules(scenario, most=3))
+    return scenario.model_copy(update={"fault": drawn})
+
+
+@settings(max_examples=12, deadline=None)
+@given(scenarios())
+def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -> None:
+    reference = fingerprint(simulated(scenario, False))
+    assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+
+
+@settings(max_examples=4, deadline=None)
+@given(latency_ms=st.sampled_from([0.001, 2.0, 250.0]), seed=st.integers(0, 1000), data=st.data())
+def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
+    latency_ms: float, seed: int, data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    vehicles = {
+        "v1": [(0.0, 4.0, along(0, 10))],
+        "v2": [(0.0, 4.0, still(0, 50))],
+        "v3": [(0.6, 4.0, along(-30, 10, 20))],  # enters
+        "v4": [(0.0, 0.8, still(100, 20))],  # leaves
+    }
+    path = write_trips(tmp_path_factory.mktemp("trips") / "trips.csv", vehicles)
+    radio = {"latency_ms": latency_ms}
+    scenario = scenario_of_trips(path, 1.6, IMPROVISES, radio=radio, run={"seed": seed, "settle_s": 0.2})
+    reference = fingerprint(simulated(scenario, False))
+    assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+
+
+# Stepped, with faults that are injected while the run is held.
+
+
+def stepped(scenario: Scenario, windows: bool, stops_s: Sequence[float]) -> Emulation:
+    """Simulate, held at these times; at the first a fault is injected, and at the second it is healed."""
+    emulation = emulation_of(with_windows(scenario, windows))
+    stops_ns: list[int | None] = [*(round(stop_s * 1e9) for stop_s in stops_s), None]
+    reached = iter(range(len(stops_ns)))
+
+    def before_horizon(lockstep: Lockstep) -> None:
+        number = next(reached)
+        now_ns = stops_ns[number - 1] if number else 0
+        assert now_ns is not None
+        if number == 1:
+            fault = {"kind": "loss", "probability": 0.5, "at_s": 0.0, "duration_s": 60.0}
+            emulation.inject(parse_fault(fault), now_ns - 1)
+        if number == 2:
+            emulation.heal("loss-0", now_ns - 1)
+        lockstep.horizon_ns = stops_ns[number]
+
+    simulate(emulation, before_horizon)
+    return emulation
+
+
+@settings(max_examples=4, deadline=None)
+@given(
+    stops_ms=st.lists(st.integers(1, 900_000), min_size=2, max_size=4, unique=True).map(sorted),
+    latency_ms=st.sampled_from([0.001, 2.0, 250.0]),
+)
+def test_a_run_that_is_stepped_and_broken_is_the_same_and_replays(stops_ms: list[int], latency_ms: float) -> None:
+    run = {"duration_s": 1.4, "settle_s": 0.3}
+    scenario = scenario_of([], IMPROVISES, run=run, radio={"latency_ms": latency_ms})
+    stops_s = [stop / 1e6 for stop in stops_ms]
+    reference = stepped(scenario, False, stops_s)
+    subject = stepped(scenario, True, stops_s)
+    assert same(fingerprint(subject), fingerprint(reference))
+    again = run_together(subject.scenario)
+    assert [planned.label for planned in again.faults.faults] == ["loss-0"]
+    assert same(fingerprint(again)[:3], fingerprint(subject)[:3])

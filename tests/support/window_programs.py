@@ -1,0 +1,102 @@
+"""Vehicle programs for the tests of windows: they do something at instants that are close to each other."""
+
+import asyncio
+import hashlib
+
+from vnet import Node
+from vnet.units import NS_PER_S
+
+
+class Diary:
+    """Digest of what a program saw, in order, and when: a difference shows in all that it says afterwards."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._hash = hashlib.blake2b(digest_size=6)
+
+    def note(self, *what: object) -> bytes:
+        entry = (self._node.now_ns, asyncio.get_running_loop().time(), *what)
+        self._hash.update(repr(entry).encode())
+        return self._hash.digest()
+
+    @property
+    def number(self) -> float:
+        return float(int.from_bytes(self._hash.digest(), "big"))
+
+
+async def improvises(node: Node) -> None:
+    """Answer packets, sleep for fractions of a millisecond, compute on threads, raise, and end at any time."""
+    diary = Diary(node)
+    manner = node.options.get("manner", "all")
+
+    async def answers() -> None:
+        while True:
+            packet = await node.radio.receive()
+            said = diary.note("packet", packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
+            draw = node.rng.random()
+            if draw < 0.2:
+                await node.radio.broadcast(said)
+            elif draw < 0.3:
+                node.event("answered", digest=diary.number)
+            elif draw < 0.35:
+                await asyncio.sleep(float(node.rng.uniform(0, 0.003)))
+                diary.note("drained", [(p.sender, p.received_ns) for p in node.radio.drain()])
+            elif draw < 0.37:
+                await node.radio.broadcast(b"last words of " + said)
+                return
+            elif draw < 0.39:
+                raise ValueError(f"{node.id} dislikes a packet at {node.now_ns}")
+
+    async def looks_seldom() -> None:
+        while True:
+            await asyncio.sleep(float(node.rng.uniform(0.0001, 0.05)))
+            heard = [(p.sender, p.sent_ns, p.received_ns, p.payload) for p in node.radio.drain()]
+            said = diary.note("heard", heard)
+            if node.rng.random() < 0.3:
+                await node.radio.broadcast(said + bytes(int(node.rng.integers(0, 300))))
+
+    async def listens_with_a_limit() -> None:
+        while True:
+            try:
+                packet = await asyncio.wait_for(node.radio.receive(), float(node.rng.uniform(0.0002, 0.03)))
+                diary.note("in time", packet.received_ns)
+            except TimeoutError:
+                diary.note("nothing")
+                await asyncio.sleep(0.02)
+
+    async def locates() -> None:
+        async for fix in node.gnss:
+            said = diary.note("fix", fix.time_ns, fix.position_m.tolist())
+            for _ in range(int(node.rng.integers(1, 4))):
+                await node.radio.broadcast(said)
+            if node.rng.random() < 0.2:
+                digest = await asyncio.get_running_loop().run_in_executor(None, hashlib.sha256, said)
+                await node.radio.broadcast(digest.digest()[:8])
+            node.report(fix.position_m, digest=diary.number)
+            node.log(f"digest {diary.number:.0f}")
+
+    def strike(number: int) -> None:
+        """A timer of the loop's, without a task, that fires a few times within a millisecond."""
+        diary.note("strike", number)
+        asyncio.get_running_loop().call_later(0.0003 if number % 5 else 0.05, strike, number + 1)
+
+    asyncio.get_running_loop().call_later(0.01, strike, 1)
+    hear = {"awaits": answers, "polls": looks_seldom, "limits": listens_with_a_limit}
+    names = list(hear)
+    chosen = names[int(node.id.strip("v")) % 3] if manner == "all" else manner
+    life_s = float(node.rng.uniform(0.2, 3.0))
+    async with asyncio.timeout(life_s if node.rng.random() < 0.3 else None):  # one in three crashes by TimeoutError
+        tasks = [asyncio.create_task(hear[chosen]()), asyncio.create_task(locates())]
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        assert ended
+        await tasks[1]
+
+
+async def notes_its_mail(node: Node) -> None:
+    """Await nothing but fixes; when it is ended, tell of the packets that it has by then."""
+    try:
+        async for fix in node.gnss:
+            await node.radio.broadcast(fix.position_m.tobytes())
+    finally:
+        newest_ns = [packet.received_ns for packet in node.radio.drain()]
+        node.log(f"{len(newest_ns)} packets at {node.now_ns / NS_PER_S:.6f} s, up to {max(newest_ns, default=0)}")
