@@ -1,5 +1,6 @@
 """Fixtures for tests of all packages."""
 
+import gc
 import signal
 from collections.abc import Iterator
 from typing import Any
@@ -15,6 +16,12 @@ use_one_blas_thread()  # as in the commands, whose results some tests compare wi
 # Others: --hypothesis-profile=default.
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.load_profile("same")
+
+
+def pytest_collection_finish() -> None:
+    """Keep garbage collection from looking through all tests and modules again at the end of each simulation."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
