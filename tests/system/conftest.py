@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,14 +27,15 @@ TIMEOUT_S = 300
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark all tests of this folder as slow, and let their processes hear Ctrl-C however pytest was started.
-
-    `items` holds the tests of other folders too.
-    """
+    """Mark all tests of this folder as slow; `items` holds the tests of other folders too."""
     for item in items:
         if item.path.is_relative_to(Path(__file__).parent):
             item.add_marker(pytest.mark.slow)
-            item.add_marker(pytest.mark.usefixtures("default_signals"))
+
+
+@pytest.fixture(autouse=True)
+def hears_ctrl_c(default_signals: None) -> None:
+    """Let processes hear Ctrl-C however pytest was started."""
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,15 @@ def run_until(enough: Callable[[], bool], folder: Path, scenario: str, *options:
         finally:
             process.kill()
     return Finished(process.returncode, stdout, stderr, folder)
+
+
+@contextlib.contextmanager
+def killed_at_last(process: subprocess.Popen[str]) -> Iterator[None]:
+    """Kill a process when a test is over, which would otherwise wait for one that has not done what it should."""
+    try:
+        yield
+    finally:
+        process.kill()
 
 
 def heard_by(folder: Path, node: str) -> set[tuple[str, int]]:

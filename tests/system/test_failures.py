@@ -13,7 +13,7 @@ import pytest
 from emulator.checks.judge import check_run
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
-from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, running_agents
+from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, killed_at_last, running_agents
 
 LONG = [
     "--program",
@@ -65,7 +65,10 @@ def test_an_interruption_ends_everything_and_leaves_readable_files(tmp_path: Pat
 def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     command = [*VNET, "emulator", "scenarios/beacon.toml", "--listen", "tcp/127.0.0.1:0", "--out", str(folder)]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with (
+        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+        killed_at_last(process),
+    ):
         assert process.stderr is not None
         while "waiting for 10 vehicles" not in (line := process.stderr.readline()):
             assert line, "it ended early"

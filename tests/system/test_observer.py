@@ -16,7 +16,7 @@ from emulator.viewer.sinks import is_closed
 from tests.support.paths import ROOT
 from tests.support.processes import has_ended
 from tests.support.recordings import descendants, listening_addresses, read_back, rrd
-from tests.system.conftest import TIMEOUT_S, VNET
+from tests.system.conftest import TIMEOUT_S, VNET, killed_at_last
 from tests.system.test_faults import processes_of, started, wait_until_all_are_gone, write
 
 LONG: dict[str, dict[str, Any]] = {
@@ -147,7 +147,7 @@ def test_a_finished_run_is_served_until_it_is_enough(tmp_path: Path, ending: sig
     whole = (folder / "recording.rrd").read_bytes()
     (folder / "recording.rrd").write_bytes(whole[:-100])  # as if it had been killed
     command = [*VNET, "view", str(folder), "--serve"]
-    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process, killed_at_last(process):
         assert process.stdout is not None
         assert "was not closed" in process.stdout.readline()
         assert process.stdout.readline().startswith("serving ")
