@@ -17,7 +17,7 @@ import typer
 from vnet.errors import ProgramError, VnetError
 from vnet.runtime import interrupts
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
+from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread
 from vnet.runtime.program_path import search_programs_in
 
 if TYPE_CHECKING:
@@ -149,6 +149,7 @@ def _leave_terminal() -> None:
 def main() -> None:
     """The console script."""
     interrupts.end_at_once()
+    open_standard_descriptors()
     use_one_blas_thread()
     fix_hash_seed("agents.cli")
     app(prog_name="vnet-agent")

@@ -35,7 +35,7 @@ from emulator.records.code_digest import entries_of
 from emulator.records.run_folder import RunFolder
 from emulator.report.notebook import Run
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import Source, scenario_of
+from emulator.scenario.source import Source, hinting, scenario_of
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError
 from vnet.runtime.program_path import search_programs_in
@@ -44,6 +44,7 @@ from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 
 
+@hinting
 def simulate(
     scenario: Source,
     *,
@@ -82,6 +83,7 @@ def simulate(
         return Run.open(_interruptible(lambda stop: simulate_into(loaded, folder, stop, why)))
 
 
+@hinting
 def run(
     scenario: Source,
     *,

@@ -60,6 +60,17 @@ class ScenarioError(VnetError):
     """A scenario, an override or an input file that cannot be used. Commands end with status 2."""
 
 
+class OverrideError(ScenarioError):
+    """A change of a scenario that cannot be used: not its file is wrong, but what was given besides.
+
+    `key` is the key that was changed.
+    """
+
+    def __init__(self, message: str, key: str) -> None:
+        super().__init__(message)
+        self.key = key
+
+
 class WireError(VnetError):
     """A message on a Zenoh key that does not decode into what the key carries."""
 

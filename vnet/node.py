@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import sys
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -381,8 +382,12 @@ def _detail(name: str, value: object) -> NoteDetail:
 def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]:
     try:
         flat: list[float] = np.asarray(value, dtype=float).ravel().tolist()
+    except OverflowError:
+        raise ValueError(
+            f"report({name}={shown(value)}): a number within ±{sys.float_info.max:.2g} is expected"
+        ) from None
     except (TypeError, ValueError):
-        raise ValueError(f"report({name}={value!r}): numbers are expected") from None
+        raise ValueError(f"report({name}={shown(value)}): numbers are expected") from None
     if size is not None and len(flat) != size:
         raise ValueError(f"report({name}=…): {len(flat)} numbers given, {size} expected")
     return flat

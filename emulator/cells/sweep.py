@@ -25,7 +25,7 @@ from emulator.records.atomic import atomically, write_atomically
 from emulator.records.run_folder import RUNS
 from emulator.report.sweep_page import sweep_page
 from emulator.scenario.scenario import Scenario
-from emulator.scenario.source import Source, scenario_of
+from emulator.scenario.source import Source, hinting, scenario_of
 from vnet.errors import ScenarioError, VnetError, shown
 from vnet.runtime.programs import Program
 
@@ -74,6 +74,7 @@ class SweepPlan:
         return self.cells[number - 1 :: of]
 
 
+@hinting
 def sweep(
     scenario: Source,
     vary: Mapping[str, Sequence[Any]],

@@ -13,8 +13,9 @@ def main() -> None:
 
     interrupts.end_at_once()
     from emulator.cli.table import find
-    from vnet.runtime.environment import fix_hash_seed, use_one_blas_thread
+    from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread
 
+    open_standard_descriptors()
     use_one_blas_thread()
     arguments = sys.argv[1:]
     command = find(arguments)

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from emulator.checks.judge import check_run
-from emulator.cli.options import ChecksOption
+from emulator.cli.options import ChecksOption, path_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import from_here
 from emulator.terminal.console import one_line_errors
@@ -17,7 +17,7 @@ from emulator.terminal.summary import print_checks
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")],
+    folder: Annotated[Path, typer.Argument(parser=path_of, metavar="RUN", help="A run's folder.")],
     check: ChecksOption = None,
     own_checks: Annotated[
         bool, typer.Option("--own-checks", metavar="", help="Run its own checks again: code that the folder names.")

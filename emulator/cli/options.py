@@ -14,12 +14,19 @@ import typer
 from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.terminal.console import LogFormat
-from vnet.errors import ScenarioError, VnetError, printable
+from vnet.errors import OverrideError, ScenarioError, VnetError, printable
 from vnet.runtime.debug_target import DebugTarget, resolve
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 LATEST = Path("runs/latest")
+
+
+def path_of(text: str) -> Path:
+    """Return a path that an option or an argument names. Raises BadParameter for an empty one."""
+    if not text:
+        raise typer.BadParameter("'': a path is needed")
+    return Path(text)
 
 
 class Pacing(StrEnum):
@@ -47,7 +54,10 @@ class OutputOptions:
 
 
 ScenarioArgument = Annotated[
-    Path, typer.Argument(metavar="SCENARIO", help="A scenario file (TOML), or the name of one that is shipped.")
+    Path,
+    typer.Argument(
+        parser=path_of, metavar="SCENARIO", help="A scenario file (TOML), or the name of one that is shipped."
+    ),
 ]
 ProgramOption = Annotated[
     str | None,
@@ -74,7 +84,8 @@ PacingOption = Annotated[
 SeedOption = Annotated[int | None, typer.Option(metavar="N", help="Random seed: same seed, same run.")]
 DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
 OutOption = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="Folder of the run's files. Default: runs/NAME-SEED.")
+    Path | None,
+    typer.Option(parser=path_of, metavar="FOLDER", help="Folder of the run's files. Default: runs/NAME-SEED."),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -117,7 +128,7 @@ HostsOption = Annotated[
         metavar="NAMES", help="Hosts of the vehicles, in equal parts: a,b,c. On each: vnet host --name NAME."
     ),
 ]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder.")]
+RunArgument = Annotated[Path, typer.Argument(parser=path_of, metavar="RUN", help="A run's folder.")]
 RerunBindOption = Annotated[
     str | None, typer.Option(metavar="ADDRESS", help="Where to serve; the default is 127.0.0.1, this machine only.")
 ]
@@ -156,7 +167,26 @@ def load(
     }
     given = [f"{key}={value}" for key, value in options.items() if value is not None]
     own = [_program_option(option) for option in program_options or ()]
-    return load_scenario(path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()])
+    if not all(map(str.strip, checks or ())):
+        raise ScenarioError("--check '': write it as my_checks.py:check")
+    try:
+        return load_scenario(path, [*(overrides or []), *own, *given], [from_here(each) for each in checks or ()])
+    except OverrideError as error:
+        chosen = next(
+            (option for key, option in _OPTIONS.items() if options[key] is not None and error.key == key), "--set"
+        )
+        if any(each.startswith(f"{error.key}=") for each in own):
+            chosen = "--option"
+        raise ScenarioError(f"{chosen}: {error}") from None
+
+
+_OPTIONS = {
+    "program.entry": "--program",
+    "run.pacing": "--pacing",
+    "run.seed": "--seed",
+    "run.duration_s": "--duration",
+}
+"""Options that are short for a change of a key."""
 
 
 def _program_option(option: str) -> str:

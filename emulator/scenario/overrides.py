@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
 from emulator.scenario.toml import DEEPEST, check_plain, parse_toml
-from vnet.errors import ScenarioError, printable, shown
+from vnet.errors import OverrideError, ScenarioError, printable, shown
 
 
 def apply_override(data: dict[str, Any], override: str) -> None:
@@ -25,6 +26,17 @@ def apply_override(data: dict[str, Any], override: str) -> None:
         if not isinstance(table, dict):
             raise ScenarioError(f"--set {printable(override)}: {printable(part)} is not a section")
     table[parts[-1]] = _value(text)
+
+
+def wrong_value(path: PurePath, problem: str, overrides: Sequence[str]) -> ScenarioError:
+    """Return the error for a problem that begins with its key: of the override of that key, else of the file."""
+    found = re.match(r"[^\s:=]+", problem)
+    for override in overrides if found else ():
+        key = override.partition("=")[0].strip()
+        named = found[0] if found else ""
+        if f"{key}.".startswith(f"{named}.") or f"{named}.".startswith(f"{key}."):
+            return OverrideError(problem, key)
+    return ScenarioError(f"{path}: {problem}")
 
 
 def as_overrides(changes: Mapping[str, Any]) -> list[str]:

@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.modules import with_modules
-from emulator.scenario.overrides import apply_override
+from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.renamed import with_new_names
@@ -351,11 +351,14 @@ def scenario_from(
         check_plain(data)
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
-        raise ScenarioError(f"{path}: {first_problem(error, Scenario)}") from None
+        raise wrong_value(path, first_problem(error, Scenario), overrides) from None
     except ValueError as error:
-        raise ScenarioError(f"{path}: {error}") from None
+        raise wrong_value(path, str(error), overrides) from None
     scenario = _with_absolute_paths(scenario, path)
-    program = with_modules(scenario.program, path.parent, checks, str(path))
+    try:
+        program = with_modules(scenario.program, path.parent, checks, str(path))
+    except ScenarioError as error:
+        raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
     scenario = scenario.model_copy(update={"program": program})
     recorded = digests or {}
     for name, digest in input_digests(scenario).items():

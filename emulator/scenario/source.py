@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from emulator.scenario.overrides import as_overrides
 from emulator.scenario.program import from_here
 from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
-from vnet.errors import ScenarioError, shown
+from vnet.errors import ScenarioError, did_you_mean, shown
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Source = str | Path | Mapping[str, Any] | Scenario
 DATA = Path("scenario")
 """The name of plain data in messages. Relative paths in it are taken from the current folder."""
@@ -31,3 +35,17 @@ def scenario_of(source: Source, changes: Mapping[str, Any], checks: Sequence[str
     if not isinstance(source, Mapping):
         raise ScenarioError(f"scenario = {shown(source)}: a path, a shipped scenario's name, or a dict is needed")
     return scenario_from(deepcopy(dict(source)), DATA, overrides, checks=checks)
+
+
+def hinting(function: Callable[P, T]) -> Callable[P, T]:
+    """Have a function say which argument may have been meant by one that it does not have."""
+    known = inspect.signature(function).parameters
+
+    @wraps(function)
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        for name in options:
+            if name not in known:
+                raise TypeError(f"{function.__name__}(): no argument {name!r}{did_you_mean(name, known)}")
+        return function(*arguments, **options)
+
+    return call

@@ -8,6 +8,8 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -191,3 +193,9 @@ def test_a_process_that_is_not_fit_has_a_worker_run_the_program(tmp_path: Path) 
     assert [each.reason for each in here.not_applicable if each.name == "replay"] == [
         "it ran once; --check-determinism runs it twice"
     ]
+
+
+@pytest.mark.parametrize("function", [emulator.simulate, emulator.run, partial(emulator.sweep, vary={})])
+def test_a_misspelt_argument_is_hinted_at(function: Callable[..., object]) -> None:
+    with pytest.raises(TypeError, match=r"no argument 'duration' \(did you mean duration_s\?\)$"):
+        function("beacon", duration=1)

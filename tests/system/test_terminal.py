@@ -195,7 +195,7 @@ def test_quiet(vnet: Vnet) -> None:
         ),
         (
             ["analyze", "scenarios/beacon.toml", "--set", "radio.los=1"],
-            "scenarios/beacon.toml: radio.los: unknown key (did you mean loss?); allowed here: access_jitter_ms",
+            "--set: radio.los: unknown key (did you mean loss?); allowed here: access_jitter_ms",
         ),
         (["status", "--json", "--watch"], "--json and --watch exclude each other"),
         (["status", "--run", "nowhere"], "nowhere: no run is going on there (control.json is missing)"),

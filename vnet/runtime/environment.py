@@ -16,6 +16,19 @@ ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM
 """One thread of linear algebra: more would not be faster here, and less reproducible."""
 
 
+def open_standard_descriptors() -> None:
+    """Lead standard input, output and error to nowhere where a caller has closed them (`>&-`).
+
+    The next files that this process opens would take their places, and be written to.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+
+
 def use_one_blas_thread() -> None:
     """Have numpy, once it is imported, compute in one thread, unless the environment already says otherwise."""
     for name, value in ONE_BLAS_THREAD.items():

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from emulator.cli.commands import app
+from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 
 BEACON = str(ROOT / "scenarios" / "beacon.toml")
@@ -43,6 +44,13 @@ def vnet(*arguments: str) -> tuple[int, str]:
 
 
 WRONG = [
+    (["--set", "radio.los=1"], "vnet: --set: radio.los: unknown key (did you mean loss?)"),
+    (["--set", "radio.loss=x"], "vnet: --set: radio.loss = 'x': a number is needed"),
+    (["--duration", "-1"], "vnet: --duration: run.duration_s = -1.0: must be greater than 0"),
+    (["--seed", "-1"], "vnet: --seed: run.seed = -1: must be greater than or equal to 0"),
+    (["--set", "run.seed=-1"], "vnet: --set: run.seed = -1: must be"),
+    (["--program", ""], "vnet: --program: program.entry = '': write it as package.module:function"),
+    (["--check", ""], "vnet: --check '': write it as my_checks.py:check"),
     (["--program", "godo:main"], "No module named 'godo'"),
     (["--program", "good:mainn"], "module good (good.py) has no 'mainn' (did you mean main?)"),
     (["--program", "wrong_syntax:main"], "SyntaxError"),
@@ -62,6 +70,26 @@ def test_what_is_refused_leaves_nothing(command: str, options: list[str], messag
     assert (status, stderr.count("\n")) == (2, 1), stderr
     assert message in stderr
     assert not Path("runs").exists()
+
+
+EMPTY = [
+    ["simulate", BEACON, "--out", ""],
+    *([command, ""] for command in ("simulate", "run", "campaign", "check")),
+]
+
+
+@pytest.mark.parametrize("arguments", EMPTY, ids=lambda words: words[0])
+def test_an_empty_path_is_none(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, arguments) == 2
+    stderr = capsys.readouterr().err
+    assert "'': a path is needed" in stderr
+    assert stderr.count("\n") == 1
+
+
+def test_an_error_of_the_file_names_the_file(here: Path) -> None:
+    (here / "own.toml").write_text("[run]\nseed = -1\n")
+    status, stderr = vnet("simulate", "own.toml", "--set", "radio.loss=0.1")
+    assert (status, stderr.startswith("vnet: own.toml: run.seed = -1")) == (2, True), stderr
 
 
 def test_the_number_is_not_used_up_and_latest_stays() -> None:

@@ -76,3 +76,27 @@ def test_a_command_starts_itself_again_with_a_fixed_hash_seed() -> None:
     )
     assert python("-c", program).stdout == "['-P', '-m', 'agents.cli'] 0\n"
     assert python("-c", program, PYTHONHASHSEED="0").stdout == "", "it has one already"
+
+
+CLOSED = """
+import os, sys
+for number in map(int, sys.argv[2]):
+    os.close(number)
+os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
+"""
+OPENED = """
+import os
+from vnet.runtime.environment import open_standard_descriptors
+open_standard_descriptors()
+first = os.open("first.txt", os.O_WRONLY | os.O_CREAT)
+print("said", flush=True)
+os.write(first, str(first).encode())
+"""
+
+
+@pytest.mark.parametrize("closed", ["1", "2", "12", "012"])
+def test_files_do_not_take_the_place_of_closed_standard_output(closed: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", CLOSED, OPENED, closed]
+    done = subprocess.run(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert done.returncode == 0
+    assert int((tmp_path / "first.txt").read_text()) > 2, "and what was said is not in it"

@@ -286,6 +286,8 @@ def test_reports_and_frames_travel_with_the_yield_of_their_instant() -> None:
         (lambda node: node.report(note={"far": 1}), "note"),
         (lambda node: node.report(note=["far", "near"]), "note"),
         (lambda node: node.report(note=65 * "x"), "note"),
+        (lambda node: node.report(delay_ms=10**400), r"delay_ms=1000.*: a number within ±1.8e\+308 is expected"),
+        (lambda node: node.report(delay_ms=10**9000), r"delay_ms=\(int\)\): a number within"),
         (lambda node: node.report(covariance_m2=[[1, 0.5], [0.4, 1]]), "not symmetric, so no covariance"),
         (
             lambda node: node.report(covariance_m2=[[1, 2], [2, 1]]),
