@@ -6,28 +6,31 @@ import pytest
 import typer.main
 import yaml
 
-import agents.cli
 import emulator.cli.commands
+from emulator.cli.access import create_access
+from emulator.cli.options import host_names
 from emulator.scenario.scenario import load_scenario
 from emulator.world.world import build_world
 from tests.support.paths import ROOT
+from vnet.transport.access import OBSERVER, host_user
 
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
 SERVICES = COMPOSE["services"]
-PROGRAMS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
 SCENARIO = load_scenario(ROOT / "scenarios" / "beacon.toml")
+CLIENTS = {"host-a", "host-b", "recorder"}
+ENDPOINT = "tcp/emulator:7447"
 
 
 def options(service: str) -> dict[str, object]:
     """The parameters that a service's command line parses into."""
     program, *arguments = shlex.split(SERVICES[service]["command"])
-    command = typer.main.get_command(PROGRAMS[program])
+    assert program == "vnet"
+    command = typer.main.get_command(emulator.cli.commands.app)
     context = command.make_context(program, arguments, resilient_parsing=False)
-    if isinstance(command, typer.core.TyperGroup):
-        name, chosen, rest = command.resolve_command(context, [*context._protected_args, *context.args])
-        assert chosen is not None
-        context = chosen.make_context(name, rest, parent=context)
-    return context.params
+    assert isinstance(command, typer.core.TyperGroup)
+    name, chosen, rest = command.resolve_command(context, [*context._protected_args, *context.args])
+    assert chosen is not None
+    return chosen.make_context(name, rest, parent=context).params
 
 
 @pytest.mark.parametrize("name", SERVICES)
@@ -37,32 +40,36 @@ def test_services_hang_together(name: str) -> None:
     assert set(service["networks"]) <= set(COMPOSE["networks"])
     assert set(service.get("depends_on", [])) <= set(SERVICES)
     assert "ports" not in service, "nothing is published to the host"
-    assert "./access:/access:ro" in service["volumes"]
+    named = {volume.split(":")[0] for volume in service["volumes"] if not volume.startswith(".")}
+    assert named <= set(COMPOSE["volumes"])
 
 
-def test_the_router_is_zenohd_of_the_pinned_version() -> None:
-    pinned = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
-    assert SERVICES["zenohd"]["image"] == f"eclipse/zenoh:{pinned['eclipse-zenoh']}"
-    assert SERVICES["zenohd"]["command"] == ["-c", "/access/zenohd.json5"]
+def test_it_starts_with_one_command() -> None:
+    """The emulator makes the users: whoever needs them waits until they are there and the router listens."""
+    assert set(SERVICES) == {"emulator", *CLIENTS}
+    for name in CLIENTS:
+        assert SERVICES[name]["depends_on"] == {"emulator": {"condition": "service_healthy"}}
+        assert "access:/access:ro" in SERVICES[name]["volumes"]
+    parsed = options("emulator")
+    assert str(parsed["access"]) == "/access" and parsed["listen"] == "tcp/0.0.0.0:7447"
+    assert "access:/access" in SERVICES["emulator"]["volumes"]
+    assert "/access/access.json" in SERVICES["emulator"]["healthcheck"]["test"]
+    assert "7447" in SERVICES["emulator"]["healthcheck"]["test"]
 
 
-def test_every_vehicle_of_the_scenario_has_its_agent() -> None:
-    agents_of = {name for name in SERVICES if str(SERVICES[name]["command"]).startswith("vnet-agent")}
-    assert agents_of == set(build_world(SCENARIO).node_ids)
-    for name in agents_of:
-        parsed = options(name)
-        assert parsed["node"] == [name]
-        assert parsed["run"] == SCENARIO.run.name
-        assert parsed["connect"] == "tcp/zenohd:7447"
-        assert str(parsed["credentials"]) == f"/access/credentials/{name}.json"
-
-
-def test_the_emulator_is_a_client_of_the_router_and_the_recorder_watches() -> None:
-    emulator_options = options("emulator")
-    assert emulator_options["connect"] == "tcp/zenohd:7447"
-    assert str(emulator_options["scenario"]) == "scenarios/beacon.toml"
-    assert str(emulator_options["access"]) == "/access"
-    assert options("recorder")["run"] == SCENARIO.run.name
+def test_each_host_of_the_emulator_has_its_container_and_its_credentials() -> None:
+    parsed = options("emulator")
+    assert str(parsed["scenario"]) == "scenarios/beacon.toml"
+    hosts = host_names(str(parsed["hosts"]))
+    assert {host_user(host) for host in hosts} == CLIENTS - {"recorder"}
+    access = create_access(SCENARIO, build_world(SCENARIO), hosts=hosts)
+    assert [len(share) for share in access.hosts.values()] == [5, 5], "as the file says"
+    for name in CLIENTS:
+        user = OBSERVER if name == "recorder" else name
+        client = options(name)
+        assert user in access.passwords
+        assert str(client["credentials"]) == f"/access/credentials/{user}.json"
+        assert (client["connect"], client["run"]) == (ENDPOINT, SCENARIO.run.name)
 
 
 def test_the_image_holds_what_the_commands_need() -> None:

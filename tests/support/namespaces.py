@@ -3,7 +3,7 @@
 import os
 import signal
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
@@ -73,22 +73,3 @@ def _delete(namespace: str) -> None:
 def _ip(*words: str) -> str:
     done = subprocess.run(["ip", *words], check=True, capture_output=True, text=True)
     return done.stdout
-
-
-def delay(hosts: Sequence[NetworkHost], one_way_ms: float) -> None:
-    """Delay what each host sends by so much (tc netem)."""
-    for host in hosts:
-        words = [
-            "tc",
-            "-n",
-            host.namespace,
-            "qdisc",
-            "add",
-            "dev",
-            LINK,
-            "root",
-            "netem",
-            "delay",
-            f"{one_way_ms}ms",
-        ]
-        subprocess.run(words, check=True, capture_output=True)
