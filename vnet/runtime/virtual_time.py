@@ -27,6 +27,7 @@ from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NumberedTimer
 from vnet.runtime.cpu_meter import CpuMeter
+from vnet.runtime.current_node import current_node
 from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
 
@@ -73,6 +74,14 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     def own_time(self) -> float:
         """Seconds on the loop's own clock."""
         return super().time()
+
+    def stop(self) -> None:
+        """Stop the loop; programs may not. Raises RuntimeError for them."""
+        if current_node.get() is not None:
+            raise RuntimeError(
+                "loop.stop(): the loop is not the program's own; return from main to end the program"
+            )
+        super().stop()
 
     def create_future(self) -> asyncio.Future[Any]:
         """Make a future that tells the loop when it fails."""

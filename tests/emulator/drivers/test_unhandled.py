@@ -436,3 +436,15 @@ def test_without_a_start_nothing_is_known() -> None:
     finding = check_no_exceptions(recorded)
     assert isinstance(finding, CheckResult)
     assert finding.verdict is Verdict.UNKNOWN
+
+
+async def stops_the_loop(node: Node) -> None:
+    await asyncio.sleep(0.1)
+    asyncio.get_running_loop().stop()
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart])
+def test_a_program_that_stops_the_loop_has_crashed(run: Run) -> None:
+    events = run(scenario_of([], f"{__name__}:stops_the_loop", vehicles=2)).folder.events
+    crashes = [(event.node, event.details["error"][:25]) for event in events if event.kind == "crashed"]
+    assert crashes == [("v01", "RuntimeError: loop.stop()"), ("v02", "RuntimeError: loop.stop()")]
