@@ -20,6 +20,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -30,12 +31,15 @@ from rerun.experimental import ViewerClient
 
 from emulator.records.run_folder import RECORDING
 from emulator.viewer.blueprints import blueprint
+from emulator.viewer.layout import EVERYTHING
 from emulator.viewer.sinks import place_to_serve, viewer_command
 
 SCENARIO = Path(__file__).parent / "pictures" / "pictures.toml"
 VEHICLE = "v08"
 AT_S = 12.0
-TABS = ("overview", "radio", "vehicle")
+TABS = ("overview", "radio", "vehicle", "program")
+CONTENT = replace(EVERYTHING, busy=False, values=("heard", "bytes", "rejected"))
+"""Data of the run, from which the tabs of the native viewer are made."""
 DESK, PHONE = (1600, 900), (390, 844)
 MENU = 36
 """The height of the viewer's own menu, which says nothing about the run."""
@@ -43,8 +47,10 @@ LARGEST_BYTES = 300_000
 START_TIMEOUT_S = 60.0
 SETTLE_S = 4.0
 """Time that a viewer may take to draw everything."""
-WEB_SETTLE_S = 120.0
+WEB_SETTLE_S = 240.0
 """Longest time that the browser may take to draw everything, by software alone."""
+LONGEST_STILL = 8
+"""Looks at the browser between which its viewer may pause without being done."""
 LEAST_BYTES = 100_000
 """Size of a picture of the browser from which on its views have data."""
 
@@ -78,7 +84,7 @@ def native_pictures(recording: Path, scratch: Path, out: Path) -> None:
     """Every tab in the native viewer."""
     for number, name in enumerate(TABS):
         tab = scratch / f"{name}.rbl"
-        blueprint(VEHICLE, number).save("vnet", str(tab))
+        blueprint(VEHICLE, number, CONTENT).save("vnet", str(tab))
         port = place_to_serve().port
         size = f"{DESK[0]}x{DESK[1]}"
         command = viewer_command("--headless", "--port", str(port), "--window-size", size, str(recording), str(tab))
@@ -98,11 +104,18 @@ def web_picture(run: Path, out: Path) -> None:
     with running([*command, "--rerun-port", str(place.port)]), Browser() as browser:
         until(lambda: urllib.request.urlopen(place.web_url).read())
         browser.look(place.web_url, DESK, dark=True)
-        deadline = time.monotonic() + WEB_SETTLE_S
-        while len(browser.picture()) < LEAST_BYTES and time.monotonic() < deadline:
-            time.sleep(SETTLE_S)
+        put(settled(browser), out / "web.png", MENU)
+
+
+def settled(browser: Browser) -> bytes:
+    """Return a picture that has not changed for a while: the viewer pauses while it loads."""
+    deadline = time.monotonic() + WEB_SETTLE_S
+    picture, same = browser.picture(), 0
+    while same < LONGEST_STILL and time.monotonic() < deadline:
         time.sleep(SETTLE_S)
-        put(browser.picture(), out / "web.png", MENU)
+        before, picture = picture, browser.picture()
+        same = same + 1 if len(picture) > LEAST_BYTES and picture == before else 0
+    return picture
 
 
 def page_pictures(page: Path, out: Path) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
 from emulator.records.reported import reported_figures
@@ -22,7 +23,8 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
 
     `failed`: the names of invalid checks; `frames_OUTCOME`: receptions by outcome; `packet_delivery_ratio`; all of
     vnet's figures by name; of each value that programs report the mean over all reports by its name, and as
-    `last.NAME` the mean over the vehicles of their last one. Texts that programs report are left out.
+    `last.NAME` the mean over the vehicles of their last one; of own checks each number by `own:NAME.FIGURE`. Texts
+    and rows are left out.
     """
     frames = verdict["frames_by_outcome"]
     attempted = sum(count for outcome, count in frames.items() if outcome != "out_of_range")
@@ -42,6 +44,10 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
         if figure["mean"] is not None:
             row[name if name not in row else f"reported.{name}"] = figure["mean"]
             row[f"last.{name}"] = figure["last"]
+    for check in verdict["checks"]:
+        if check["name"].startswith(PREFIX):
+            figures = check.get("figures", {}).items()
+            row |= {f"{check['name']}.{key}": value for key, value in figures if isinstance(value, int | float)}
     return row
 
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import emulator
 from emulator.cells import sweep as subject
 from emulator.cells.cells import Cell, CellResult, compute
-from emulator.cells.measure import WALL_CLOCK
+from emulator.cells.measure import WALL_CLOCK, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.sweep import sweep as command
 from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page
@@ -192,3 +192,20 @@ def test_columns_of_several_kinds_are_texts() -> None:
         {"a": 1.0, "b": "x", "c": None, "d": None},
         {"a": 2.5, "b": "true", "c": None, "d": 3},
     ]
+
+
+def test_numbers_of_own_checks_are_columns() -> None:
+    figures = {"slowest_s": 0.2, "late": 3, "who": "v02", "rows": [{"node": "v02"}]}
+    checks = [
+        {"name": "own:warned", "verdict": "invalid", "figures": figures},
+        {"name": "conservation", "verdict": "valid", "figures": {"frames": 10}},
+    ]
+    verdict: dict[str, Any] = dict.fromkeys(
+        ("verdict", "vehicles", "emulated_s", "trace_sha256", "metrics_sha256", "wall_s", "real_time_factor")
+    )
+    row = judged_figures(verdict | {"checks": checks, "frames_by_outcome": {}, "figures": {}, "reported": {}})
+    assert {name: value for name, value in row.items() if "." in name} == {
+        "own:warned.slowest_s": 0.2,
+        "own:warned.late": 3,
+    }
+    assert row["failed"] == "own:warned"
