@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.signals import signals_handled, tell_from_handler
@@ -59,7 +60,7 @@ def simulate(
     started = time.monotonic()
     interrupted = False
     try:
-        with _ending_between_windows(simulation, on_interrupt):
+        with _ending_between_windows(simulation, on_interrupt), rare_collections(len(emulation.world.node_ids)):
             simulation.run()
     except KeyboardInterrupt:
         interrupted = True
