@@ -9,6 +9,7 @@ import numpy as np
 
 from agents.cooperative import frame as cooperative_frame
 from agents.cooperative import information_frame
+from emulator.drivers.hosts import messages
 from emulator.scenario.faults import KINDS
 from tests.support import maps
 from vnet.node import Report
@@ -53,6 +54,22 @@ TX: tuple[wire.AgentMessage, ...] = (
     wire.Frames(b"n" * 16, 3, 3, [(1, 2)], TRAFFIC, wire.Lateness([1] * wire.LATENESS_BINS), True),
     wire.Final(b"n" * 16, TRAFFIC),
     wire.StackDump(b"n" * 16, "File …", 5),
+)
+HOST_TX: tuple[messages.FromHost, ...] = (
+    messages.HostHello("a", b"n" * 16, 1, "there", "digest", True, None),
+    messages.News(
+        b"n" * 16,
+        [
+            messages.FromNode("v01", wire.encode(TX[2])),
+            messages.Token("v01", True),
+            messages.Ended("v01", 1, -9, "a line"),
+            messages.LogTail("v01", "a line"),
+            messages.Part("file", "v01", "a/b", b"data"),
+            messages.LeftOut("file", "v01", 1, ["a: a link"]),
+            messages.Figures({"v01": 5}, [("v01", [0.0, 0.5], [1, 2])]),
+            messages.HandedIn(),
+        ],
+    ),
 )
 RX: tuple[wire.EmulatorMessage, ...] = (
     wire.Welcome(

@@ -20,6 +20,7 @@ from agents.cooperative import frame as cooperative_frame
 from agents.cooperative import information_frame
 from emulator.drivers.control import answer
 from emulator.drivers.emulation import Emulation
+from emulator.drivers.hosts import messages
 from emulator.drivers.status import Course
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.faults import parse_fault
@@ -39,6 +40,7 @@ from tests.fuzz.seeds import (
     FCD,
     FILES,
     GEOJSON,
+    HOST_TX,
     JSON_WORDS,
     MSGPACK_WORDS,
     NET,
@@ -95,6 +97,11 @@ class Target:
 
 def _read_tx(data: bytes) -> None:
     _comes_back(wire.decode_tx(data), wire.decode_tx)
+
+
+def _read_host_tx(data: bytes) -> None:
+    message = messages.decode_from_host(data)
+    assert messages.decode_from_host(messages.encode(message)) == message
 
 
 def _read_rx(data: bytes) -> None:
@@ -276,5 +283,6 @@ TARGETS = (  # the slowest first
     ),
     Target("report", _read_report, WireError, (wire.encode(TRAFFIC.reports[0]),), MSGPACK_WORDS),
     Target("tx", _read_tx, WireError, tuple(map(wire.encode, TX)), MSGPACK_WORDS),
+    Target("host tx", _read_host_tx, WireError, tuple(map(messages.encode, HOST_TX)), MSGPACK_WORDS),
     Target("rx", _read_rx, WireError, tuple(map(wire.encode, RX)), MSGPACK_WORDS),
 )

@@ -4,6 +4,7 @@ Where root may make them, hosts are network namespaces, which share nothing but 
 """
 
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,10 +12,14 @@ from typing import Any
 
 import pytest
 import tomli_w
+import zenoh
 
 from tests.support.namespaces import NetworkHost, network, why_impossible
 from tests.support.paths import ROOT
 from tests.system.conftest import PATIENT, TIMEOUT_S, VNET, Finished, Vnet
+from vnet.transport import keys
+from vnet.transport.access import Access, host_user
+from vnet.transport.session import open_client, open_router, router_endpoint
 
 SCENARIO: dict[str, Any] = {
     "run": {"name": "hosts", "duration_s": 4.0, "settle_s": 0.5},
@@ -121,3 +126,37 @@ def test_a_host_that_is_cut_off_ends_the_run_as_unknown(three_hosts: list[Networ
     assert stalled == {"v05": 10**9, "v06": 10**9}
     assert [event["host"] for event in done.events_of("host_silent")] == ["c"]
     assert (done.folder / "logs" / "v01.log").exists(), "the other hosts have handed in what they have"
+
+
+def test_a_host_gets_and_says_nothing_but_its_own() -> None:
+    access = Access.create("r", [["v01"], ["v02"]], hosts=["a", "b"])
+    heard: list[str] = []
+    stolen: list[str] = []
+    over = threading.Event()
+
+    def hear(sample: zenoh.Sample) -> None:
+        heard.append(str(sample.key_expr))
+        if sample.payload.to_bytes() == b"last":
+            over.set()
+
+    with open_router("tcp/127.0.0.1:0", access, 10_000) as router, ExitStack() as stack:
+        stack.enter_context(router.declare_subscriber("vnet/r/**", hear))
+        stack.enter_context(router.liveliness().declare_subscriber("vnet/r/**", hear))
+        thief, client = (
+            stack.enter_context(open_client(router_endpoint(router), access.credentials(host_user("a")), 10_000))
+            for _ in range(2)
+        )
+        for wanted in ("vnet/r/**", keys.host_rx("r", "b"), keys.host_tx("r", "b"), keys.node_rx("r", "v01")):
+            stack.enter_context(
+                thief.declare_subscriber(wanted, lambda sample: stolen.append(str(sample.key_expr)))
+            )
+        for key in (keys.host_rx("r", "b"), keys.node_rx("r", "v01"), keys.observe("r", "period")):
+            router.put(key, b"secret")
+        for key in (keys.host_tx("r", "b"), keys.node_tx("r", "v01"), keys.host_rx("r", "b"), "vnet/r/control/x"):
+            client.put(key, b"false")
+        client.liveliness().declare_token(keys.host_alive("r", "b"))
+        client.put(keys.host_tx("r", "a"), b"last")
+        assert over.wait(TIMEOUT_S)
+    secrets = [keys.host_rx("r", "b"), keys.node_rx("r", "v01"), keys.observe("r", "period")]
+    assert [key for key in heard if key not in secrets] == [keys.host_tx("r", "a")]
+    assert stolen == []

@@ -206,6 +206,30 @@ def test_in_lockstep_a_process_that_stays_at_its_instant_has_stalled(monkeypatch
     in_virtual_time(run(), monkeypatch)
 
 
+def test_in_lockstep_only_those_have_stalled_whose_yields_their_host_does_not_keep(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        kept: dict[str, bytes] = {}
+
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if isinstance(message, wire.Grant) and message.time_ns == 200 * MS and node in ("v02", "v03"):
+                kept[node] = wire.encode(yields(node, message))  # type: ignore[arg-type]
+                return None
+            if isinstance(message, wire.StackRequest):
+                if node == "v03":
+                    play.inbox.put_message(node, kept[node])
+                return wire.StackDump(b"1", "here", 200 * MS)
+            return yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        assert play.stage.events("stalled") == [("stalled", "v02")]
+
+    in_virtual_time(run(), monkeypatch)
+
+
 def test_a_restart_of_the_emulator_is_announced_and_ends_when_all_have_answered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
