@@ -1,12 +1,10 @@
 """Recording of what programs report: curves, maps, texts, and views for nothing else."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rerun as rr
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
@@ -20,6 +18,8 @@ from tests.emulator.viewer.test_recorder import views
 from tests.support.recordings import Entity, read_back
 from vnet import Node
 
+pytestmark = pytest.mark.usefixtures("strict")
+
 
 async def program(node: Node) -> None:
     """Report the vehicle's number, sometimes more; positions are the raw fixes."""
@@ -30,14 +30,6 @@ async def program(node: Node) -> None:
         if fix.time_ns >= 3e8:
             values["warned"] = number > 2
         node.report(fix.position_m, fix.covariance_m2, **values)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def strict() -> Iterator[None]:
-    """Turn Rerun's warnings into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """A recording, read back: what is in it is what was told, in the units that its names say, and it is closed."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +36,10 @@ from tests.support.recordings import Entity, read_back, rrd
 from vnet.errors import VnetError
 from vnet.transport import wire
 
+pytestmark = pytest.mark.usefixtures("strict")
+
 Told = list[tuple[str, dict[str, Any]]]
 LATE_S = 1.5
-
-
-@pytest.fixture(scope="module", autouse=True)
-def strict() -> Iterator[None]:
-    """Turn Rerun's warnings into errors."""
-    rr.set_strict_mode(True)
-    yield
-    rr.set_strict_mode(False)
 
 
 @pytest.fixture(scope="module")
