@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pyarrow as pa
@@ -248,8 +248,7 @@ def page() -> str:
 
 def world_rows() -> list[list[str]]:
     """A row for each array of world.npz. Raises LookupError where the texts do not fit them."""
-    if wrong := ARRAYS.keys() ^ WORLD.keys():
-        raise LookupError(f"arrays without a text, or texts without an array: {', '.join(sorted(wrong))}")
+    _check_texts("array", ARRAYS, WORLD)
     return [
         [f"`{name}`", KINDS[kind], f"({shape})", unit_of(name), WORLD[name]]
         for name, (kind, shape) in ARRAYS.items()
@@ -258,12 +257,16 @@ def world_rows() -> list[list[str]]:
 
 def columns(schema: pa.Schema, said: Mapping[str, str]) -> str:
     """The columns of a table with their types and units. Raises LookupError where the texts do not fit them."""
-    if wrong := set(schema.names) ^ said.keys():
-        raise LookupError(f"columns without a text, or texts without a column: {', '.join(sorted(wrong))}")
+    _check_texts("column", schema.names, said)
     rows = (
         [f"`{field.name}`", f"`{_type(field.type)}`", unit_of(field.name), said[field.name]] for field in schema
     )
     return table(["column", "type", "unit", "what"], rows)
+
+
+def _check_texts(what: str, names: Iterable[str], texts: Mapping[str, str]) -> None:
+    if wrong := set(names) ^ texts.keys():
+        raise LookupError(f"{what}s without a text, or texts without {what}: {', '.join(sorted(wrong))}")
 
 
 def _type(kind: pa.DataType) -> str:
