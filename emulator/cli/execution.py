@@ -185,7 +185,23 @@ def _finish(
     """Judge a run and print its summary; exits with the verdict's status. A second Ctrl-C ends that, too."""
     say = partial(_say, asked, "the run is being judged and written; Ctrl-C again ends without")
     with first_interrupt_told(say):
-        status = _conclude(emulation, progress, wall_s, interrupted, command, asked, output)
+        progress.judging()
+        judgement, verdict = conclude(emulation, wall_s, command)
+        progress.close()
+        if asked.check_determinism and not interrupted:
+            again = ["--quiet"] if asked.only_the_result else []
+            verdict = run_again(emulation, judgement, verdict, command, again)
+        status = 130 if interrupted else judgement.exit_status
+        folder = emulation.folder.path
+        progress.ended(verdict, str(folder), status)
+        if asked.log_format is LogFormat.JSON:
+            output.print(json.dumps(verdict))
+        elif asked.quiet:
+            output.print(f"verdict: {judgement.verdict}  {folder}")
+        else:
+            print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
+        if asked.report:
+            report_at_end(folder)
     raise typer.Exit(status)
 
 
@@ -193,32 +209,3 @@ def _say(asked: OutputOptions, line: str) -> None:
     """Print a line on stderr for who has pressed Ctrl-C, with `--quiet` too: nothing else shows that it came."""
     if asked.log_format is not LogFormat.JSON:
         say_first(f"vnet: {line}")
-
-
-def _conclude(
-    emulation: Emulation,
-    progress: Progress,
-    wall_s: float,
-    interrupted: bool,
-    command: str,
-    asked: OutputOptions,
-    output: StandardOutput,
-) -> int:
-    progress.judging()
-    judgement, verdict = conclude(emulation, wall_s, command)
-    progress.close()
-    if asked.check_determinism and not interrupted:
-        again = ["--quiet"] if asked.only_the_result else []
-        verdict = run_again(emulation, judgement, verdict, command, again)
-    status = 130 if interrupted else judgement.exit_status
-    folder = emulation.folder.path
-    progress.ended(verdict, str(folder), status)
-    if asked.log_format is LogFormat.JSON:
-        output.print(json.dumps(verdict))
-    elif asked.quiet:
-        output.print(f"verdict: {judgement.verdict}  {folder}")
-    else:
-        print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
-    if asked.report:
-        report_at_end(folder)
-    return status
