@@ -13,41 +13,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vnet.cmm.consensus import (
-        AveragingConsensus,
-        Consensus,
-        ConsensusConfig,
-        DirectMean,
-        RatioConsensus,
-        Share,
-    )
-    from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
-    from vnet.cmm.weights import (
-        OptimizedWeights,
-        constant_weights,
-        max_degree_weights,
-        metropolis_weights,
-        no_fusion_weights,
-        random_weights,
-    )
-
-__all__ = [
-    "AveragingConsensus",
-    "Consensus",
-    "ConsensusConfig",
-    "DirectMean",
-    "Observation",
-    "OptimizedWeights",
-    "RatioConsensus",
-    "Rbpf",
-    "RbpfConfig",
-    "Share",
-    "constant_weights",
-    "max_degree_weights",
-    "metropolis_weights",
-    "no_fusion_weights",
-    "random_weights",
-]
+    from vnet.cmm.consensus import AveragingConsensus as AveragingConsensus
+    from vnet.cmm.consensus import Consensus as Consensus
+    from vnet.cmm.consensus import ConsensusConfig as ConsensusConfig
+    from vnet.cmm.consensus import DirectMean as DirectMean
+    from vnet.cmm.consensus import RatioConsensus as RatioConsensus
+    from vnet.cmm.consensus import Share as Share
+    from vnet.cmm.rbpf import Observation as Observation
+    from vnet.cmm.rbpf import Rbpf as Rbpf
+    from vnet.cmm.rbpf import RbpfConfig as RbpfConfig
+    from vnet.cmm.weights import OptimizedWeights as OptimizedWeights
+    from vnet.cmm.weights import constant_weights as constant_weights
+    from vnet.cmm.weights import max_degree_weights as max_degree_weights
+    from vnet.cmm.weights import metropolis_weights as metropolis_weights
+    from vnet.cmm.weights import no_fusion_weights as no_fusion_weights
+    from vnet.cmm.weights import random_weights as random_weights
 
 _MODULES = {
     "vnet.cmm.consensus": (
@@ -69,6 +49,7 @@ _MODULES = {
     ),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:
