@@ -59,6 +59,7 @@ def test_a_vehicle_without_links_is_not_warned(tmp_path: Path) -> None:
     assert [reports[node].values["warned"] for node in sorted(reports)] == [1, 1, 0]
 
 
+@pytest.mark.slow
 def test_the_first_of_a_hundred_vehicles_warns_by_default(tmp_path: Path) -> None:
     links = [[int(abs(a - b) == 1) for b in range(100)] for a in range(100)]
     reports = last_reports(tmp_path / "run", links, options={})

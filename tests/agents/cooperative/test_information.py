@@ -18,6 +18,8 @@ from vnet import Fix, Packet
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 100_000_000
 COMMON_M = np.array([2.0, -1.5])
 Change = Callable[[str, InformationFrame], InformationFrame | None]

@@ -92,6 +92,7 @@ emulator_messages = st.one_of(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(agent_messages)
 def test_what_agents_say_comes_back(message: wire.AgentMessage) -> None:
