@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from emulator.scenario.fault_families import LinkFault, Selector
 from emulator.scenario.faults import Partition
+from emulator.scenario.node_ids import node_id
 from vnet.errors import ScenarioError, first_names
 from vnet.types import Array, Mask
 
@@ -26,11 +27,17 @@ class Nodes:
     degree: NDArray[np.intp]
 
     def numbers(self, ids: Sequence[str]) -> list[int]:
-        """Return the numbers of nodes. Raises ScenarioError for an id that no node has."""
-        for node in ids:
-            if node not in self.ids:
-                raise ScenarioError(f"{node!r} is no vehicle of the network; they are {first_names(self.ids)}")
-        return [self.ids.index(node) for node in ids]
+        """Return the numbers of nodes, by their ids or those of a file of trips, `flow#1` for `flow-23-1`.
+
+        Raises ScenarioError for an id that no node has.
+        """
+        return [self._number(node) for node in ids]
+
+    def _number(self, node: str) -> int:
+        for known in (node, node_id(node)):
+            if known in self.ids:
+                return self.ids.index(known)
+        raise ScenarioError(f"{node!r} is no vehicle of the network; they are {first_names(self.ids)}")
 
 
 def select(selector: Selector, nodes: Nodes, rng: np.random.Generator) -> Mask:

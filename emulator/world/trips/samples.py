@@ -6,7 +6,6 @@ for a vehicle with two positions at one time. Repeated samples count once.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.scenario.node_ids import node_id
 from emulator.scenario.scenario import FAR_S
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import middle_deg, project
@@ -32,8 +32,6 @@ DEGREES = ("lat_deg", "lon_deg")
 """Columns of positions in degrees."""
 OPTIONAL = ("heading_rad", "speed_mps")
 """Columns that a file may lack."""
-_UNSAFE = re.compile(r"[^A-Za-z0-9_.]|^[_.]")
-"""Characters of an id that are escaped where one of them cannot be part of a key."""
 _BOUND = {
     "time_s": FAR_S,
     "x_m": MAX_COORDINATE_M,
@@ -43,19 +41,6 @@ _BOUND = {
     "heading_rad": 1e6,
     "speed_mps": 1e6,
 }
-
-
-def node_id(given: str) -> str:
-    """Return the id of a node for an id in a file: itself if keys can hold it, else with characters escaped.
-
-    Any character but letters, digits, `_` and `.` becomes its code in hexadecimal between hyphens, as `#` becomes
-    `-23-`; so does a hyphen, so that the given id can be read from the escaped one. An `x` goes before what does
-    not begin with a letter or a digit.
-    """
-    if is_segment(given) or not given.isprintable():
-        return given
-    escaped = _UNSAFE.sub(lambda found: f"-{ord(found[0]):x}-", given)
-    return f"x{escaped}" if escaped.startswith("-") else escaped
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from emulator.faults.selectors import Nodes, partitioned_links, select
 from emulator.scenario.fault_families import Selector
 from emulator.scenario.faults import Partition
 from emulator.scenario.scenario import Scenario
+from vnet.errors import ScenarioError
 
 seeds = st.integers(0, 2**63 - 1)
 counts = st.integers(1, 25)
@@ -41,6 +42,13 @@ def test_without_a_word_all_are_meant(count: int) -> None:
 def test_ids_are_exactly_those(count: int, data: st.DataObject) -> None:
     ids = data.draw(st.lists(st.integers(0, count - 1), max_size=count))
     assert chosen(some_nodes(count), ids=[f"v{n}" for n in ids]) == sorted(set(ids))
+
+
+def test_a_vehicle_is_known_by_the_id_in_its_file_too() -> None:
+    nodes = Nodes(["car", "flow-23-1", "x-23-2"], np.zeros((3, 2)), np.zeros(3, int))
+    assert nodes.numbers(["flow#1", "#2", "flow-23-1", "car"]) == [1, 2, 1, 0]
+    with pytest.raises(ScenarioError, match="'flow#2' is no vehicle"):
+        nodes.numbers(["flow#2"])
 
 
 @given(counts, seeds, st.floats(0, 1, exclude_min=True))
