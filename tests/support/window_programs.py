@@ -27,7 +27,7 @@ class Diary:
 async def improvises(node: Node) -> None:
     """Answer packets, sleep for fractions of a millisecond, compute on threads, raise, and end at any time."""
     diary = Diary(node)
-    manner = node.options.get("manner", "all")
+    filling = bytes(node.options.get("filling_bytes", 0))
 
     async def answers() -> None:
         while True:
@@ -35,7 +35,7 @@ async def improvises(node: Node) -> None:
             said = diary.note("packet", packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
             draw = node.rng.random()
             if draw < 0.2:
-                await node.radio.broadcast(said)
+                await node.radio.broadcast(said + filling)
             elif draw < 0.3:
                 node.event("answered", digest=diary.number)
             elif draw < 0.35:
@@ -68,7 +68,7 @@ async def improvises(node: Node) -> None:
         async for fix in node.gnss:
             said = diary.note("fix", fix.time_ns, fix.position_m.tolist())
             for _ in range(int(node.rng.integers(1, 4))):
-                await node.radio.broadcast(said)
+                await node.radio.broadcast(said + filling)
             if node.rng.random() < 0.2:
                 digest = await asyncio.get_running_loop().run_in_executor(None, hashlib.sha256, said)
                 await node.radio.broadcast(digest.digest()[:8])
@@ -83,7 +83,7 @@ async def improvises(node: Node) -> None:
     asyncio.get_running_loop().call_later(0.01, strike, 1)
     hear = {"awaits": answers, "polls": looks_seldom, "limits": listens_with_a_limit}
     names = list(hear)
-    chosen = names[int(node.id.strip("v")) % 3] if manner == "all" else manner
+    chosen = names[int(node.id.strip("v")) % 3]
     life_s = float(node.rng.uniform(0.2, 3.0))
     async with asyncio.timeout(life_s if node.rng.random() < 0.3 else None):  # one in three crashes by TimeoutError
         tasks = [asyncio.create_task(hear[chosen]()), asyncio.create_task(locates())]

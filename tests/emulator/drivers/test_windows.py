@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -112,6 +113,20 @@ def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -
     reference = fingerprint(simulated(scenario, False))
     assert same(fingerprint(simulated(scenario, True)), reference)
     assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+
+
+def test_a_medium_under_heavy_load_is_the_same_with_and_without_windows() -> None:
+    """Frames wait for the medium longer than a window, collide and are dropped."""
+    radio = {**MEDIUM, "bitrate_mbps": 3.0, "latency_ms": 0.3, "access_jitter_ms": 20.0}
+    run = {"duration_s": 0.6, "settle_s": 0.0}
+    world = {"gnss": {"rate_hz": 20}}
+    scenario = scenario_of([], IMPROVISES, 14, run=run, radio=radio, network={"layout": "dense"}, world=world)
+    program = scenario.program.model_copy(update={"options": {"filling_bytes": 1300}})
+    scenario = scenario.model_copy(update={"program": program})
+    reference = simulated(scenario, False)
+    loads = np.array(reference.engine.busy_ratios(reference.duration_ns))
+    assert loads.mean() > 0.6
+    assert same(fingerprint(simulated(scenario, True)), fingerprint(reference))
 
 
 @settings(max_examples=4, deadline=None)
