@@ -92,7 +92,17 @@ async def improvises(node: Node) -> None:
         await tasks[1]
 
 
-async def notes_its_mail(node: Node) -> None:
+async def looks_as_it_begins(node: Node) -> None:
+    """Tell of the packets that are there at the start; v01 sends one at 0.4955 s, v03 has a timer at 0.498 s."""
+    node.log(f"{len(node.radio.drain())} packets")
+    if node.id == "v01":
+        await asyncio.sleep(0.4955)
+        await node.radio.broadcast(bytes(1000))
+    await asyncio.sleep(0.498 if node.id == "v03" else 10)
+    await asyncio.sleep(10)
+
+
+async def tells_of_its_mail(node: Node) -> None:
     """Await nothing but fixes; when it is ended, tell of the packets that it has by then."""
     try:
         async for fix in node.gnss:

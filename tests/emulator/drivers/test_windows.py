@@ -1,7 +1,7 @@
 """Windows change nothing but the number of exchanges: traces, metrics, states and events are the same without."""
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -146,6 +146,34 @@ def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
     reference = fingerprint(simulated(scenario, False))
     assert same(fingerprint(simulated(scenario, True)), reference)
     assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
+
+
+# Packets that the process has, but whose receiver has not run since they arrived.
+
+STILL_AIR = {"loss": 0.0, "jitter_ms": 0.0, "access_jitter_ms": 0.0}
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart])
+def test_a_program_that_is_started_again_has_no_packets_of_the_one_before(
+    run: Callable[[Scenario], Emulation],
+) -> None:
+    """v02 is killed after the window in which a packet has come that it has not looked at."""
+    kill = {"kind": "kill", "at_s": 0.499, "duration_s": 0.002, "nodes": {"ids": ["v02"]}}
+    program = "tests.support.window_programs:looks_as_it_begins"
+    emulation = run(scenario_of([kill], program, radio=STILL_AIR))
+    logs = [(e.node, e.details["text"]) for e in emulation.folder.events if e.kind == "log"]
+    assert sorted(logs) == sorted((node, "0 packets") for node in ["v01", "v02", "v02", "v03", "v04"])
+    (row,) = [row for row in emulation.engine.trace.to_table().to_pylist() if row["receiver"] == "v02"]
+    assert row["outcome"] == "delivered"
+
+
+@pytest.mark.parametrize("run", [run_together, run_apart])
+def test_a_program_that_is_ended_has_the_packets_of_its_own_last_instant(
+    run: Callable[[Scenario], Emulation],
+) -> None:
+    restart = {"kind": "restart", "at_s": 1.001, "duration_s": 0.4, "nodes": {"ids": ["v02"]}}
+    scenario = scenario_of([restart], "tests.support.window_programs:tells_of_its_mail", radio=STILL_AIR)
+    assert same(fingerprint(run(scenario)), fingerprint(run(with_windows(scenario, False))))
 
 
 # Stepped, with faults that are injected while the run is held.
