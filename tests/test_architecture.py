@@ -231,9 +231,10 @@ def test_an_agent_imports_nothing_heavy(modules: str) -> None:
     ("module", "slow_to_import"),
     [
         ("emulator.cli.runs", ["pyarrow", "zenoh", "scipy", "matplotlib", "jinja2", "rerun", "asyncio"]),
+        ("emulator.drivers.hosts.host", ["pydantic", "scipy", "pyarrow", "matplotlib", "jinja2", "rerun"]),
         ("emulator.cli.execution", ["scipy", "matplotlib", "jinja2", "rerun"]),
     ],
-    ids=["until a run is announced", "until it is judged"],
+    ids=["until a run is announced", "until a host has started its agents", "until it is judged"],
 )
 def test_a_run_on_the_disc_radio_imports_little(module: str, slow_to_import: list[str]) -> None:
     """scipy, for one, serves maps, fading and tests of significance."""

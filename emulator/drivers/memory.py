@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from emulator.records.run_folder import RunFolder
+if TYPE_CHECKING:  # slow to import, and hosts write no events
+    from emulator.records.run_folder import RunFolder
 
 SAMPLES = 40
 """A run, so many times; a process that is started again begins a new series."""

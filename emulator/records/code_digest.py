@@ -17,9 +17,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from importlib.machinery import SOURCE_SUFFIXES, FileFinder, ModuleSpec, PathFinder, SourceFileLoader
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from emulator.scenario.scenario import Scenario
+if TYPE_CHECKING:  # slow to import, and hosts need no scenario
+    from emulator.scenario.scenario import Scenario
 
 OWN = ("vnet", "emulator")
 """The packages that are vnet itself."""

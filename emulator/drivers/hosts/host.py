@@ -24,14 +24,12 @@ from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.down import Down
 from emulator.drivers.hosts.messages import HostHello, HostWelcome, Item, Order
 from emulator.drivers.hosts.relay import Relay
-from emulator.drivers.hosts.retrieval import hand_in
 from emulator.drivers.hosts.up import Up
 from emulator.drivers.launch import Launcher
 from emulator.drivers.memory import MemoryWatch
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.zygote import Zygote
 from emulator.records.code_digest import vnet_digest
-from emulator.records.run_folder import RunFolder
 from vnet.errors import TransportError, VnetError, WireError
 from vnet.transport.access import Access
 from vnet.transport.credentials import Credentials
@@ -79,11 +77,11 @@ def run_host(
         join = _Join(up, name, events, join_timeout_s)
         welcome = join.until_welcome()
         on_state(f"host {name}: {len(welcome.processes)} agent processes of run {run}")
-        folder = RunFolder(Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-"))))
-        folder.logs.mkdir()
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
+        (folder / "logs").mkdir()
         zygote = Zygote(welcome.modules) if welcome.start == "fork" and sys.platform == "linux" else None
-        launcher = Launcher(folder.logs, folders, zygote)
-        launcher.disks = folder.disks
+        launcher = Launcher(folder / "logs", folders, zygote)
+        launcher.disks = folder / "disks"
         stack.callback(launcher.stop, SHUT_DOWN_S)
         down = Down(
             Access.create(run, welcome.processes),
@@ -93,8 +91,8 @@ def run_host(
         )
         stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
         try:
-            down.open(stack)
             launcher.prepare()
+            down.open(stack)
             while not launcher.is_prepared():
                 time.sleep(READY_POLL_S)
         except VnetError as error:
@@ -164,7 +162,7 @@ class HostProcess:
         up: Up,
         down: Down,
         launcher: Launcher,
-        folder: RunFolder,
+        folder: Path,
         events: queue.SimpleQueue[Event],
     ) -> None:
         self._name = name
@@ -304,6 +302,8 @@ class HostProcess:
             self._up.put([item])
 
     def _left_behind(self) -> Iterator[Item]:
+        from emulator.drivers.hosts.retrieval import hand_in  # slow to import: agents should be started first
+
         yield from hand_in(self._folder, list(self._nodes_of.values()), self._welcome.files_max_mb)
         yield messages.Figures(dict(self._cpu.cpu_ns), list(self._memory.series()))
         yield messages.HandedIn()

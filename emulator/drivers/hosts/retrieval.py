@@ -21,8 +21,12 @@ MOST_LOG_BYTES = 16 * 2**20
 """Bytes of the end of a process's log that are handed in."""
 
 
-def hand_in(folder: RunFolder, processes: Sequence[Sequence[str]], files_max_mb: float) -> Iterator[Item]:
-    """Yield the logs of processes and the files of their nodes in `folder`, whose disks are gone afterwards."""
+def hand_in(path: Path, processes: Sequence[Sequence[str]], files_max_mb: float) -> Iterator[Item]:
+    """Yield the logs of processes and the files of their nodes, which are in the host's folder at `path`.
+
+    The folder is laid out as that of a run; its disks are gone afterwards.
+    """
+    folder = RunFolder(path)
     for nodes in processes:
         yield from _log(folder, nodes[0])
     nodes_here = [node for nodes in processes for node in nodes]

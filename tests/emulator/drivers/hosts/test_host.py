@@ -81,7 +81,7 @@ class Play:
         self.folder.logs.mkdir()
         self.steps: list[Event | Callable[[], None]] = []
         welcome = messages.HostWelcome(b"1", PROCESSES, "fork", [], False, 0.0, 1000, 1.0)
-        parts: list[Any] = [self.sides, self.sides, self.launcher, self.folder, self]
+        parts: list[Any] = [self.sides, self.sides, self.launcher, folder, self]
         self.host = HostProcess("a", welcome, *parts)
 
     def get(self, timeout: float | None) -> Event:

@@ -41,7 +41,7 @@ def test_logs_and_files_come_as_they_were(
 ) -> None:
     monkeypatch.setattr(retrieval, "PART_BYTES", 1000)
     writer = Retrieval(here, PROCESSES, ONE_MB)
-    for item in hand_in(there, PROCESSES, ONE_MB):
+    for item in hand_in(there.path, PROCESSES, ONE_MB):
         if isinstance(item, Part):
             assert len(item.data) <= 1000
             writer.take(item)
@@ -60,7 +60,7 @@ def test_logs_and_files_come_as_they_were(
 
 def test_of_a_long_log_the_end_comes(there: RunFolder, here: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(retrieval, "MOST_LOG_BYTES", 8)
-    items = [item for item in hand_in(there, PROCESSES[:1], 0.0) if item.owner == "v01"]  # type: ignore[union-attr]
+    items = [item for item in hand_in(there.path, PROCESSES[:1], 0.0) if item.owner == "v01"]  # type: ignore[union-attr]
     assert items == [LeftOut("log", "v01", 7), Part("log", "v01", "", b"another\n")]
     Retrieval(here, PROCESSES, 0.0).tell_left_out(7, items[0])  # type: ignore[arg-type]
     assert [(event.kind, event.details) for event in here.events] == [("log_left_out", {"bytes": 7})]
