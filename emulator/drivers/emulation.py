@@ -19,7 +19,7 @@ from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
-from emulator.radio.engine import Delivery, Engine
+from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.payloads import PayloadRecorder
@@ -95,7 +95,7 @@ class Emulation:
         self._period = 0
         self._finished = False
         self._reports: list[Report] = []
-        self._arrived: list[Delivery] = []
+        self._arrived: list[Deliveries] = []
         self.costs = Costs()
         self.log_book = LogBook(folder, self.number)
 
@@ -308,9 +308,9 @@ class Emulation:
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
-        deliveries = [*self._arrived, *self.engine.advance(time_ns)]
+        arrived = [*self._arrived, self.engine.advance(time_ns)]
         self._arrived = []
-        return deliveries
+        return [delivery for deliveries in arrived for delivery in deliveries]
 
     def pass_to(self, time_ns: int) -> None:
         """As `advance`, where everything that arrives by then has been foreseen and handed out."""
@@ -337,7 +337,7 @@ class Emulation:
         """
         while (end_ns := (self._period + 1) * self.world.period_ns) <= time_ns:
             self.engine.look_ahead(end_ns, ())
-            self._arrived += self.engine.advance(end_ns - 1)
+            self._arrived.append(self.engine.advance(end_ns - 1))
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
             component = self._component(self._period) if self.world.moves else None

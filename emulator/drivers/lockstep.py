@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
+from emulator.drivers.protocol import ProtocolError, check_ownership
 from emulator.radio.stages import least_latency_ns
 from vnet.node import INBOX_LIMIT
 from vnet.transport import wire
@@ -261,10 +261,10 @@ class Lockstep:
             if process := self._processes.get(self._process_of[node]):
                 del process.packets[node][:-INBOX_LIMIT]
         self._crowded.clear()
-        for delivery in self._emulation.engine.foresee(time_ns):
-            node = node_ids[delivery.receiver]
+        for receiver, sender, sent_ns, arrival_ns, payload in self._emulation.engine.foresee(time_ns).entries():
+            node = node_ids[receiver]
             packets = self._processes[self._process_of[node]].packets[node]
-            packets.append(wire_packet(node, delivery.packet))
+            packets.append(wire.WirePacket(node, sender, sent_ns, arrival_ns, payload))
             if len(packets) > INBOX_LIMIT:
                 self._crowded.add(node)
 

@@ -66,13 +66,27 @@ class Deliveries(Sequence[Delivery]):
             self._built = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
         return self._built
 
+    def entries(self) -> Iterator[tuple[int, str, int, int, bytes]]:
+        """Yield receiver, sender's name, times of sending and arrival in ns, and payload of each, as it stands.
+
+        No object is kept of them, which is what takes time where there are many.
+        """
+        frames = self._frames
+        for arrival_ns, receiver, _, number in self._table[:, self._order()].T.tolist():
+            frame = frames[number]
+            payload = frame.altered.get(receiver, frame.payload) if frame.altered else frame.payload
+            yield receiver, frame.name, frame.sent_ns, arrival_ns, payload
+
     def _order(self) -> NDArray[np.intp]:
-        arrival, receiver, row, _ = self._table
-        order = np.argsort(arrival, kind="stable")
-        if (np.diff(arrival[order]) > 0).all():
-            return order
-        rows = self._trace.rows(row)
-        return np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))
+        order = np.argsort(self._table[_ARRIVAL], kind="stable")
+        is_same = np.diff(self._table[_ARRIVAL, order]) == 0
+        tied = np.append(is_same, False) | np.append(False, is_same)
+        if tied[: len(order)].any():
+            some = order[tied]
+            arrival, receiver, row, _ = self._table[:, some]
+            rows = self._trace.rows(row)
+            order[tied] = some[np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))]
+        return order
 
     def _delivery(self, arrival_ns: int, receiver: int, row: int, number: int) -> Delivery:
         frame = self._frames[number]

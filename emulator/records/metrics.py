@@ -142,17 +142,17 @@ class Metrics:
         )
 
     def _store(self, instant: Instant, last: dict[str, Report]) -> None:
-        states = self._states
+        states, count = self._states, len(self._node_ids)
+        states["period"] += [instant.period] * count
+        states["time_ns"] += [instant.time_ns] * count
+        states["node"] += self._node_ids
+        states["position_m"] += instant.position_m.tolist()
+        states["heading_rad"] += instant.heading_rad.tolist()
+        states["fix_m"] += instant.fix_m.tolist()
+        states["common_error_m"] += [instant.common_error_m.tolist()] * count
         for number, node in enumerate(self._node_ids):
             report = last.get(node)
             values = {} if report is None else dict(report.values)
-            states["period"].append(instant.period)
-            states["time_ns"].append(instant.time_ns)
-            states["node"].append(node)
-            states["position_m"].append(instant.position_m[number].tolist())
-            states["heading_rad"].append(float(instant.heading_rad[number]))
-            states["fix_m"].append(instant.fix_m[number].tolist())
-            states["common_error_m"].append(instant.common_error_m.tolist())
             states["estimate_m"].append(None if report is None else report.estimate_m)
             states["covariance_m2"].append(None if report is None else report.covariance_m2)
             for name, column in COMMON_VALUES.items():

@@ -82,6 +82,8 @@ class World:
         _check_exceptions(scenario, motion.node_ids)
         _check_processes(scenario, bool(present.all()))
         self._gnss = scenario.world.gnss
+        self._covariance_m2 = np.eye(2) * self._gnss.sigma_m**2
+        self._covariance_m2.flags.writeable = False  # one for all fixes
         self._common_m = self._draw_common(scenario)
         self._noise_m, self._heading_noise = self._draw_noise(self._gnss, seed, count)
 
@@ -146,7 +148,7 @@ class World:
         if self._gnss.heading and not np.isnan(self._heading_rad[period, node]):
             noisy = self._heading_rad[period, node] + self._heading_noise[period, node]
             heading = float(np.mod(noisy, 2 * np.pi))
-        return Fix(period * self.period_ns, fix_m, np.eye(2) * self._gnss.sigma_m**2, heading)
+        return Fix(period * self.period_ns, fix_m, self._covariance_m2, heading)
 
 
 def periods_of(scenario: Scenario) -> int:
