@@ -325,8 +325,9 @@ CHECKS: list[Check] = [
     Check(
         check_no_exceptions,
         RUN,
-        "Programs handled every exception that was raised in their tasks, callbacks, `finally` blocks and executor "
-        "jobs. One that is awaited, however late, is handled; one that leaves `main` counts in `agents_alive`.",
+        "Programs handled every exception that was raised in their tasks, callbacks, `finally` blocks, executor "
+        "jobs, threads and `__del__`. One that is awaited, however late, is handled; one that leaves `main` counts "
+        "in `agents_alive`.",
         invalid="an event `exception`",
         unknown="no event says that the run started",
         without_positions=WithoutPositions.JUDGE,

@@ -56,7 +56,7 @@ def check_agents_alive(recorded: RecordedRun) -> Finding:
 
 
 def check_no_exceptions(recorded: RecordedRun) -> Finding:
-    """Check that programs handled every exception that was raised in their tasks, callbacks and jobs."""
+    """Check that programs handled every exception that was raised in their tasks, callbacks, jobs and threads."""
     name = "no_exceptions"
     raised = recorded.event("exception")
     if not raised and not recorded.event("started"):

@@ -1,4 +1,4 @@
-"""Exceptions of programs that nobody handles: in tasks nobody awaits, callbacks, executor jobs that were dropped.
+"""Exceptions of programs that nobody handles: in tasks nobody awaits, callbacks, dropped executor jobs, threads.
 
 An exception that somebody retrieves, however late, is none. asyncio tells of the others when it discards the task
 or future; so the instant is remembered when it fails. What reference counting discards is told at once, which is
@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-import gc
 import sysconfig
+import threading
 import traceback
 import weakref
 from collections.abc import Callable
@@ -21,8 +21,9 @@ from types import TracebackType
 from typing import Any
 
 from vnet.node import Node
-from vnet.runtime import asyncio_internals
+from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.current_node import current_node
+from vnet.runtime.outside_loop import collector
 from vnet.runtime.programs import error_line
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
@@ -41,18 +42,6 @@ _NOT_THE_PROGRAM = (
 _NO_CONTEXT = contextvars.Context()
 _SHIELDED = "exception in shielded future"
 """End of asyncio's message, from Python 3.14 on, about a future whose caller was cancelled: that is legal."""
-
-
-class _Collector:
-    """Knows whether the garbage collector runs; registered once for the whole process."""
-
-    runs = False
-
-    def __call__(self, phase: str, info: dict[str, int]) -> None:
-        self.runs = phase == "start"
-
-
-_collector = _Collector()
 
 
 @dataclass(frozen=True)
@@ -85,6 +74,7 @@ class UnhandledExceptions:
         self._most = FIRST_CLEANING
         self._failures: dict[int, _Failure] = {}  # by the id of the future, which is gone when asyncio tells of it
         self._ready: list[Unhandled] = []
+        self._lock = threading.RLock()  # of `_ready`: threads of programs and `__del__` come at any time
         self._held: list[tuple[_Failure, BaseException]] = []  # nothing is formatted while the collector runs
         self._silenced: weakref.WeakSet[Node] = weakref.WeakSet()
 
@@ -93,17 +83,18 @@ class UnhandledExceptions:
         self._loop = loop
         loop.on_failed, loop.on_unhandled = self._failed, self._unhandled
         asyncio_internals.tell_of_failed_gatherings()
-        if _collector not in gc.callbacks:
-            gc.callbacks.append(_collector)
+        outside_loop.attach()
 
     def watch(self, task: asyncio.Task[Any], owner: Node | None) -> None:
-        """Remember when a task fails."""
+        """Remember when a task fails, and have all other exceptions of its node."""
 
         def done(task: asyncio.Future[Any]) -> None:
             if asyncio_internals.is_unretrieved(task):
                 self._note(task, owner, "in a task")
 
         task.add_done_callback(done, context=_NO_CONTEXT)
+        if owner is not None:
+            outside_loop.watch(owner, self._failed_outside)
 
     def add(self, owner: Node, error: BaseException, place: str) -> None:
         """Take an exception that has just been caught outside asyncio."""
@@ -111,7 +102,8 @@ class UnhandledExceptions:
 
     def take(self) -> list[Unhandled]:
         """Return the exceptions that are told by now, in the order of their instants."""
-        ready, self._ready = self._ready, []
+        with self._lock:
+            ready, self._ready = self._ready, []
         return sorted(ready, key=lambda each: (each.time_ns is None, each.time_ns))
 
     def settle(self, owner: Node | None = None) -> None:
@@ -138,6 +130,14 @@ class UnhandledExceptions:
         if self._loop is not None:
             self._loop.on_failed, self._loop.on_unhandled = _ignore, _only_log
             self._loop = None
+            outside_loop.detach()
+
+    def _failed_outside(self, owner: Node, error: BaseException, place: str) -> bool:
+        """Take what has left a thread or `__del__`; what comes after `close` is not taken."""
+        if self._loop is None:
+            return False
+        self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
+        return True
 
     # What asyncio tells.
 
@@ -153,7 +153,7 @@ class UnhandledExceptions:
         self._note(future, owner, place)
 
     def _note(self, future: asyncio.Future[Any], owner: Node | None, place: str) -> None:
-        if len(self._failures) >= self._most and not _collector.runs:
+        if len(self._failures) >= self._most and not collector.runs:
             self._forget_retrieved()
         self._failures[id(future)] = _Failure(weakref.ref(future), self._now_ns(owner), owner, place)
 
@@ -170,7 +170,7 @@ class UnhandledExceptions:
         if error is None or str(context.get("message")).endswith(_SHIELDED):
             return True
         failure = self._failure_of(context, error)
-        if not _collector.runs:
+        if not collector.runs:
             self._ready_unless_silenced(failure, error)
         elif len(self._held) < MOST_HELD and failure.owner not in self._silenced:
             self._held.append((failure, error))
@@ -194,7 +194,8 @@ class UnhandledExceptions:
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
         if failure.owner not in self._silenced and not isinstance(error, KeyboardInterrupt):
             unhandled = self._of(failure, error)
-            self._ready.append(unhandled)
+            with self._lock:
+                self._ready.append(unhandled)
             self._on_line(unhandled.node, f"{unhandled.node} exception {unhandled.place}\n{unhandled.details}")
 
     def _of(self, failure: _Failure, error: BaseException) -> Unhandled:

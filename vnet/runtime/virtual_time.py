@@ -96,7 +96,8 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         self, executor: Executor | None, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """Run a job as asyncio does; the future knows on whose behalf."""
-        outer = super().run_in_executor(executor, func, *args)
+        context = Context() if executor is None else copy_context()  # the default executor's threads are nobody's
+        outer = context.run(super().run_in_executor, executor, func, *args)
         if isinstance(outer, _TellingFuture):
             outer.job_context = copy_context()
         return outer
@@ -237,8 +238,10 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
         if executor is None:
-            executor = asyncio_internals.default_executor(self, "vnet")
-        job = executor.submit(func, *args)
+            executor, context = asyncio_internals.default_executor(self, "vnet"), Context()  # as above
+        else:
+            context = copy_context()
+        job = context.run(executor.submit, func, *args)
         outer = _TellingFuture(loop=self)
         outer.job_context = copy_context()
         self._jobs.append((job, outer))

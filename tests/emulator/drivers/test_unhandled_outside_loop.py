@@ -1,0 +1,197 @@
+"""Exceptions in threads that programs start and in `__del__` count like those that asyncio tells of."""
+
+import asyncio
+import gc
+import sys
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from emulator.drivers.emulation import Emulation
+from emulator.records.verdicts import Verdict
+from tests.emulator.drivers.test_unhandled import RUNS, exceptions, judged, sends
+from tests.support.multi_loop_driver import run_together, scenario_of
+from vnet.node import Node
+
+Program = Callable[[Node], Awaitable[None]]
+
+
+class FailsWhenDiscarded:
+    def __del__(self) -> None:
+        raise ValueError("boom")
+
+
+def run_thread(target: Callable[..., object], *args: object) -> None:
+    """Start a thread and wait for it, as no emulated time passes meanwhile."""
+    thread = threading.Thread(target=target, args=args)
+    thread.start()
+    thread.join()
+
+
+def entry(program: Program) -> str:
+    return f"{__name__}:{program.__name__}"
+
+
+# Programs that are told of.
+
+
+async def fails_in_a_thread(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    run_thread(int, "x")
+    await sends(node)
+
+
+async def fails_in_a_thread_of_a_thread(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    run_thread(run_thread, int, "x")
+    await sends(node)
+
+
+async def fails_in_a_thread_of_a_job(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    await asyncio.to_thread(run_thread, int, "x")
+    await sends(node)
+
+
+async def fails_when_discarded(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    FailsWhenDiscarded()
+    await sends(node)
+
+
+async def fails_when_discarded_in_a_thread(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    run_thread(FailsWhenDiscarded)
+    await sends(node)
+
+
+async def fails_when_discarded_at_the_end(node: Node) -> None:
+    kept = FailsWhenDiscarded()
+    try:
+        await sends(node)
+    finally:
+        del kept
+
+
+async def ignores_the_end_of_a_generator(node: Node) -> None:
+    def numbers() -> Any:
+        try:
+            yield 1
+        finally:
+            raise ValueError("boom")
+
+    await asyncio.sleep(0.5)
+    next(numbers())
+    await sends(node)
+
+
+TOLD: dict[Program, tuple[str, float]] = {
+    fails_in_a_thread: ("in a thread", 0.5),
+    fails_in_a_thread_of_a_thread: ("in a thread", 0.5),
+    fails_in_a_thread_of_a_job: ("in a thread", 0.5),
+    fails_when_discarded: ("in __del__", 0.5),
+    fails_when_discarded_in_a_thread: ("in __del__", 0.5),
+    fails_when_discarded_at_the_end: ("in __del__", 3.0),
+    ignores_the_end_of_a_generator: ("in numbers", 0.5),
+}
+
+
+@pytest.mark.parametrize("run", RUNS)
+@pytest.mark.parametrize("program", TOLD, ids=lambda program: program.__name__)
+def test_what_the_loop_never_sees_is_told_with_its_instant(program: Program, run: str) -> None:
+    drive, nodes_per_process = RUNS[run]
+    emulation: Emulation = drive(
+        scenario_of([], entry(program), vehicles=2, run={"nodes_per_process": nodes_per_process})
+    )
+    place, time_s = TOLD[program]
+    found = [
+        (event.node, event.time_ns / 1e9, event.details["place"].partition(" (")[0])
+        for event in exceptions(emulation)
+    ]
+    assert found == [("v01", time_s, place), ("v02", time_s, place)]
+    assert all("ValueError" in event.details["where"] for event in exceptions(emulation))
+    assert judged(emulation).verdict is Verdict.INVALID
+
+
+# Programs that are not.
+
+
+async def leaves_a_thread(node: Node) -> None:
+    run_thread(sys.exit, 3)
+    await sends(node)
+
+
+async def handles_it_by_a_hook(node: Node) -> None:
+    ours, threading.excepthook = threading.excepthook, lambda failed: None
+    run_thread(int, "x")
+    threading.excepthook = ours
+    await sends(node)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("program", [leaves_a_thread, handles_it_by_a_hook], ids=lambda program: program.__name__)
+def test_what_ends_a_thread_quietly_is_none(program: Program) -> None:
+    emulation = run_together(scenario_of([], entry(program), vehicles=2))
+    assert exceptions(emulation) == []
+    assert judged(emulation).verdict is Verdict.VALID
+
+
+async def fails_in_a_job_whose_threads_another_started(node: Node) -> None:
+    loop = asyncio.get_running_loop()
+    if node.id == "v01":
+        await loop.run_in_executor(None, int, "1")
+    await asyncio.sleep(0.5)
+    if node.id == "v02":
+        await loop.run_in_executor(None, FailsWhenDiscarded)
+    await sends(node)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_threads_of_the_default_executor_are_nobodys() -> None:
+    emulation = run_together(scenario_of([], entry(fails_in_a_job_whose_threads_another_started), vehicles=2))
+    assert exceptions(emulation) == []
+
+
+survivors: list[Callable[[], None]] = []
+"""Ends of threads of vehicles that have been killed."""
+
+
+async def outlives_its_vehicle(node: Node) -> None:
+    if node.id == "v01" and node.incarnation == 0:
+        killed = threading.Event()
+        thread = threading.Thread(target=lambda: int("x" * killed.wait()))
+        thread.start()
+        survivors.extend([killed.set, thread.join])
+    await asyncio.sleep(2.0)
+    while survivors:
+        survivors.pop(0)()
+    await sends(node)
+
+
+def test_a_thread_that_outlives_a_killed_vehicle_is_not_told_of() -> None:
+    kill = {"kind": "kill", "at_s": 1.0, "duration_s": 1.5, "nodes": {"ids": ["v01"]}}
+    emulation = run_together(scenario_of([kill], entry(outlives_its_vehicle), vehicles=2, run={"duration_s": 2.4}))
+    assert survivors == []
+    assert exceptions(emulation) == []
+
+
+def test_the_hooks_are_given_back() -> None:
+    before = (sys.unraisablehook, threading.excepthook)
+    run_together(scenario_of([], entry(fails_in_a_thread), vehicles=2))
+    assert (sys.unraisablehook, threading.excepthook) == before
+
+
+async def collects_what_fails(node: Node) -> None:
+    kept = FailsWhenDiscarded()
+    kept.itself = kept  # type: ignore[attr-defined]
+    del kept
+    gc.collect()
+    await sends(node)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_what_the_collector_finds_is_left_to_python() -> None:
+    emulation = run_together(scenario_of([], entry(collects_what_fails), vehicles=2))
+    assert exceptions(emulation) == []

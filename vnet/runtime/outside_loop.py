@@ -1,0 +1,107 @@
+"""Exceptions of programs that the event loop never sees: in threads that a program starts, and in `__del__`.
+
+Python hands them to `threading.excepthook` and `sys.unraisablehook`, which print them. While hosts run programs,
+these hooks first ask for the node on whose behalf the code runs, and give the exception to whoever watches that
+node. What belongs to no node is printed as before, and so is what the garbage collector finds: when it runs depends
+on the process, and nothing that a run says may.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+from vnet.node import Node
+from vnet.runtime.current_node import current_node
+
+Taker = Callable[[Node, BaseException, str], bool]
+"""Takes an exception of a node and the place where it was raised; returns False if it is not to be taken."""
+
+
+class _Collector:
+    """Knows whether the garbage collector runs; registered once for the whole process."""
+
+    runs = False
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        self.runs = phase == "start"
+
+
+collector = _Collector()
+_takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.WeakKeyDictionary()
+_started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
+_watchers = 0
+_before: tuple[Any, Any] = (sys.unraisablehook, threading.excepthook)
+_start_thread = threading.Thread.start
+
+
+def watch(node: Node, taker: Taker) -> None:
+    """Hand the exceptions of `node` to `taker`, a bound method, while both are there."""
+    if node not in _takers:
+        _takers[node] = weakref.WeakMethod(taker)
+
+
+def attach() -> None:
+    """Take the hooks of Python and of the collector; each call is followed by one of `detach`."""
+    global _watchers, _before
+    if collector not in gc.callbacks:
+        gc.callbacks.append(collector)
+    if threading.Thread.start is _start_thread:
+        threading.Thread.start = _start_noted  # type: ignore[assignment, method-assign]
+    if sys.unraisablehook is not _unraisable:
+        _before = (sys.unraisablehook, _before[1])
+        sys.unraisablehook = _unraisable
+    if threading.excepthook is not _thread_failed:
+        _before = (_before[0], threading.excepthook)
+        threading.excepthook = _thread_failed
+    _watchers += 1
+
+
+def detach() -> None:
+    """Give the hooks back when nobody watches any more, unless a program has put others in their place."""
+    global _watchers
+    _watchers -= 1
+    if _watchers == 0:
+        if sys.unraisablehook is _unraisable:
+            sys.unraisablehook = _before[0]
+        if threading.excepthook is _thread_failed:
+            threading.excepthook = _before[1]
+
+
+@wraps(_start_thread)
+def _start_noted(thread: threading.Thread) -> None:
+    owner = _owner()
+    if owner is not None:
+        _started_by[thread] = owner
+    _start_thread(thread)
+
+
+def _owner() -> Node | None:
+    """Return the node on whose behalf the present code runs: that of its context, or of its thread."""
+    return current_node.get() or _started_by.get(threading.current_thread())
+
+
+def _unraisable(ignored: sys.UnraisableHookArgs) -> None:
+    error = ignored.exc_value or ignored.exc_type()
+    name = getattr(ignored.object, "__name__", "")
+    if collector.runs or not _taken(_owner(), error, f"in {name}" if name else "where Python ignores it"):
+        _before[0](ignored)
+
+
+def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+    owner = None if failed.thread is None else _started_by.get(failed.thread)
+    if not _taken(owner, failed.exc_value or failed.exc_type(), "in a thread"):
+        _before[1](failed)
+
+
+def _taken(owner: Node | None, error: BaseException, place: str) -> bool:
+    reference = None if owner is None else _takers.get(owner)
+    taker = None if reference is None else reference()
+    if owner is None or taker is None or isinstance(error, KeyboardInterrupt | SystemExit):
+        return False
+    return taker(owner, error, place)
