@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+from benchmarks import hosts
 from benchmarks.__main__ import ROOT, event, vnet
 
 PAGE = ROOT / "docs" / "scale.md"
@@ -167,6 +168,17 @@ def ns3(runs: int, counts: Sequence[int] = (50, 100, 200), seconds: float = 10.0
     return " / ".join(f"{ratio:.1f}" for ratio in ratios)
 
 
+def three_hosts(runs: int) -> str:
+    """Return barriers an emulated second of 50 beacons on three hosts, and their speed by that on one host."""
+    return hosts.compare(runs, BEACON, "--duration", "20", *_vehicles(50))
+
+
+def three_hosts_awaiting(runs: int) -> str:
+    """Return the same for programs that await each packet of 13 peers, without a delivery tick."""
+    program = ["--program", "benchmarks.programs:always_awaits"]
+    return hosts.compare(runs, BEACON, *program, "--duration", "5", *_vehicles(50))
+
+
 def realtime(runs: int, count: int = 100) -> str:
     """Beacons of 300 bytes on the wall clock: transport gaps, median and worst p99 of the transport latency."""
     options = ["--program", "benchmarks.programs:steady_beacon", "--pacing", "realtime", "--duration", "30"]
@@ -196,6 +208,18 @@ ROWS: dict[str, Row] = {
     "density": Row("CPU a vehicle and period at 1000 : at 100 vehicles, simulated", "1.2", "1.05", density),
     "ns3": Row(
         "engine against ns-3 at 50 / 100 / 200 vehicles with fading, CPU", "12 / 18 / 25", "20 / 30 / 50", ns3
+    ),
+    "hosts": Row(
+        "three hosts, 1 ms between them, 50 beacons: barriers an emulated second; speed : one host",
+        "≤ 25; 0.6",
+        "0.8",
+        three_hosts,
+    ),
+    "hosts_awaiting": Row(
+        "the same, 50 × 13 peers, awaiting each packet: barriers; speed : one host",
+        "≤ 520; 0.5",
+        "0.8",
+        three_hosts_awaiting,
     ),
     "realtime": Row("real time, 100 beacons × 10 Hz, 30 s", "0 gaps, p99 ≤ 20 ms", "10 ms", realtime),
     "realtime_200": Row("real time, 200 beacons", "4 of 5 not unknown, p99 ≤ 50 ms", "", realtime_200),

@@ -99,7 +99,9 @@ def run_host(
             join.say(failure=str(error))
             raise
         join.say(ready=True)
-        HostProcess(name, welcome, up, down, launcher, folder, events).work()
+        process = HostProcess(name, welcome, up, down, launcher, folder, events)
+        process.work()
+        on_state(f"host {name}: {process.grants:,} grants in {process.barriers:,} bundles")
 
 
 class _Join:
@@ -182,6 +184,8 @@ class HostProcess:
         self._patience_until = 0.0
         self._lost_at: float | None = None
         self._is_over = False
+        self.grants = self.barriers = 0
+        """Messages for which a process owed a yield, and bundles that held any."""
         self._takes: dict[type, Callable[[Any], None]] = {
             messages.ToNode: self._to_node,
             messages.Start: self._start,
@@ -231,6 +235,8 @@ class HostProcess:
             return
         if not isinstance(message, messages.Orders) or message.nonce != self._up.nonce:
             return
+        grants = sum(isinstance(order, messages.ToNode) and order.awaited for order in message.orders)
+        self.grants, self.barriers = self.grants + grants, self.barriers + bool(grants)
         for order in message.orders:
             self._carry_out(order)
         if not self._relay.awaited:

@@ -122,6 +122,7 @@ def test_a_barrier_is_a_message_down_for_each_process_and_one_up(play: Play) -> 
     bundles = play.work(grant("v01", "v03"), ("tx", "v03", YIELD), ("tx", "v01", YIELD))
     assert play.sides.down == [("v01", b"grant"), ("v03", b"grant")]
     assert bundles == [[FromNode("v03", YIELD), FromNode("v01", YIELD)]]
+    assert (play.host.grants, play.host.barriers) == (2, 1)
 
 
 def test_last_messages_tokens_and_ends_go_at_once(play: Play) -> None:
