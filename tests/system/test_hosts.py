@@ -3,6 +3,7 @@
 Where root may make them, hosts are network namespaces, which share nothing but a bridge.
 """
 
+import os
 import subprocess
 import threading
 from collections.abc import Iterator
@@ -91,7 +92,8 @@ def run_on(hosts: list[NetworkHost], scenario: str, tmp_path: Path, scheme: str,
         for name, host in zip(NAMES, hosts, strict=True):
             words = [*VNET, "host", "--connect", endpoint, "--run", Path(scenario).stem]
             words += ["--credentials", str(access / "credentials" / f"host-{name}.json")]
-            process = stack.enter_context(subprocess.Popen(host.command(*words), cwd=ROOT))
+            here = {**os.environ, "TMPDIR": str(tmp_path)}  # a host that is killed leaves its logs behind
+            process = stack.enter_context(subprocess.Popen(host.command(*words), cwd=ROOT, env=here))
             stack.callback(process.kill)
         stdout, stderr = emulator.communicate(timeout=TIMEOUT_S)
     return Finished(emulator.returncode, stdout, stderr, folder)
