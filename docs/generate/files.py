@@ -38,7 +38,7 @@ FOLDER = {
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
-    "logs/": "what each process printed (live runs): `v01.log`, …; further incarnations append. `programs.log`: "
+    "logs/": "what each vehicle printed and logged: `v01.log`, …; further incarnations append. `programs.log`: "
     "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign",
     "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
     "each. Only regular files of processes that the emulator has started; during a run they are in `disks/`",

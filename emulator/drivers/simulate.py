@@ -19,8 +19,10 @@ from msgspec.structs import replace
 from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.program_output import output_kept
 from emulator.drivers.signals import signals_handled, tell_from_handler
 from emulator.records.node_logs import NodeLogs
+from vnet.node import Node
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.disks import Disks
@@ -60,7 +62,11 @@ def simulate(
     started = time.monotonic()
     interrupted = False
     try:
-        with _ending_between_windows(simulation, on_interrupt), rare_collections(len(emulation.world.node_ids)):
+        with (
+            _ending_between_windows(simulation, on_interrupt),
+            rare_collections(len(emulation.world.node_ids)),
+            output_kept(simulation.owns, simulation.logs),
+        ):
             simulation.run()
     except KeyboardInterrupt:
         interrupted = True
@@ -124,15 +130,21 @@ class _Simulation:
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._meter = CpuMeter()
         self.loop.measure(self._meter)
-        logs = NodeLogs(emulation.folder.logs)
+        self.logs = NodeLogs(emulation.folder.logs)
         disks = Disks(emulation.folder.disks)
         debugger = None if debug is None else _debugger(debug, self._quit)
-        self._host = Host(welcomes, lambda: self.loop.now_ns, on_line=logs.write, disks=disks, debugger=debugger)
+        self._host = Host(
+            welcomes, lambda: self.loop.now_ns, on_line=self.logs.write, disks=disks, debugger=debugger
+        )
 
     def _quit(self) -> None:
         """End the run wherever the debugger has stopped it."""
         self.stop.set()
         raise KeyboardInterrupt
+
+    def owns(self, node: Node) -> bool:
+        """Return whether `node` is one of this simulation, and not an earlier incarnation."""
+        return self._host.nodes.get(node.id) is node
 
     def run(self) -> None:
         """From the first grant to the last."""

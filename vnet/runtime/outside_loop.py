@@ -75,13 +75,13 @@ def detach() -> None:
 
 @wraps(_start_thread)
 def _start_noted(thread: threading.Thread) -> None:
-    owner = _owner()
+    owner = present_node()
     if owner is not None:
         _started_by[thread] = owner
     _start_thread(thread)
 
 
-def _owner() -> Node | None:
+def present_node() -> Node | None:
     """Return the node on whose behalf the present code runs: that of its context, or of its thread."""
     return current_node.get() or _started_by.get(threading.current_thread())
 
@@ -89,7 +89,7 @@ def _owner() -> Node | None:
 def _unraisable(ignored: sys.UnraisableHookArgs) -> None:
     error = ignored.exc_value or ignored.exc_type()
     name = getattr(ignored.object, "__name__", "")
-    if collector.runs or not _taken(_owner(), error, f"in {name}" if name else "where Python ignores it"):
+    if collector.runs or not _taken(present_node(), error, f"in {name}" if name else "where Python ignores it"):
         _before[0](ignored)
 
 

@@ -1,0 +1,108 @@
+"""Output of simulated programs is in the log of their vehicle, and in the terminal."""
+
+import asyncio
+import sys
+import threading
+
+import pytest
+
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.program_output import output_kept
+from emulator.records import node_logs
+from emulator.records.node_logs import NodeLogs
+from tests.support.multi_loop_driver import emulation_of, run_together, scenario_of
+from vnet.node import Node
+
+
+def log_of(emulation: Emulation, node: str) -> str:
+    return (emulation.folder.logs / f"{node}.log").read_text()
+
+
+async def prints_everywhere(node: Node) -> None:
+    def say(where: str) -> None:
+        print(node.id, "in", where)
+
+    async def task() -> None:
+        say("a task")
+
+    say("main")
+    await asyncio.create_task(task())
+    asyncio.get_running_loop().call_soon(say, "a callback")
+    await asyncio.sleep(0.1)
+    await asyncio.to_thread(say, "a job")
+    thread = threading.Thread(target=say, args=("a thread",))
+    thread.start()
+    thread.join()
+    print(node.id, "in", "error", file=sys.stderr)
+    sys.stdout.writelines([node.id, " in ", "pieces", "\n"])
+    node.log("noted")
+    print(node.id, "without an end", end="")
+
+
+WHERE = ["main", "a task", "a callback", "a job", "a thread", "error", "pieces"]
+
+
+def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    emulation = run_together(scenario_of([], f"{__name__}:prints_everywhere", vehicles=2))
+    terminal = capsys.readouterr()
+    for node in ("v01", "v02"):
+        said = [f"{node} in {where}" for where in WHERE]
+        assert log_of(emulation, node).splitlines() == [
+            *said,
+            f"0.100000 {node} info: noted",
+            f"{node} without an end{node} finished",
+        ]
+        assert [line for line in said if f"{line}\n" not in terminal.out] == [f"{node} in error"]
+        assert f"{node} in error\n" in terminal.err
+
+
+async def prints_a_beginning(node: Node) -> None:
+    print("begun", end="")
+    await asyncio.sleep(99)
+
+
+def test_a_line_without_an_end_is_written_when_the_run_ends() -> None:
+    emulation = run_together(scenario_of([], f"{__name__}:prints_a_beginning", vehicles=2))
+    assert log_of(emulation, "v01") == "begun\n"
+
+
+async def crashes(node: Node) -> None:
+    print(node.incarnation)
+    await asyncio.sleep(1.0)
+    raise ValueError("boom")
+
+
+def test_prints_and_a_crash_are_in_order() -> None:
+    emulation = run_together(scenario_of([], f"{__name__}:crashes", vehicles=2))
+    lines = log_of(emulation, "v01").splitlines()
+    assert lines[:2] == ["0", "v01 crashed"]
+    assert lines[-1] == "ValueError: boom"
+
+
+async def never_ends_a_line(node: Node) -> None:
+    for _ in range(100):
+        print("x" * 100, end="")
+
+
+def test_a_flood_is_bounded(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(node_logs, "LARGEST_LOG_BYTES", 5000)
+    monkeypatch.setattr(node_logs, "LONGEST_HELD", 1000)
+    emulation = run_together(scenario_of([], f"{__name__}:never_ends_a_line", vehicles=2))
+    log = log_of(emulation, "v01")
+    assert log == "x" * 5000 + "(the log is full: further lines are left out after 5,000 bytes)\n"
+    assert capsys.readouterr().out.count("x") == 20_000
+
+
+def test_the_streams_are_given_back_also_by_two_simulations_at_once() -> None:
+    before = (sys.stdout, sys.stderr)
+    emulation = emulation_of(scenario_of([], f"{__name__}:crashes", vehicles=2))
+    logs = NodeLogs(emulation.folder.logs)
+    first, second = (output_kept(lambda node: False, logs) for _ in range(2))
+    first.__enter__()
+    second.__enter__()
+    assert sys.stdout is not before[0]
+    assert sys.stdout.encoding == before[0].encoding
+    first.__exit__(None, None, None)
+    assert sys.stdout is not before[0], "the other one still goes on"
+    second.__exit__(None, None, None)
+    assert (sys.stdout, sys.stderr) == before
