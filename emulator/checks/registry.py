@@ -205,7 +205,9 @@ CHECKS: list[Check] = [
         "A vehicle that is down (killed, restarted, not in the network, or ended by itself) sends and reports "
         "nothing, and what arrives there is `receiver_down`; a vehicle that is up receives.",
         invalid="a frame, report or arrival that contradicts it",
+        unknown=BEHIND,
         not_applicable="no vehicle was down",
+        realtime_sensitive=True,
     ),
     Check(
         check_pause_respected,

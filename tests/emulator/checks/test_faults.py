@@ -248,6 +248,14 @@ def test_frames_and_reports_of_nodes_that_should_be_down_are_found() -> None:
     assert min(figures["spoke"], figures["reports"], figures["missed"]) > 0
 
 
+@pytest.mark.parametrize(("kind", "check"), [("kill", "down_respected"), ("pause", "pause_respected")])
+def test_where_the_machine_did_not_keep_up_frames_may_come_late(kind: str, check: str) -> None:
+    early = shifted(with_fault(kind), -0.5)
+    gap = Event(0, "transport_gap", "v01", {"count": 1})
+    assert not_valid(early)[check] is Verdict.INVALID
+    assert not_valid(replace(early, events=[*early.events, gap]))[check] is Verdict.UNKNOWN
+
+
 def test_a_node_that_does_not_stand_still_is_found() -> None:
     early = shifted(with_fault("pause"), -0.5)
     assert not_valid(early)["pause_respected"] is Verdict.INVALID
