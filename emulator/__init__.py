@@ -1,15 +1,15 @@
 """emulator: everything that vehicles live in. It stands on vnet and never imports agents.
 
 Its public names are those of `__all__`; they are imported when they are first used, because commands import this
-package too and must start fast.
+package too and must start fast. It imports nothing itself: until `vnet` runs, Ctrl-C prints a traceback.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from emulator.api import run, simulate
     from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
@@ -31,6 +31,8 @@ def __getattr__(name: str) -> Any:
     """Return a public name."""
     if name not in _PUBLIC:
         raise AttributeError(f"module 'emulator' has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(_PUBLIC[name]), name)
 
 

@@ -9,9 +9,12 @@ import sys
 
 def main() -> None:
     """Run the command `vnet` with the arguments of this process; import only what that command needs."""
-    from vnet.runtime import interrupts
+    try:
+        from vnet.runtime import interrupts
 
-    interrupts.end_at_once()
+        interrupts.end_at_once()
+    except KeyboardInterrupt:
+        sys.exit(130)
     from emulator.cli.table import find
     from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread
 

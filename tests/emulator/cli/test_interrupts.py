@@ -72,6 +72,7 @@ def vnet(folder: Path, *arguments: str, at_start: str = "") -> tuple[int, str, s
 @pytest.mark.parametrize(
     ("arguments", "module"),
     [
+        (["run", BEACON], "vnet.runtime.interrupts"),
         (["run", BEACON], "vnet.runtime.environment"),
         (["run", BEACON], "typer"),
         (["run", BEACON], "pydantic"),
@@ -84,6 +85,17 @@ def test_while_a_module_is_imported(arguments: list[str], module: str, tmp_path:
     assert status == 130
     assert said == ("beacon: lockstep, seed 1, 10 s of emulated time\n" if module == "zenoh" else "")
     assert not (tmp_path / "runs").exists()
+
+
+def test_nothing_is_imported_before_the_command_runs() -> None:
+    program = "import sys; before = {*sys.modules}; import emulator.cli; print(*sorted({*sys.modules} - before))"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    assert {*done.stdout.decode().split()} - {"__future__"} == {"emulator", "emulator.cli"}
 
 
 def test_while_a_command_starts_itself_again(tmp_path: Path) -> None:
