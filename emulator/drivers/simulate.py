@@ -173,6 +173,7 @@ class _Simulation:
         finally:
             asyncio.set_event_loop(None)
             self.loop.close()
+            self._host.discard_killed()
             self._emulation.costs.take_programs(self._meter.cpu_ns, self._meter.wake_ups)
 
     def _close(self, time_ns: int) -> None:

@@ -22,12 +22,17 @@ from __future__ import annotations
 
 import asyncio
 import heapq
+import inspect
 import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
+from types import CoroutineType
 from typing import Any, cast
+
+MOST_CLOSINGS = 10
+"""Times that a coroutine is told to close that awaits something in answer."""
 
 
 def ready_queue(loop: asyncio.AbstractEventLoop) -> deque[asyncio.Handle]:
@@ -83,8 +88,31 @@ def handle_that_raised(error: BaseException) -> asyncio.Handle | None:
 
 
 def abandon(task: asyncio.Task[Any]) -> None:
-    """Let a pending task be destroyed without a message in the log."""
+    """Let a pending task, which goes no further, be destroyed without a message in the log."""
     _private(task)._log_destroy_pending = False
+    coroutine = _coroutine_of(task)
+    if inspect.getcoroutinestate(coroutine) == inspect.CORO_CREATED:
+        coroutine.close()
+
+
+def close_abandoned(task: asyncio.Task[Any]) -> None:
+    """Close an abandoned task's coroutine, whose loop is closed, whatever it raises.
+
+    Python would do so when it discards the coroutine, at any time, and print what it raises: a task group
+    cannot cancel its tasks any more.
+    """
+    for _ in range(MOST_CLOSINGS):
+        try:
+            _coroutine_of(task).close()
+            return
+        except (Exception, asyncio.CancelledError, SystemExit):
+            pass
+
+
+def _coroutine_of(task: asyncio.Task[Any]) -> CoroutineType[Any, Any, Any]:
+    coroutine = task.get_coro()
+    assert inspect.iscoroutine(coroutine)
+    return coroutine
 
 
 def is_unretrieved(future: asyncio.Future[Any]) -> bool:

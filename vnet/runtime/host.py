@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import contextvars
-import inspect
 import logging
 import traceback
 import weakref
@@ -173,10 +172,6 @@ class Host:
             self._killed[gone] = self._tasks_of(gone)
             for task in self._killed[gone]:
                 asyncio_internals.abandon(task)
-                program = task.get_coro()
-                assert inspect.iscoroutine(program)
-                if inspect.getcoroutinestate(program) == inspect.CORO_CREATED:
-                    program.close()
             self._hold()
         else:
             self._stopped_ns[gone] = time_ns
@@ -382,6 +377,11 @@ class Host:
                     self.end_exited(leave)
         del tasks  # it would keep their exceptions from being discarded
         self._settle()
+
+    def discard_killed(self) -> None:
+        """Discard what is left of killed programs, after the loop has been closed (simulated)."""
+        for task in [task for tasks in self._killed.values() for task in tasks]:
+            asyncio_internals.close_abandoned(task)
 
     async def cancel(self) -> None:
         """Cancel all programs and wait a second at most for their `finally` blocks (real time)."""

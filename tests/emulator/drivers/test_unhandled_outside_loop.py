@@ -195,3 +195,32 @@ async def collects_what_fails(node: Node) -> None:
 def test_what_the_collector_finds_is_left_to_python() -> None:
     emulation = run_together(scenario_of([], entry(collects_what_fails), vehicles=2))
     assert exceptions(emulation) == []
+
+
+async def has_groups_in_tasks(node: Node) -> None:
+    async def group() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(asyncio.sleep(99))
+            await asyncio.sleep(99)
+
+    async def holds_on() -> None:
+        try:
+            await asyncio.sleep(99)
+        finally:
+            await asyncio.sleep(99)
+
+    tasks = [asyncio.create_task(each()) for each in (group, holds_on)]
+    await sends(node)
+    await asyncio.gather(*tasks)
+
+
+def test_what_is_left_of_a_killed_vehicle_is_discarded_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    ignored: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda args: ignored.append(str(args.exc_value)))
+    kill = {"kind": "kill", "at_s": 1.0, "duration_s": 1.0, "nodes": {"ids": ["v01"]}}
+    emulation = run_together(scenario_of([kill], entry(has_groups_in_tasks), vehicles=2))
+    assert [event.node for event in emulation.folder.events if event.kind == "restarted"] == ["v01"]
+    assert exceptions(emulation) == []
+    del emulation
+    gc.collect()
+    assert ignored == []

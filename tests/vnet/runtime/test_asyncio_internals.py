@@ -260,6 +260,25 @@ def test_an_abandoned_task_is_destroyed_in_silence(loop: StandingLoop) -> None:
     assert len(complaints) == 1, f"{CHANGED}_log_destroy_pending does not silence a task"
 
 
+def test_an_abandoned_task_is_closed_although_it_awaits_something_in_answer(loop: StandingLoop) -> None:
+    ended: list[str] = []
+
+    async def holds_on() -> None:
+        try:
+            await loop.create_future()
+        finally:
+            try:
+                await loop.create_future()
+            finally:
+                ended.append("ended")
+
+    task = loop.create_task(holds_on())
+    loop.round()
+    asyncio_internals.abandon(task)
+    asyncio_internals.close_abandoned(task)
+    assert ended == ["ended"]
+
+
 def test_a_task_factory_may_take_whatever_a_task_does(loop: StandingLoop) -> None:
     """From 3.13.3 on `create_task` hands the task's name to the factory, too."""
     taken: list[dict[str, Any]] = []
