@@ -165,12 +165,12 @@ def read_result(cell: Cell, folder: Path, live: bool = False) -> dict[str, Any]:
 
 def read_series(cell: Cell, folder: Path) -> pa.Table:
     """The metrics of a finished cell, a row a period."""
-    return pq.read_table(folder / "cells" / f"{cell.digest}.parquet")
+    return pq.read_table((folder / "cells" / f"{cell.digest}.parquet").absolute())
 
 
 def read_states(cell: Cell, folder: Path) -> pa.Table:
     """The states of a finished cell that keeps them, a row for each vehicle and period."""
-    return pq.read_table(_states_path(folder / "cells", cell))
+    return pq.read_table(_states_path(folder / "cells", cell).absolute())
 
 
 def has_result(cell: Cell, folder: Path) -> bool:
@@ -186,7 +186,8 @@ def has_states(cell: Cell, folder: Path) -> bool:
 def write_results(results: Sequence[dict[str, Any]], folder: Path, name: str) -> Path:
     """All cells as one Parquet file."""
     path = folder / f"{name}.parquet"
-    pq.write_table(pa.Table.from_pylist(list(results)), path)
+    with atomically(path) as part:
+        pq.write_table(pa.Table.from_pylist(list(results)), part)
     return path
 
 

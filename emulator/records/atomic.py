@@ -27,7 +27,8 @@ def atomically(path: Path) -> Iterator[Path]:
     If the block raises, nothing is left, and what was at `path` stays as it was. A folder replaces an empty folder
     only. Raises VnetError where the disk refuses.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Absolute, because pyarrow takes a relative path with a colon for the address of a remote file.
+    part = path.absolute().with_name(f".{path.name}.{os.getpid()}.part")
     with disk_errors(path):
         try:
             yield part

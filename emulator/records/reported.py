@@ -149,9 +149,11 @@ class ReportedFigure:
 
 
 def figure_text(value: float | None) -> str:
-    """Return a number with four significant digits, or all of an integer's."""
+    """Return a number with four significant digits, or all of an integer's below 10¹⁵."""
     if value is None:
         return "–"
+    if abs(value) >= 1e15:
+        return f"{value:.4g}"
     if abs(value) >= 1000 or value.is_integer():
         return f"{value:,.0f}"
     return f"{value:.4g}"

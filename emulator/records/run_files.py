@@ -214,7 +214,7 @@ class RunFiles:
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
         names = None if wanted is None else [*wanted, *self._values_beside(path, wanted)]
-        table: pa.Table = self._read(path, lambda: pq.read_table(path, columns=names))
+        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         for column in wanted or schema.names:
             found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
             if not found and column not in left_out:
@@ -225,7 +225,7 @@ class RunFiles:
         """The columns of reported values, for those who want `values` of the states."""
         if path.name != STATES_FILE or "values" not in wanted:
             return []
-        return self._read(path, lambda: value_columns(pq.read_schema(path)))
+        return self._read(path, lambda: value_columns(pq.read_schema(path.absolute())))
 
 
 def _from_here(command: str, folder: Path) -> str:

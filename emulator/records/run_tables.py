@@ -34,7 +34,7 @@ class TableFile:
     def __init__(self, path: Path, columns: Sequence[str], perhaps: Sequence[str] = ()) -> None:
         self.path = path
         try:
-            self._file = pq.ParquetFile(path)
+            self._file = pq.ParquetFile(path.absolute())
         except FileNotFoundError:
             text = f"{path.parent}: not the folder of a finished run: there is no {path.name} in it"
             raise VnetError(text) from None

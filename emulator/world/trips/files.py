@@ -41,7 +41,7 @@ def write_trips(motion: Motion, path: Path, rate_hz: float) -> int:
         if path.suffix.lower() == ".csv":
             pyarrow.csv.write_csv(table, path)
         else:
-            pq.write_table(table, path)
+            pq.write_table(table, path.absolute())  # a colon would make it an address
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be written: {error.strerror or error}") from None
     return len(table)

@@ -43,7 +43,7 @@ def read_csv(path: Path, window_s: tuple[float, float] | None) -> Samples:
 def read_parquet(path: Path, window_s: tuple[float, float] | None) -> Samples:
     """Return the samples of a Parquet file. Raise ScenarioError, naming the row (from 1), for a bad file."""
     try:
-        with pq.ParquetFile(path) as file:
+        with pq.ParquetFile(path.absolute()) as file:
             columns = choose_columns(path, file.schema_arrow.names)
             batches = file.iter_batches(BATCH_ROWS, columns=columns)
             return _collect(path, batches, columns, first_row=1, window_s=window_s)

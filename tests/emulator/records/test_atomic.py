@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from emulator.records.atomic import atomically, write_atomically
@@ -56,3 +58,14 @@ def test_a_disk_that_refuses_is_one_line(tmp_path: Path) -> None:
 def test_text_that_cannot_be_encoded_is_written_all_the_same(tmp_path: Path) -> None:
     write_atomically(tmp_path / "a", "\udc80é")
     assert (tmp_path / "a").read_text(encoding="utf-8") == "?é"
+
+
+def test_a_colon_in_a_relative_path_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a relative path that does not begin with a slash pyarrow makes `scheme:path`."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("a:b")
+    folder.mkdir()
+    table = pa.table({"x": [1, 2]})
+    with atomically(folder / "t.parquet") as part:
+        pq.write_table(table, part)
+    assert pq.read_table((folder / "t.parquet").absolute()) == table

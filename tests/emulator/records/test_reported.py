@@ -91,7 +91,15 @@ def test_nothing_reported_is_no_figure() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(0.123456, "0.1235"), (12.0, "12"), (12345.6, "12,346"), (None, "–"), (float("inf"), "inf")]
+    ("value", "text"),
+    [
+        (0.123456, "0.1235"),
+        (12.0, "12"),
+        (12345.6, "12,346"),
+        (None, "–"),
+        (float("inf"), "inf"),
+        (1e300, "1e+300"),
+    ],
 )
 def test_numbers_are_short(value: float | None, text: str) -> None:
     assert figure_text(value) == text
