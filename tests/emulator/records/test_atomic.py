@@ -61,7 +61,7 @@ def test_text_that_cannot_be_encoded_is_written_all_the_same(tmp_path: Path) -> 
 
 
 def test_a_colon_in_a_relative_path_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a relative path that does not begin with a slash pyarrow makes `scheme:path`."""
+    """Read and write the file: pyarrow takes `a:b` for a scheme and a path."""
     monkeypatch.chdir(tmp_path)
     folder = Path("a:b")
     folder.mkdir()
