@@ -105,7 +105,9 @@ def close_abandoned(task: asyncio.Task[Any]) -> None:
         try:
             _coroutine_of(task).close()
             return
-        except (Exception, asyncio.CancelledError, SystemExit):
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # a task group raises a group of GeneratorExit
             pass
 
 

@@ -279,6 +279,19 @@ def test_an_abandoned_task_is_closed_although_it_awaits_something_in_answer(loop
     assert ended == ["ended"]
 
 
+def test_a_task_group_that_is_discarded_raises_nothing(loop: StandingLoop) -> None:
+    """Its body is ended by GeneratorExit, which it puts into a group of its own."""
+
+    async def waits_in_a_group() -> None:
+        async with asyncio.TaskGroup():
+            await loop.create_future()
+
+    task = loop.create_task(waits_in_a_group())
+    loop.round()
+    asyncio_internals.abandon(task)
+    asyncio_internals.close_abandoned(task)
+
+
 def test_a_task_factory_may_take_whatever_a_task_does(loop: StandingLoop) -> None:
     """From 3.13.3 on `create_task` hands the task's name to the factory, too."""
     taken: list[dict[str, Any]] = []
