@@ -14,8 +14,8 @@ from vnet.units import title_of, unit_of
 
 MOST_VALUES = 16
 """Names of values that are drawn, in the order in which they are first reported."""
-LOW, HIGH = np.array((40, 90, 220), dtype=float), np.array((255, 205, 40), dtype=float)
-"""Colours of the least and of the largest value so far, blue and yellow: both are seen on dark and on light."""
+SCALE = np.array([(40, 90, 220), (0, 158, 115), (255, 205, 40)], dtype=float)
+"""Colours of the least, middle and largest value so far: blue, green and yellow, and nowhere near grey."""
 
 
 def titled(name: str) -> str:
@@ -84,8 +84,9 @@ class ProgramScene:
             value = values.get(name)
             if value is None:
                 continue
-            share = np.clip((value - least) / max(most - least, 1e-12), 0, 1)[:, None]
-            colours = np.where(np.isfinite(share), LOW + share * (HIGH - LOW), np.array(GREY[:3], dtype=float))
+            share = np.clip((value - least) / max(most - least, 1e-12), 0, 1)
+            scaled = np.column_stack([np.interp(share, (0, 0.5, 1), SCALE[:, part]) for part in range(3)])
+            colours = np.where(np.isfinite(share)[:, None], scaled, np.array(GREY[:3], dtype=float))
             self._canvas.log(f"program/map/{name}", rr.Points2D.from_fields(colors=colours.astype(np.uint8)))
 
     def _texts(self, texts: Mapping[str, list[str]]) -> None:
