@@ -156,6 +156,7 @@ def _values(key: str, given: Any) -> list[Any]:
     values = [value.item() if hasattr(value, "item") else value for value in _listed(f"vary {key}", given)]
     if not values:
         raise ScenarioError(f"vary {key}: at least one value is needed")
+    _refuse_repeated(f"vary {key}", values)
     return values
 
 
@@ -163,7 +164,15 @@ def _seeds(given: Any) -> list[int]:
     seeds = [value.item() if hasattr(value, "item") else value for value in _listed("seeds", given)]
     if not seeds or any(type(seed) is not int for seed in seeds):
         raise ScenarioError(f"seeds = {shown(given)}: how many, at least 1, or a list of integers")
+    _refuse_repeated("seeds", seeds)
     return seeds
+
+
+def _refuse_repeated(name: str, values: Sequence[Any]) -> None:
+    """Raise ScenarioError for a value that is there twice: the same run would count as a further sample."""
+    for place, value in enumerate(values):
+        if any(value == other and type(value) is type(other) for other in values[:place]):
+            raise ScenarioError(f"{name}: {shown(value)} is given twice")
 
 
 def _listed(name: str, given: Any) -> Iterator[Any]:

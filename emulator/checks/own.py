@@ -146,11 +146,18 @@ def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
         answer = [answer]
     if not isinstance(answer, Iterable) or isinstance(answer, (str, bytes, Mapping)):
         raise _NonsenseError(f"answers {shown(answer)}: results are needed, as (name, verdict, text)")
-    count = 0
+    count, nonsense = 0, None
     for count, result in enumerate(islice(answer, MOST_RESULTS + 1), start=1):
         if count > MOST_RESULTS:
             raise _NonsenseError(f"yields more than {MOST_RESULTS} results")
-        yield _finding(result)
+        try:
+            finding = _finding(result)
+        except _NonsenseError as error:  # the results after it count all the same
+            nonsense = nonsense or error
+            continue
+        yield finding
+    if nonsense is not None:
+        raise nonsense
     if not count:
         raise _NonsenseError("yields no result")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -72,7 +73,7 @@ def sweep(
     with one_line_errors():
         plain = load(scenario, overrides, program, Pacing.LOCKSTEP, None, duration, option, checks)
         keeps_network = any(each.partition("=")[0].strip() == NETWORK_SEED for each in overrides or ())
-        plan = SweepPlan.of(plain, dict(map(_varied, vary or ())), range(1, seeds + 1), keeps_network)
+        plan = SweepPlan.of(plain, _all_varied(vary or ()), range(1, seeds + 1), keeps_network)
         cells = plan.cells if shard is None else plan.shard(*parse_shard(shard))
         folder = out or default_folder(plan)
         try:
@@ -91,6 +92,15 @@ def sweep(
         Console().print(f"{len(table)} runs: {counts}", highlight=False)
         print(folder / TABLE)
         print(folder / PAGE)
+
+
+def _all_varied(texts: Sequence[str]) -> dict[str, list[object]]:
+    varied: dict[str, list[object]] = {}
+    for key, values in map(_varied, texts):
+        if key in varied:
+            raise VnetError(f"--vary {key}: is given twice; write all values behind one, separated by commas")
+        varied[key] = values
+    return varied
 
 
 def _varied(text: str) -> tuple[str, list[object]]:

@@ -139,6 +139,7 @@ def test_an_interrupted_simulation_is_written_down(tmp_path: Path, monkeypatch: 
             lambda: emulator.sweep(SMALL, {"radio.loss": "ab"}),
             r"^vary radio\.loss = .ab.: a list of values is needed",
         ),
+        (lambda: emulator.sweep(SMALL, {"radio.loss": [0]}, seeds=[1, 2, 1]), r"^seeds: 1 is given twice"),
         (lambda: emulator.sweep(SMALL, {"radio.loss": []}), r"^vary radio\.loss: at least one value"),
         (lambda: emulator.sweep(SMALL, {"run.seed": [1]}), r"^vary run\.seed: a sweep sets it itself"),
         (lambda: emulator.sweep(SMALL, {}, seeds=0), r"^seeds = range\(1, 1\): how many"),

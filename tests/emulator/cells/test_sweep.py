@@ -139,6 +139,11 @@ def test_shards_may_run_anywhere_and_the_last_makes_the_table(tmp_path: Path, in
         (["--vary", "radio.loss"], "--vary radio.loss: write it as KEY=VALUES"),
         (["--vary", "radio.loss="], "radio.loss=: write its values with commas between"),
         (["--vary", "radio.los=1,2"], "sweep, radio.los = 1: radio.los: unknown key (did you mean loss?)"),
+        (
+            ["--vary", "radio.loss=0", "--vary", "radio.loss=1"],
+            "--vary radio.loss: is given twice; write all values",
+        ),
+        (["--vary", "radio.loss=0,0.1,0"], "vary radio.loss: 0 is given twice"),
         (["--shard", "3/2"], "--shard 3/2: write it as i/n"),
         (["--executor", "ray"], "--executor ray: write it as dask://HOST:PORT"),
     ],

@@ -210,6 +210,17 @@ def test_nonsense_is_unknown_and_says_what_is_allowed(
     assert (found.verdict, found.text[: len(text)]) == (Verdict.UNKNOWN, text)
 
 
+def test_a_result_that_is_nonsense_hides_no_other(
+    recorded: RecordedRun, module: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = [("a", "valid", "", {"x": float("nan")}), ("b", "invalid", "too late")]
+    monkeypatch.setattr(module, "given", lambda run: answer, raising=False)
+    found = findings(recorded, "given")
+    verdicts = {name: finding.verdict for name, finding in found.items() if isinstance(finding, CheckResult)}
+    assert verdicts["own:b"] is Verdict.INVALID
+    assert verdicts["own:own_checks.given"] is Verdict.UNKNOWN
+
+
 def test_figures_of_numpy_are_plain_numbers(
     recorded: RecordedRun, module: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
