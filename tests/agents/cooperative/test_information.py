@@ -269,8 +269,8 @@ def frames(draw: st.DrawFn) -> InformationFrame:
 def test_a_frame_comes_back(frame: InformationFrame) -> None:
     payload = encode(frame)
     got = decode(payload)
-    assert replace(got, passed=frame.passed) == replace(frame, passed=frame.passed)
     assert np.array_equal(got.passed, frame.passed)
+    assert vars(got) | {"passed": None} == vars(frame) | {"passed": None}
     assert len(frame.passed) <= room(len(frame.heard), len(payload))
 
 
