@@ -20,6 +20,7 @@ from agents.cooperative.estimator import mean_consensus, usable
 from agents.cooperative.frame import MAX_DEGREE, short_name
 from agents.cooperative.fusion_rule import FusionRule
 from agents.cooperative.information_frame import (
+    INCREMENT_LIMIT,
     MAX_HEARD,
     PASSED,
     InformationFrame,
@@ -129,7 +130,8 @@ class InformationEstimator:
             return
         dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
         fix = Observation(own.position_m, own.covariance_m2, own.heading_rad) if usable(own) else None
-        self._increment = np.array(as_sent(self.own.step(dt_s, fix)))
+        increment = np.array(as_sent(self.own.step(dt_s, fix)))
+        self._increment = increment * min(1.0, INCREMENT_LIMIT / max(np.abs(increment).max(), 1.0))
         self._prior = np.array(as_sent(self.own.prior))
 
     def filter(self, own: Fix) -> None:

@@ -23,6 +23,8 @@ VERSION = 4
 """Version of the layout; `frame` has 3."""
 INFORMATION_LIMIT = 1e6
 """Largest entry of a matrix (1/m²): a deviation of a millimetre."""
+INCREMENT_LIMIT = 6e4
+"""Largest number of an increment: those who pass it on have half precision, which ends at 65 504."""
 PASSED_LIMIT = 255
 """Number of increments in a frame: it is one byte."""
 MAX_HEARD = 255
@@ -151,8 +153,10 @@ def _check(prior: list[float], increment: list[float], running_sum: list[float],
         raise FrameError("covariance")
     if not is_increment(np.array([increment]))[0] or not is_increment(passed.astype(float)).all():
         raise FrameError("covariance")
+    if max(map(abs, increment)) > INCREMENT_LIMIT:
+        raise FrameError("absurd")
     mean_m = abs(d * x - b * y) / determinant, abs(a * y - b * x) / determinant
-    if max(mean_m) > COMMON_LIMIT_M or max(a, d, *increment[:1], increment[2]) > INFORMATION_LIMIT:
+    if max(mean_m) > COMMON_LIMIT_M or max(a, d) > INFORMATION_LIMIT:
         raise FrameError("absurd")
 
 

@@ -33,9 +33,9 @@ class Information:
         covariance_m2 = inverse(self.matrix)
         return covariance_m2 @ self.vector, covariance_m2
 
-    def plus(self, other: Information, share: float = 1.0) -> Information:
-        """Return this belief with `share` of another piece of information added."""
-        return Information(self.matrix + share * other.matrix, self.vector + share * other.vector)
+    def plus(self, other: Information) -> Information:
+        """Return this belief with another piece of information added."""
+        return Information(self.matrix + other.matrix, self.vector + other.vector)
 
 
 def inverse(matrix: Array) -> Array:

@@ -83,11 +83,6 @@ class OwnVehicle:
         return np.asarray(self._filter.estimate_covariance_m2)
 
     @property
-    def is_decided(self) -> bool:
-        """True if the vehicle knows its lane."""
-        return self._is_placed and len(self._filter.lane_probability) == 1
-
-    @property
     def belief(self) -> tuple[Array, Array]:
         """Estimate (2,) of the common error, and its covariance (2, 2)."""
         return self.estimate_m, self.estimate_covariance_m2

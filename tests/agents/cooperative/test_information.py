@@ -204,6 +204,30 @@ def test_frames_of_another_period_are_not_fused() -> None:
     assert estimator.rejected["late"] == 1
 
 
+def test_who_passes_on_what_a_liar_claims_is_still_heard() -> None:
+    """A huge increment with the right mean contradicts nobody; with half precision it would be infinite."""
+
+    def lie(name: str, frame: InformationFrame) -> InformationFrame:
+        huge = (1e5, 0.0, 1e5, *(1e5 * COMMON_M).tolist())
+        return replace(frame, increment=huge) if name == "v0" else frame
+
+    network = Network(6)
+    with pytest.raises(FrameError, match="absurd"):
+        decode(encode(lie("v0", decode(network.estimators[0].frame(network.fix(0), 1400)))))
+    network.run(20, lie)
+    assert all(e.rejected["not_finite"] == 0 and e.rejected["absurd"] > 0 for e in network.estimators[1:])
+
+
+def test_a_receiver_of_millimetres_keeps_to_what_a_frame_holds() -> None:
+    network = Network(3)
+    fix = replace(network.fix(0), covariance_m2=1e-8 * np.eye(2))
+    estimator = network.estimators[0]
+    for period in range(3):
+        frame = decode(estimator.frame(replace(fix, time_ns=period * PERIOD_NS), 1400))
+        assert np.isfinite(frame.passed["information"]).all()
+        estimator.agree()
+
+
 def test_a_frame_that_is_sent_again_by_another_is_rejected() -> None:
     network = Network(3)
     network.run(2)
