@@ -38,6 +38,8 @@ _LIBRARIES = tuple(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "pureli
 _BELOW_THE_PROGRAM = ("asyncio.events", "vnet.runtime.host")
 """Modules whose frames, and those below, are not shown."""
 _BETWEEN_COROUTINES = (StopIteration, GeneratorExit)
+_SUSPENDED_AT = ("YIELD_VALUE", "RESUME")
+"""Instructions at which a coroutine that waits is found: up to Python 3.12 the former, from 3.13 on the latter."""
 _RESUMABLE = inspect.CO_COROUTINE | inspect.CO_GENERATOR | inspect.CO_ASYNC_GENERATOR
 
 
@@ -147,7 +149,7 @@ class NodeDebugger(pdb.Pdb):
     def dispatch_return(self, frame: FrameType, arg: Any) -> Any:
         """Leave a function; a coroutine that only waits is not left."""
         if frame.f_code.co_flags & _RESUMABLE:
-            if dis.opname[frame.f_code.co_code[frame.f_lasti]] == "YIELD_VALUE":
+            if dis.opname[frame.f_code.co_code[frame.f_lasti]] in _SUSPENDED_AT:
                 return self.trace_dispatch
             if frame is self.stopframe and frame is not self.botframe:
                 self._set_stopinfo(None, None)  # type: ignore[attr-defined]  # next: in whoever awaits it
