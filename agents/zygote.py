@@ -31,6 +31,7 @@ import agents.cli
 import agents.host  # what every agent needs
 from vnet.runtime import forking
 from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.forked_exit import end_forked
 
 STANDARD_ERROR = 2
 
@@ -58,7 +59,8 @@ def main() -> None:
     channel.send(forking.encode(forking.READY))
     agent = _fork_until_agent(channel)
     if agent is not None:
-        _be(agent)
+        shared = frozenset(sys.modules)
+        end_forked(_status_of(agent), shared)
 
 
 def _fork_until_agent(channel: socket.socket) -> _Agent | None:
@@ -114,6 +116,15 @@ def _take_descriptors(agent: _Agent) -> None:
         if descriptor > STANDARD_ERROR and descriptor != agent.credentials:
             with suppress(OSError):  # that of the listing itself
                 os.close(descriptor)
+
+
+def _status_of(agent: _Agent) -> int:
+    """Be this agent to its end; returns the status with which `vnet-agent` would exit."""
+    try:
+        _be(agent)
+    except SystemExit as leave:
+        return leave.code if isinstance(leave.code, int) else 0
+    return 0
 
 
 def _be(agent: _Agent) -> None:

@@ -65,13 +65,15 @@ def _start_s(count: int) -> float:
 
 
 def memory(runs: int) -> str:
-    """Unique and proportional set size of a process of 50 beacons, medians over processes."""
+    """Unique and proportional set size of a process of 50 beacons near the run's end, medians over processes."""
     sizes: list[tuple[float, float]] = []
 
     def watch(pid: int) -> None:
         while Path(f"/proc/{pid}").exists():
             time.sleep(SAMPLE_S)
-            sizes[:] = agents_mb(pid) or sizes
+            sample = agents_mb(pid)
+            if len(sample) >= len(sizes):  # before processes end
+                sizes[:] = sample
 
     for _ in range(runs):
         vnet("run", BEACON, *_vehicles(50), "--duration", "20", watch=watch)
