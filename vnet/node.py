@@ -60,7 +60,8 @@ class Packet:
 class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 
-    The covariance is that of the receiver's own noise, without the common error of all receivers.
+    The covariance is that of the receiver's own noise, without the common error of all receivers. A receiver has no
+    heading where the scenario says so, for example while the vehicle stands.
     """
 
     time_ns: int

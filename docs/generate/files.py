@@ -58,7 +58,7 @@ Two sections are not the scenario's own: they hold SHA-256 of what the run has r
   and the new digests), and goes on. The hash of the trace does not depend on them.
 """
 WORLD_ABOUT = """
-An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles and `l` lanes.
+An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
 """
 WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
 KINDS = {"U": "text", "f": "double", "b": "bool"}
@@ -94,6 +94,7 @@ WORLD = {
     "lane_heading_rad": "its direction of travel, counter-clockwise from east",
     "lane_length_m": "its length; infinite for a lane that is a straight line through its point",
     "links": "with `radio.links` only: whether the row's vehicle hears the column's",
+    "receiver_m": "with a recorded common error of several receivers only: what each has beyond the common error",
 }
 PAYLOAD = {
     "time_ns": "when the program handed it to the radio",

@@ -13,7 +13,7 @@ import numpy as np
 
 from emulator.checks.channel import changed_bytes
 from emulator.checks.latency import bounds
-from emulator.checks.senders import is_noise
+from emulator.checks.senders import is_noise, receiver_noise_m
 from emulator.faults.plan import PlannedFault
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import SLOT_NS
@@ -91,9 +91,7 @@ def _(fault: ProcessFault, recorded: RecordedRun, planned: PlannedFault, name: s
 
 @effect.register
 def _(fault: GnssFault, recorded: RecordedRun, planned: PlannedFault, name: str) -> Finding:
-    error_m = (recorded.vectors("fix_m") - recorded.vectors("position_m") - recorded.vectors("common_error_m"))[
-        _affected(recorded, planned)
-    ]
+    error_m = receiver_noise_m(recorded)[_affected(recorded, planned)]
     error_m = error_m[np.isfinite(error_m).all(axis=1)]
     as_noise = not len(error_m) or is_noise(error_m, recorded.scenario.world.gnss.sigma_m)
     return _wrong_fixes(name, 0 if as_noise else len(error_m))

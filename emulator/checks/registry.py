@@ -235,7 +235,7 @@ CHECKS: list[Check] = [
     Check(
         check_gnss,
         FAULTS,
-        "Fixes differ from truth, common error and the offsets of faults by zero-mean noise of "
+        "Fixes differ from the truth, the errors of `[world]` and the offsets of faults by zero-mean noise of "
         "`world.gnss.sigma_m`. Frozen and random fixes are not judged.",
         invalid=f"{ONE_IN_A_MILLION}, over all fixes without faults or those under one fault",
         unknown="no such fix",

@@ -14,6 +14,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
 from emulator.scenario.faults import DataReplay, DoS, Sybil
+from emulator.world.receivers import further_error_m
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
@@ -108,10 +109,10 @@ def _last_before(sent_ns: IntArray, time_ns: int, planned: PlannedFault) -> int 
 
 
 def check_gnss(recorded: RecordedRun) -> Finding:
-    """Check that fixes differ from truth, common error and the offsets of faults by receiver noise."""
+    """Check that fixes differ from the truth, the world's errors and the offsets of faults by receiver noise."""
     name = "gnss"
     sigma_m = recorded.scenario.world.gnss.sigma_m
-    error_m = recorded.vectors("fix_m") - recorded.vectors("position_m") - recorded.vectors("common_error_m")
+    error_m = receiver_noise_m(recorded)
     for planned in recorded.plan:
         error_m -= _displaced(recorded, planned)
     usable = np.isfinite(error_m).all(axis=2)
@@ -133,6 +134,20 @@ def check_gnss(recorded: RecordedRun) -> Finding:
     text = f"{counted(fixes, 'fix', 'fixes')} with the noise of {sigma_m:g} m"
     broken_text = f"fixes do not have the receiver's noise: {', '.join(row['under'] for row in rows)}"
     return result(name, len(rows), text, broken_text, rows, fixes=fixes)
+
+
+def receiver_noise_m(recorded: RecordedRun) -> Array:
+    """Return what fixes (periods, N, 2) have beyond the truth and all errors that the world gives them, in metres.
+
+    Without faults it is the receivers' white noise. Multipath, outliers and gradients are drawn again.
+    """
+    position_m = recorded.vectors("position_m")
+    error_m = recorded.vectors("fix_m") - position_m - recorded.vectors("common_error_m")
+    world = recorded.world
+    middle_m = np.zeros(2) if world is None else world.area_m.mean(axis=0)
+    receiver_m = None if world is None else world.receiver_m
+    further_m = further_error_m(recorded.scenario, position_m, middle_m, receiver_m) if position_m.size else None
+    return np.asarray(error_m if further_m is None else error_m - further_m)
 
 
 def _displaced(recorded: RecordedRun, planned: PlannedFault) -> Array:

@@ -24,8 +24,11 @@ ARRAYS: dict[str, tuple[str, str]] = {
     "lane_heading_rad": ("f", "l"),
     "lane_length_m": ("f", "l"),
     "links": ("b", "n × n"),
+    "receiver_m": ("f", "k × r × 2"),
 }
-"""The arrays of the file: kind of number, and shape for n vehicles and l lanes. Only `links` may be missing."""
+"""The arrays of the file: kind of number, and shape for n vehicles, l lanes, k periods and r receivers."""
+OPTIONAL = ("links", "receiver_m")
+"""Arrays that may be missing."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ class RecordedWorld:
 
     `position_m` (n, 2) are positions at time 0, NaN of a vehicle that is not there yet; `area_m` (2, 2) the corners
     of the box in which vehicles are during the run; lanes (l) have a point, a heading and a length from there,
-    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None.
+    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `receiver_m`
+    (k, r, 2) is what each receiver of a recorded common error has beyond the common one in each period, or None.
     """
 
     node_ids: tuple[str, ...]
@@ -44,20 +48,21 @@ class RecordedWorld:
     lane_heading_rad: Array
     lane_length_m: Array
     links: Mask | None = None
+    receiver_m: Array | None = None
 
     @classmethod
     def of(cls, world: World) -> RecordedWorld:
         """Take from a world what is to be recorded."""
-        lanes, course_m = world.lane_map, world.course_m
-        area_m = np.array([np.nanmin(course_m, axis=(0, 1)), np.nanmax(course_m, axis=(0, 1))])
+        lanes = world.lane_map
         return cls(
             node_ids=world.node_ids,
             position_m=world.position_m(0),
-            area_m=area_m,
+            area_m=world.area_m,
             lane_point_m=lanes.point_m,
             lane_heading_rad=lanes.heading_rad,
             lane_length_m=lanes.length_m,
             links=world.links,
+            receiver_m=world.receiver_m,
         )
 
     def write(self, path: Path) -> None:
@@ -83,9 +88,10 @@ class RecordedWorld:
 def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Raise VnetError unless the arrays have their kinds and shapes."""
     sizes = {"2": 2, "n": len(arrays.get("node_ids", ())), "l": len(arrays.get("lane_heading_rad", ()))}
+    sizes |= dict(zip("kr", np.shape(arrays.get("receiver_m", np.zeros((0, 0, 2)))), strict=False))
     for name, (kind, dimensions) in ARRAYS.items():
         if name not in arrays:
-            if name != "links":
+            if name not in OPTIONAL:
                 raise VnetError(f"{path}: has no array {name!r}")
             continue
         shape = tuple(sizes[dimension] for dimension in dimensions.split(" × "))

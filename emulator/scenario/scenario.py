@@ -15,6 +15,7 @@ import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
+from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
 from emulator.scenario.modules import with_modules
 from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
@@ -24,18 +25,11 @@ from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
 from emulator.scenario.toml import check_plain, read_toml
+from emulator.scenario.world import WorldSection
 from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
-DAY_S = 86_400
-"""No time in a scenario is longer, so that nanoseconds stay far within 64 bits."""
-FAR_M = 1e9
-"""No length in a scenario is larger, so that squares stay finite and millimetres mean something."""
-WILD_M = 1e5
-"""No standard deviation is larger, so that fixes stay near enough for frames to say."""
 MANY = 1_000_000_000
-FAR_S = 1e11
-"""Times of files, which may be seconds since 1970, are within ± three thousand years."""
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
 NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
@@ -141,48 +135,6 @@ class Map(Section):
     """Mean distance of the driven line to the right of the map's lanes; negative: to the left."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)
     """Programs are given the roads within so much of the box in which vehicles drive."""
-
-
-class CommonError(Section):
-    """`[world.common_error]`: the GNSS error that all share, a first-order Gauss-Markov process."""
-
-    sigma_m: float = Field(3.0, ge=0, le=WILD_M)
-    """Its standard deviation in each axis: by default that of ionosphere and orbits, so that all fixes are some
-    metres off in the same direction. For studies that are not about positioning: 0."""
-    tau_s: float = Field(600.0, gt=0)
-    """Its correlation time."""
-
-
-class Gnss(Section):
-    """`[world.gnss]`: each vehicle's own receiver noise and its rate."""
-
-    rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
-    """Fixes a second. The time between two is the period by which states and metrics are recorded."""
-    sigma_m: float = Field(1.0, ge=0, le=WILD_M)
-    """Standard deviation of the receiver's noise in each axis."""
-    heading: bool = True
-    """True if fixes have a heading."""
-    heading_sigma_rad: float = Field(0.01, ge=0, le=1)
-    """Standard deviation of that heading."""
-
-
-class Lateral(Section):
-    """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
-
-    half_width_m: float = Field(0.85, gt=0, le=FAR_M)
-    """Largest lateral offset; programs know it from the map."""
-    sigma_m: float = Field(0.4, ge=0, le=WILD_M)
-    """Standard deviation of the offset, before it is reflected at the half-width."""
-    tau_s: float = Field(20.0, gt=0)
-    """Correlation time of the offset."""
-
-
-class WorldSection(Section):
-    """`[world]`: the truth that the vehicles never see."""
-
-    common_error: CommonError = CommonError()
-    gnss: Gnss = Gnss()
-    lateral: Lateral = Lateral()
 
 
 class Radio(Section):
@@ -314,9 +266,9 @@ class Scenario(Section):
 def load_scenario(path: Path, overrides: Sequence[str] = (), checks: Sequence[str] = ()) -> Scenario:
     """Read a scenario, from its path or by its name if it is shipped, and apply `section.key=value` overrides.
 
-    Values are in TOML syntax; bare words are strings. A relative `network.path` or `radio.links` is taken from
-    the scenario's own folder; programs and checks are looked for there, and then in the current folder. `checks`
-    come after those of the file. Raises `ScenarioError`.
+    Values are in TOML syntax; bare words are strings. Relative paths of files are taken from the scenario's own
+    folder; programs and checks are looked for there, and then in the current folder. `checks` come after those of
+    the file. Raises `ScenarioError`.
     """
     path = find_scenario(path)
     try:
@@ -387,7 +339,12 @@ def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] |
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
     """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
-    read = scenario.network.path, scenario.radio.links, scenario.map and scenario.map.path
+    read = (
+        scenario.network.path,
+        scenario.radio.links,
+        scenario.map and scenario.map.path,
+        scenario.world.common_error.path,
+    )
     paths = [path for path in read if isinstance(path, Path)]
     if scenario.network.kind == "sumo" and scenario.network.path is not None:
         paths += input_files(scenario.network.path)
@@ -410,7 +367,17 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     roads = scenario.map
     if roads is not None:
         roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
-    return scenario.model_copy(update={"network": network, "radio": radio, "map": roads})
+    return scenario.model_copy(
+        update={"network": network, "radio": radio, "map": roads, "world": _world_of(scenario, scenario_path)}
+    )
+
+
+def _world_of(scenario: Scenario, scenario_path: Path) -> WorldSection:
+    common = scenario.world.common_error
+    if common.path is None:
+        return scenario.world
+    path = _absolute(common.path, "world.common_error.path", scenario_path)
+    return scenario.world.model_copy(update={"common_error": common.model_copy(update={"path": path})})
 
 
 def _absolute(given: Path, key: str, scenario_path: Path) -> Path:

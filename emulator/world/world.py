@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import stream
-from emulator.scenario.scenario import Gnss, Scenario
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.world import Gnss
+from emulator.world.common_error import common_errors
 from emulator.world.graph import components_of_links
 from emulator.world.lateral import lateral_offsets_m
 from emulator.world.links import load_links
 from emulator.world.neighbours import Links, links_within
 from emulator.world.networks import Network, generate_network, load_network
+from emulator.world.receivers import further_error_m, heading_of_fixes_rad, noise_m
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
 from vnet.node import Fix
@@ -59,14 +62,14 @@ class World:
     `lane_map` is given to programs; `lane_of` (N,), the lane of each vehicle that stands on one, is not. `links`
     (N, N) is `radio.links`: the receiver is the row, the sender the column; it is None if range or path loss
     decide. `moves` is true if vehicles drive, enter and leave. `course_m` (K, N, 2) are the positions at the start
-    of each period, NaN for an absent vehicle. `notes` are lines for the user about the input. Raise ScenarioError
+    of each period, NaN for an absent vehicle; `receiver_m` (K, R, 2) is what a file's receivers have beyond the
+    common error, or None. `notes` are lines for the user about the input. Raise ScenarioError
     if the scenario's links, exceptions or processes do not fit the vehicles.
     """
 
     def __init__(
         self, scenario: Scenario, motion: Motion, lane_map: LaneMap | RoadMap, lane_of: NDArray[np.intp]
     ) -> None:
-        seed = scenario.run.seed
         count = len(motion.node_ids)
         self.node_ids = motion.node_ids
         self.moves = scenario.network.moves
@@ -81,15 +84,24 @@ class World:
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)
         _check_processes(scenario, bool(present.all()))
-        self._gnss = scenario.world.gnss
-        self._covariance_m2 = np.eye(2) * self._gnss.sigma_m**2
+        self._covariance_m2 = np.eye(2) * _stated_variance_m2(scenario.world.gnss)
         self._covariance_m2.flags.writeable = False  # one for all fixes
-        self._common_m = self._draw_common(scenario)
-        self._noise_m, self._heading_noise = self._draw_noise(self._gnss, seed, count)
+        common = common_errors(scenario, self.periods)
+        self._common_m, self.receiver_m = common.common_m, common.receiver_m
+        self._noise_m = noise_m(scenario, self.periods, count)
+        further_m = further_error_m(scenario, self.course_m, self.area_m.mean(axis=0), self.receiver_m)
+        if further_m is not None:
+            self._noise_m += further_m
+        self._fix_heading_rad = heading_of_fixes_rad(scenario, self.course_m, self._heading_rad, self.moves)
 
     def present(self, period: int) -> NDArray[np.bool_]:
         """Return the mask (N,) of the vehicles that are present in `period`."""
         return np.isfinite(self.course_m[period, :, 0])
+
+    @property
+    def area_m(self) -> Array:
+        """Corners (2, 2) of the box in which vehicles are during the run."""
+        return np.array([np.nanmin(self.course_m, axis=(0, 1)), np.nanmax(self.course_m, axis=(0, 1))])
 
     def position_m(self, period: int) -> Array:
         """Return the positions (N, 2) at the start of `period`; NaN for an absent vehicle."""
@@ -105,50 +117,31 @@ class World:
         index = np.searchsorted(self._changes, after_ns // self.period_ns + 1)
         return int(self._changes[index]) * self.period_ns if index < len(self._changes) else None
 
-    def _draw_common(self, scenario: Scenario) -> Array:
-        """Draw the common error (K, 2) in metres: a Gauss-Markov process that starts in its stationary state."""
-        common = scenario.world.common_error
-        normal = stream(scenario.run.seed, "common error").standard_normal((self.periods, 2))
-        keep = math.exp(-self.period_ns / NS_PER_S / common.tau_s)
-        error = np.empty_like(normal)
-        error[0] = common.sigma_m * normal[0]
-        for k in range(1, self.periods):
-            error[k] = keep * error[k - 1] + common.sigma_m * math.sqrt(1 - keep**2) * normal[k]
-        return error
-
-    def _draw_noise(self, gnss: Gnss, seed: int, count: int) -> tuple[Array, Array]:
-        """Draw the position noise (K, N, 2) in metres and the heading noise (K, N) in radians."""
-        position = [stream(seed, "gnss", i).standard_normal((self.periods, 2)) for i in range(count)]
-        heading = [stream(seed, "heading", i).standard_normal(self.periods) for i in range(count)]
-        return gnss.sigma_m * np.stack(position, axis=1), gnss.heading_sigma_rad * np.stack(heading, axis=1)
-
     def at(self, period: int) -> Instant:
         """Return the truth and the fixes at the start of `period`, 0 ≤ period < `periods`."""
         assert 0 <= period < self.periods, period
-        position_m, heading_rad = self.course_m[period], self._heading_rad[period]
-        common_m = self._common_m[period]
-        if self._gnss.heading:
-            fix_heading = np.mod(heading_rad + self._heading_noise[period], 2 * np.pi)
-        else:
-            fix_heading = np.full(len(heading_rad), np.nan)
+        position_m, common_m = self.course_m[period], self._common_m[period]
         return Instant(
             period=period,
             time_ns=period * self.period_ns,
             position_m=position_m,
-            heading_rad=heading_rad,
+            heading_rad=self._heading_rad[period],
             common_error_m=common_m,
             fix_m=position_m + common_m + self._noise_m[period],
-            fix_heading_rad=fix_heading,
+            fix_heading_rad=self._fix_heading_rad[period],
         )
 
     def fix(self, period: int, node: int) -> Fix:
         """Return the fix of vehicle number `node`, which must be present, at the start of `period`."""
         fix_m = self.course_m[period, node] + self._common_m[period] + self._noise_m[period, node]
-        heading = None
-        if self._gnss.heading and not np.isnan(self._heading_rad[period, node]):
-            noisy = self._heading_rad[period, node] + self._heading_noise[period, node]
-            heading = float(np.mod(noisy, 2 * np.pi))
-        return Fix(period * self.period_ns, fix_m, self._covariance_m2, heading)
+        heading = float(self._fix_heading_rad[period, node])
+        return Fix(period * self.period_ns, fix_m, self._covariance_m2, None if math.isnan(heading) else heading)
+
+
+def _stated_variance_m2(gnss: Gnss) -> float:
+    """Return the variance (m²) in each axis that fixes state of their own error."""
+    told_m = gnss.multipath_sigma_m if gnss.covariance == "total" else 0.0
+    return gnss.sigma_m**2 + told_m**2
 
 
 def periods_of(scenario: Scenario) -> int:

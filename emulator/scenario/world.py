@@ -1,0 +1,88 @@
+"""`[world]`: the truth that the vehicles never see, their receivers included."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
+from emulator.scenario.sections import Section
+
+
+class CommonError(Section):
+    """`[world.common_error]`: the GNSS error that all share, drawn or recorded."""
+
+    kind: Literal["gauss_markov", "file"] = "gauss_markov"
+    """`gauss_markov` draws a first-order Gauss-Markov process; `file` reads a recorded error from `path`."""
+    sigma_m: float = Field(3.0, ge=0, le=WILD_M)
+    """Its standard deviation in each axis: by default that of ionosphere and orbits, so that all fixes are some
+    metres off in the same direction. For studies that are not about positioning: 0. Of a recorded error what the
+    hears-all bound assumes."""
+    tau_s: float = Field(600.0, gt=0)
+    """Its correlation time. Of a recorded error what the hears-all bound assumes."""
+    path: Path | None = None
+    """`file`: CSV, relative to the scenario file, with the columns time_s, east_m, north_m; or of several receivers
+    NAME_east_m and NAME_north_m each. Then their mean is common, and the rest is each receiver's own: vehicles
+    have the receivers in turn. Between rows the error changes linearly."""
+    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
+    """`file`: at which time of the file the run begins; at its first row's if left out."""
+    gradient_m_per_km: float = Field(0.0, ge=0, le=1000)
+    """Standard deviation of each of the four components of the error's gradient, a Gauss-Markov process with
+    `tau_s`: with it, the error is common in the middle of the area only."""
+
+    @model_validator(mode="after")
+    def _keys_go_with_their_kind(self) -> CommonError:
+        if self.kind == "file" and self.path is None:
+            raise ValueError('path is required with kind = "file"')
+        if self.kind != "file" and (self.path is not None or self.start_s is not None):
+            raise ValueError('path and start_s go with kind = "file"')
+        return self
+
+
+class Gnss(Section):
+    """`[world.gnss]`: each vehicle's own receiver: its rate, its noise and its heading."""
+
+    rate_hz: float = Field(10.0, ge=1 / DAY_S, le=1000)
+    """Fixes a second. The time between two is the period by which states and metrics are recorded."""
+    sigma_m: float = Field(1.0, ge=0, le=WILD_M)
+    """Standard deviation of the receiver's noise in each axis."""
+    multipath_sigma_m: float = Field(0.0, ge=0, le=WILD_M)
+    """Standard deviation of multipath in each axis: a Gauss-Markov process of each vehicle's own."""
+    multipath_tau_s: float = Field(60.0, gt=0)
+    """Correlation time of the multipath."""
+    outlier_probability: float = Field(0.0, ge=0, le=1)
+    """Probability that a fix is an outlier, independently for each."""
+    outlier_m: float = Field(30.0, ge=0, le=WILD_M)
+    """Distance by which an outlier is displaced, in any direction."""
+    covariance: Literal["noise", "total"] = "noise"
+    """Covariance that fixes state: that of the receiver's `noise` alone, or in `total` with its multipath."""
+    heading: bool = True
+    """True if fixes have a heading."""
+    heading_sigma_rad: float = Field(0.01, ge=0, le=1)
+    """Standard deviation of that heading."""
+    heading_speed_sigma_mps: float = Field(0.0, ge=0, le=FAR_M)
+    """Standard deviation of the speed across the course, from which a receiver computes its heading: divided by
+    the vehicle's speed it adds to the heading's deviation, up to π."""
+    heading_min_speed_mps: float = Field(0.0, ge=0, le=FAR_M)
+    """Fixes of slower vehicles have no heading. Vehicles of a network of straight lanes stand."""
+
+
+class Lateral(Section):
+    """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
+
+    half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    """Largest lateral offset; programs know it from the map."""
+    sigma_m: float = Field(0.4, ge=0, le=WILD_M)
+    """Standard deviation of the offset, before it is reflected at the half-width."""
+    tau_s: float = Field(20.0, gt=0)
+    """Correlation time of the offset."""
+
+
+class WorldSection(Section):
+    """`[world]`: the truth that the vehicles never see."""
+
+    common_error: CommonError = CommonError()
+    gnss: Gnss = Gnss()
+    lateral: Lateral = Lateral()
