@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,8 +12,13 @@ import pyarrow as pa
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
+from emulator.records.hears_all import bound_of
+from emulator.records.recorded_tables import RecordedTables
+from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
+from vnet.errors import VnetError
 from vnet.types import Array
+from vnet.units import NS_PER_S
 
 WALL_CLOCK = ("wall_s", "real_time_factor")
 """Figures that the machine decides: they differ from run to run."""
@@ -84,7 +90,19 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
         "bytes": _mean_value(states, "bytes"),
         "not_finite": sum(row.not_finite for row in rows),
         "metrics_sha256": emulation.metrics.sha256(),
+        **_bound(emulation, states, from_s),
     }
+
+
+def _bound(emulation: Emulation, states: pa.Table, from_s: float) -> dict[str, Any]:
+    """Figures of the hears-all bound from `from_s` on; none if the run has no such bound."""
+    world = RecordedWorld.of(emulation.world)
+    recorded = RecordedTables(emulation.scenario, pa.table({}), states, pa.table({}), (), world=world)
+    try:
+        figures = bound_of(recorded).after(math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
+    except VnetError:
+        return {}
+    return {f"bound_{name}": value for name, value in figures.items()}
 
 
 def _rms_columns(rows: list[list[float | None]]) -> list[float]:

@@ -89,7 +89,7 @@ def default(
     with one_line_errors():
         folder = _folder(out, "default")
         cells = paper.default_cells(paper.network_sections(networks), range(1, seeds + 1))
-        results = _run(cells, folder, "default", only, live)
+        results = paper.with_bound(_run(cells, folder, "default", only, live))
         if any(row["mechanism"] == "bound" for row in results):
             result_figures.ratio_bars(results, folder / "default")
             _show(reports.default_profile(results), folder / "default.md")

@@ -31,7 +31,8 @@ from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
 
 LOSS = 0.1
-CENTRALIZED_PARTICLES = 2000
+CENTRALIZED_PARTICLES = 4000
+"""Particles of the filter that hears all: fewer are sure of what they cannot know."""
 MECHANISMS: dict[str, dict[str, Any]] = {
     "optimized": {"fusion": "optimized"},
     "random": {"fusion": "random"},

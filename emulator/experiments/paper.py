@@ -73,17 +73,33 @@ def table2_cells(
 def default_cells(
     networks: dict[str, dict[str, Any]], seeds: Sequence[int], rows: dict[str, dict[str, Any]] | None = None
 ) -> list[Cell]:
-    """vnet's own profile on the same networks: centralized, the bound of each component, and the mechanisms."""
+    """vnet's own profile on the same networks; each run has the figures of its bound."""
     cells = []
     for network, section in networks.items():
         for seed in seeds:
-            for mechanism in ("centralized", "bound"):
-                labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
-                cells.append(Cell(labels, bound_scenario(section, seed, mechanism == "bound"), SETTLED_S))
             for mechanism, options in (rows or DEFAULT_ROWS | ONE_HOP_ROWS).items():
-                labels = {"network": network, "mechanism": mechanism, "seed": seed}
+                labels: Labels = {"network": network, "mechanism": mechanism, "seed": seed}
                 cells.append(Cell(labels, default_scenario(section, seed, options), SETTLED_S))
     return cells
+
+
+def with_bound(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the results with a row of the bound for each network and seed, from a run of the same world."""
+    bounds: dict[tuple[Any, Any], dict[str, Any]] = {}
+    for row in results:
+        if row.get("bound_common_rmse_m") is not None:
+            bounds[row["network"], row["seed"]] = {
+                **dict.fromkeys(row),
+                **{name: row[name] for name in ("network", "seed", "fix_rmse_m")},
+                "mechanism": "bound",
+                "rmse_m": row["bound_common_rmse_m"],
+                "component_rmse_m": row["bound_component_rmse_m"],
+                "deviation_m": 0.0 if len(row["bound_component_rmse_m"]) == 1 else None,
+                "position_rmse_m": row["bound_position_rmse_m"],
+                "common_error_anees": row["bound_common_anees"],
+                "divergent": 0,
+            }
+    return [*bounds.values(), *results]
 
 
 def table1_cells(seeds: Sequence[int], network: Path) -> list[Cell]:

@@ -253,8 +253,8 @@ def _notes(results: Sequence[Result]) -> str:
     runs = len(unique(results, "seed"))
     low, high = anees_band(runs)
     return (
-        f"100 s, counted from 20 s on; up to {in_seeds(runs)}. `bound` is one centralized filter "
-        "a connected component, `centralized` one over all. `one hop` mixes particles as the paper does and passes "
+        f"100 s, counted from 20 s on; up to {in_seeds(runs)}. `bound` is a Kalman filter "
+        "a connected component that hears every fix of it. `one hop` mixes particles as the paper does and passes "
         "no fixes on. Not worse: not by more than two standard errors of the paired difference. ANEES is 1 for a "
         f"consistent filter; the 95 % band of {runs} independent samples of two degrees of freedom is {low:.2f} to "
         f"{high:.2f} (the samples within a run are not independent)."

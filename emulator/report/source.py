@@ -12,6 +12,8 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.pages.canvas import Span
+from emulator.records.hears_all import COLUMNS as BOUND_COLUMNS
+from emulator.records.hears_all import BoundSeries, bound_of
 from emulator.records.key_figures import SAME
 from emulator.records.radio_metrics import RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -97,6 +99,11 @@ class Source:
         """The radio in figures, without the channel busy ratio where its table cannot be read."""
         has_busy = maybe(lambda: self.recorded.busy_ratio) is not None
         return radio_metrics(self.recorded, has_busy=has_busy)
+
+    @cached_property
+    def bound(self) -> BoundSeries:
+        """The hears-all bound. Raises VnetError if the run has none."""
+        return bound_of(RecordedRun.open(self.folder, {STATES_FILE: BOUND_COLUMNS}))
 
     # What programs report by names of their own.
 

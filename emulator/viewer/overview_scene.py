@@ -38,15 +38,13 @@ from emulator.viewer.drawing import (
     outcome_colours,
 )
 from emulator.viewer.radio_scene import next_charts_s
-from vnet.errors import first_names
+from vnet.errors import VnetError, first_names
 
 LANE_HALF_LENGTH_M = 250.0
 ELLIPSES_EVERY_S = 1.0
 CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
-LIMIT_VEHICLES = 100
-"""Most vehicles for which the bound is computed: its cost grows with their number."""
 WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "refused", "interrupted",
             "observer_ended", "host_gone"}  # fmt: skip
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
@@ -65,8 +63,10 @@ class OverviewScene:
     def __init__(self, canvas: Canvas, scene: Mapping[str, Any]) -> None:
         self._canvas = canvas
         self._node_ids: list[str] = scene["node_ids"]
-        few, lanes = len(self._node_ids) <= LIMIT_VEHICLES, len(scene["lane_heading_rad"]) > 0
-        self._limit = HearsAllBound(scene) if few and lanes and not scene["moves"] else None
+        try:
+            self._bound: HearsAllBound | None = HearsAllBound(scene)
+        except VnetError:
+            self._bound = None
         self._paper = paper_rmse(scene)
         self._weights = np.full((len(self._node_ids),) * 2, np.nan, dtype=np.float32)
         self._faults: set[str] = set()
@@ -95,8 +95,8 @@ class OverviewScene:
         canvas.rings("common", COMMON_RINGS_M)
         canvas.rings("position", POSITION_RINGS_M)
         common = [("RMSE", RED, 2.0), ("deviation between vehicles", SKY, 2.0)]
-        if self._limit is not None:
-            common.append(("bound: one filter that hears all", GREEN, 1.5))
+        if self._bound is not None:
+            common.append(("bound: a Kalman filter that hears all", GREEN, 1.5))
         if self._paper is not None:
             common.append((self._paper[0], GREY, 1.5))
         canvas.series("figures/common", common)
@@ -160,9 +160,9 @@ class OverviewScene:
     def _figures(self, period: Period) -> None:
         plot, figure = self._canvas.plot, period.figure
         common = [figure("common_error_rmse_m"), figure("deviation_m")]
-        if self._limit is not None:
-            limit_m = self._limit.step(period.message)
-            common.append(float("nan") if limit_m is None else limit_m)
+        if self._bound is not None:
+            bound_m = self._bound.step(period.message)
+            common.append(float("nan") if bound_m is None else bound_m)
         if self._paper is not None:
             common.append(self._paper[1])
         plot("figures/common", *common)

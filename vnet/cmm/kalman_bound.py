@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from vnet.types import Array
 
@@ -40,6 +40,11 @@ class LaneModel:
     acceleration_m2_s4: float = 1.0
     speed_sigma_m_s: float = 0.5
 
+    @property
+    def measured(self) -> list[list[int]]:
+        """Indices in a vehicle's own state of what adds up to a fix, each for across and along the lane."""
+        return [[0, 1]]
+
     def transition(self, dt_s: float) -> Array:
         """Return F (3, 3) of a vehicle's own state (l, s, v) over `dt_s`."""
         keep = np.exp(-dt_s / self.lateral_tau_s)
@@ -61,6 +66,38 @@ class LaneModel:
     def common_step(self, dt_s: float) -> tuple[float, float]:
         """Return the factor of c over `dt_s`, and the variance (m²) that is added an axis."""
         return common_step(self.common_sigma_m, self.common_tau_s, self.common_walk_m, dt_s)
+
+
+@dataclass(frozen=True)
+class MultipathLaneModel(LaneModel):
+    """The model with multipath (b_l, b_s) as further states of a vehicle, a Gauss-Markov process an axis.
+
+    multipath_sigma_m, multipath_tau_s: its deviation in metres and its correlation time in seconds.
+    """
+
+    multipath_sigma_m: float = 1.0
+    multipath_tau_s: float = 60.0
+
+    @property
+    def measured(self) -> list[list[int]]:
+        """Indices in a vehicle's own state of what adds up to a fix, each for across and along the lane."""
+        return [[0, 1], [3, 4]]
+
+    def transition(self, dt_s: float) -> Array:
+        """Return F (5, 5) of a vehicle's own state (l, s, v, b_l, b_s) over `dt_s`."""
+        keep = np.exp(-dt_s / self.multipath_tau_s)
+        return np.asarray(block_diag(super().transition(dt_s), keep * np.eye(2)))
+
+    def process_noise(self, dt_s: float) -> Array:
+        """Return Q (5, 5) of a vehicle's own state over `dt_s`."""
+        keep = np.exp(-dt_s / self.multipath_tau_s)
+        return np.asarray(
+            block_diag(super().process_noise(dt_s), self.multipath_sigma_m**2 * (1 - keep**2) * np.eye(2))
+        )
+
+    def own_covariance(self) -> Array:
+        """Return the covariance (5, 5) of a vehicle's own state before its first fix."""
+        return np.asarray(block_diag(super().own_covariance(), self.multipath_sigma_m**2 * np.eye(2)))
 
 
 def common_step(sigma_m: float, tau_s: float, walk_m: float | None, dt_s: float) -> tuple[float, float]:
@@ -88,34 +125,31 @@ class KalmanBound:
         self.model = model or LaneModel()
         self._point_m = point_m
         self._axes = lane_axes(heading_rad)
-        count = len(heading_rad)
-        self._mean = np.zeros(2 + 3 * count)
-        self._covariance = np.zeros((2 + 3 * count, 2 + 3 * count))
-        self._covariance[:2, :2] = self.model.common_sigma_m**2 * np.eye(2)
         own = self.model.own_covariance()
-        for vehicle in range(count):
-            rows = slice(2 + 3 * vehicle, 5 + 3 * vehicle)
-            self._covariance[rows, rows] = own
+        self._size = len(own)
+        self._covariance = block_diag(self.model.common_sigma_m**2 * np.eye(2), *[own] * len(heading_rad))
+        self._mean = np.zeros(len(self._covariance))
 
     @property
     def common_m(self) -> Array:
         """Estimate (2,) of the common error."""
-        return self._mean[:2]
+        return np.asarray(self._mean[:2])
 
     @property
     def common_covariance_m2(self) -> Array:
         """Covariance (2, 2) of the common error."""
-        return self._covariance[:2, :2]
+        return np.asarray(self._covariance[:2, :2])
 
     @property
     def position_m(self) -> Array:
         """Estimated positions (N, 2) of all vehicles."""
-        own = self._mean[2:].reshape(-1, 3)
+        own = self._mean[2:].reshape(-1, self._size)
         return np.asarray(self._point_m + np.einsum("nji,nj->ni", self._axes, own[:, :2]))
 
     def position_covariance_m2(self) -> Array:
         """Return the covariances (N, 2, 2) of the positions."""
-        blocks = [self._covariance[2 + 3 * n : 4 + 3 * n, 2 + 3 * n : 4 + 3 * n] for n in range(len(self._axes))]
+        first = 2 + self._size * np.arange(len(self._axes))
+        blocks = [self._covariance[row : row + 2, row : row + 2] for row in first.tolist()]
         return np.asarray(self._axes.transpose(0, 2, 1) @ np.array(blocks) @ self._axes)
 
     def step(self, dt_s: float, fix_m: Array, noise_m2: Array) -> None:
@@ -124,17 +158,18 @@ class KalmanBound:
         heard = np.flatnonzero(np.isfinite(fix_m[:, 0]))
         if not len(heard):
             return
-        axes, rows = self._axes[heard], (2 + 3 * heard[:, None] + np.arange(2)).ravel()
+        axes = self._axes[heard]
+        parts = [(2 + self._size * heard[:, None] + part).ravel() for part in np.array(self.model.measured)]
         common = axes.reshape(-1, 2)
         measured = np.einsum("nij,nj->ni", axes, fix_m[heard] - self._point_m[heard]).ravel()
-        projected = common @ self._covariance[:2] + self._covariance[rows]
-        innovation = projected[:, :2] @ common.T + projected[:, rows]
+        projected = common @ self._covariance[:2] + sum(self._covariance[rows] for rows in parts)
+        innovation = projected[:, :2] @ common.T + sum(projected[:, rows] for rows in parts)
         noise = axes @ noise_m2 @ axes.transpose(0, 2, 1)
         for k in range(len(heard)):
             innovation[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += noise[k]
         factor = cho_factor(innovation, lower=True)
         gain = cho_solve(factor, projected).T
-        self._mean += gain @ (measured - common @ self._mean[:2] - self._mean[rows])
+        self._mean += gain @ (measured - common @ self._mean[:2] - sum(self._mean[rows] for rows in parts))
         self._covariance -= gain @ projected
         self._covariance = (self._covariance + self._covariance.T) / 2
 
@@ -143,15 +178,16 @@ class KalmanBound:
         moves, noise = self.model.transition(dt_s), self.model.process_noise(dt_s)
         count = len(self._axes)
         self._mean[:2] *= keep
-        self._mean[2:] = (self._mean[2:].reshape(-1, 3) @ moves.T).ravel()
+        size = self._size
+        self._mean[2:] = (self._mean[2:].reshape(-1, size) @ moves.T).ravel()
         covariance = self._covariance
         covariance[:2] *= keep
         covariance[:, :2] *= keep
-        rows = covariance[2:].reshape(count, 3, -1)
-        covariance[2:] = (moves @ rows).reshape(3 * count, -1)
-        columns = covariance[:, 2:].reshape(-1, count, 3)
-        covariance[:, 2:] = (columns @ moves.T).reshape(-1, 3 * count)
+        rows = covariance[2:].reshape(count, size, -1)
+        covariance[2:] = (moves @ rows).reshape(size * count, -1)
+        columns = covariance[:, 2:].reshape(-1, count, size)
+        covariance[:, 2:] = (columns @ moves.T).reshape(-1, size * count)
         covariance[[0, 1], [0, 1]] += variance_m2
-        for vehicle in range(count):
-            own = slice(2 + 3 * vehicle, 5 + 3 * vehicle)
+        for first in range(2, len(covariance), size):
+            own = slice(first, first + size)
             covariance[own, own] += noise

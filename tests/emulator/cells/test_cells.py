@@ -161,6 +161,21 @@ def test_the_default_report_says_what_is_as_wanted_and_what_is_not() -> None:
 def test_the_default_experiment_has_one_row_of_one_hop() -> None:
     cells = paper.default_cells({"n1": TINY}, [1, 2])
     mechanisms = [cell.labels["mechanism"] for cell in cells if cell.labels["seed"] == 2]
-    assert mechanisms == ["centralized", "bound", "optimized", "random", "none", "optimized, one hop"]
+    assert mechanisms == ["optimized", "random", "none", "optimized, one hop"]
+    bound = {"bound_common_rmse_m": 0.2, "bound_component_rmse_m": [0.2], "bound_position_rmse_m": 0.4}
+    row = {
+        "network": "n1",
+        "mechanism": "none",
+        "seed": 2,
+        "rmse_m": 0.3,
+        "fix_rmse_m": 3.0,
+        "bound_common_anees": 1.0,
+    }
+    added = paper.with_bound([{**row, **bound}, {**row, "seed": 3}])
+    assert [(each["mechanism"], each["seed"], each["rmse_m"]) for each in added] == [
+        ("bound", 2, 0.2),
+        ("none", 2, 0.3),
+        ("none", 3, 0.3),
+    ]
     options = next(c for c in cells if c.labels["mechanism"] == "optimized, one hop").scenario.program.options
     assert options["relay"] is False and options["exchange"] == "particles"

@@ -39,8 +39,8 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return tell(tmp_path_factory.mktemp("bound") / "run", "agents.cooperative:main")
 
 
-def steps(told: list[dict[str, Any]], particles: int = 500) -> list[float | None]:
-    bound = HearsAllBound(told[0], particles)
+def steps(told: list[dict[str, Any]]) -> list[float | None]:
+    bound = HearsAllBound(told[0])
     return [bound.step(period) for period in told[1:]]
 
 
@@ -56,12 +56,12 @@ def test_it_finds_the_common_error_as_well_as_cooperation_does(told: list[dict[s
 
 
 def test_it_is_the_same_each_time(told: list[dict[str, Any]]) -> None:
-    assert steps(told, 50) == steps(told, 50)
+    assert steps(told) == steps(told)
 
 
 def test_it_says_nothing_where_nobody_speaks_of_a_common_error(tmp_path: Path) -> None:
     told = tell(tmp_path / "run", "agents.beacon:main", run={"duration_s": 0.5})
-    assert steps(told, 50) == [None] * 5
+    assert steps(told) == [None] * 5
 
 
 def test_fixes_that_are_missing_and_periods_that_were_left_out_are_bridged(told: list[dict[str, Any]]) -> None:

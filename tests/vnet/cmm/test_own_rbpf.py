@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from vnet.cmm.information import Information
-from vnet.cmm.kalman_bound import KalmanBound, LaneModel
+from vnet.cmm.kalman_bound import KalmanBound, LaneModel, MultipathLaneModel
 from vnet.cmm.own_rbpf import OwnRbpf
 from vnet.types import Array
 
@@ -53,6 +53,26 @@ def test_the_bound_is_the_textbook_filter() -> None:
     assert_allclose(bound.common_covariance_m2, covariance[:2, :2], atol=1e-6)
     assert_allclose(bound.position_m[0], [mean[3], -mean[2]], atol=1e-5)
     assert np.linalg.norm(bound.common_m - common_m) < 1.0
+
+
+def test_multipath_is_told_from_c_by_the_bound_that_knows_of_it() -> None:
+    """Ten vehicles on lanes in all directions, each with an error of its own that stays."""
+    rng, heading_rad = np.random.default_rng(5), np.linspace(0, np.pi, 10, endpoint=False)
+    multipath_m, common_m = 2.0 * rng.standard_normal((10, 2)), np.array([1.0, -2.0])
+    bounds = [
+        KalmanBound(np.zeros((10, 2)), heading_rad, model)
+        for model in (LaneModel(), MultipathLaneModel(multipath_sigma_m=2.0, multipath_tau_s=60.0))
+    ]
+    for k in range(100):
+        fix_m = common_m + multipath_m + rng.standard_normal((10, 2))
+        for bound in bounds:
+            bound.step(0.1 if k else 0.0, fix_m, NOISE_M2)
+    deceived, told = (
+        float((off := bound.common_m - common_m) @ np.linalg.solve(bound.common_covariance_m2, off)) / 2
+        for bound in bounds
+    )
+    assert deceived > 10, "it believes what it cannot know"
+    assert told < 3
 
 
 def test_a_vehicle_without_a_fix_is_predicted() -> None:
