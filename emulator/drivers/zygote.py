@@ -22,7 +22,7 @@ from typing import Protocol
 from emulator.drivers.process_group import has_ended, rest_of_group_ended, wait_until_ended
 from vnet.errors import VnetError
 from vnet.runtime import forking
-from vnet.runtime.environment import ONE_BLAS_THREAD
+from vnet.runtime.environment import KEPT_MEMORY, ONE_BLAS_THREAD
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.scheduling import default_time_slice
 from vnet.transport.session import AGENT_RUNTIME
@@ -31,6 +31,7 @@ AGENT_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
     "ZENOH_RUNTIME": AGENT_RUNTIME,
     "PYTHONUNBUFFERED": "1",
+    **KEPT_MEMORY,
 }
 START_TIMEOUT_S = 60.0
 """Seconds for the zygote to import its modules, or to answer: long enough for a loaded machine."""

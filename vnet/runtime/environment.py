@@ -15,6 +15,15 @@ from vnet.runtime.own_packages import foreign_on_path
 ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """One thread of linear algebra: more would not be faster here, and less reproducible."""
 
+KEPT_MEMORY = {
+    "MALLOC_TRIM_THRESHOLD_": str(64 * 2**20),
+    "MALLOC_MMAP_THRESHOLD_": str(32 * 2**20),
+    "MALLOC_TOP_PAD_": str(2**20),
+}
+"""Bounds in bytes from which glibc gives memory that was freed back to the system.
+
+By default, 128 KiB, an agent fetches the arrays of its filter again, page by page, in each period."""
+
 
 def open_standard_descriptors() -> None:
     """Lead standard input, output and error to nowhere where a caller has closed them (`>&-`).
