@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.cells.consistency import consistency_figures
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
@@ -61,7 +62,8 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
     """Figures of a run from `from_s` on: roots of mean squares over the periods, in metres.
 
     Of the common error at the end of the period (`rmse_m`, `deviation_m`, by component), right after stacking
-    (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period.
+    (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period;
+    what `consistency_figures` and, as `bound_…`, the hears-all bound have.
     """
     rows = [row for row in emulation.metrics.rows if row.time_ns >= from_s * 1e9]
 
@@ -74,6 +76,7 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
         return float(np.mean(values)) if values else None
 
     states = emulation.metrics.states_table()
+    recorded = _recorded(emulation, states)
     return {
         "rmse_m": rms("common_error_rmse_m"),
         "deviation_m": rms("deviation_m"),
@@ -90,16 +93,21 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
         "bytes": _mean_value(states, "bytes"),
         "not_finite": sum(row.not_finite for row in rows),
         "metrics_sha256": emulation.metrics.sha256(),
-        **_bound(emulation, states, from_s),
+        **consistency_figures(recorded, from_s),
+        **_bound(recorded, from_s),
     }
 
 
-def _bound(emulation: Emulation, states: pa.Table, from_s: float) -> dict[str, Any]:
+def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
+    """Return the states of a run as those of its folder."""
+    nothing, world = pa.table({}), RecordedWorld.of(emulation.world)
+    return RecordedTables(emulation.scenario, nothing, states, nothing, (), world=world)
+
+
+def _bound(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
     """Figures of the hears-all bound from `from_s` on; none if the run has no such bound."""
-    world = RecordedWorld.of(emulation.world)
-    recorded = RecordedTables(emulation.scenario, pa.table({}), states, pa.table({}), (), world=world)
     try:
-        figures = bound_of(recorded).after(math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
+        figures = bound_of(recorded).after(math.ceil(from_s * NS_PER_S / recorded.scenario.period_ns))
     except VnetError:
         return {}
     return {f"bound_{name}": value for name, value in figures.items()}

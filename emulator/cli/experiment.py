@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -126,6 +127,43 @@ def divergence(
         cells = study.divergence_cells(paper.network_sections(networks), range(1, seeds + 1), duration)
         results = _run(cells, folder, "divergence", only)
         _show(study.report(results), folder / "divergence.md")
+
+
+class Study(StrEnum):
+    """Studies of `vnet experiment compare`."""
+
+    ABLATION = "ablation"
+    ABLATION_FULL = "ablation-full"
+    BASELINES = "baselines"
+    RECEIVERS = "receivers"
+    CHURN = "churn"
+
+
+@app.command()
+def compare(
+    study: Annotated[Study, typer.Argument(help="What the cooperative program is compared with.")],
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 10,
+    duration: Annotated[
+        float | None, typer.Option(min=1, metavar="SECONDS", help="Emulated length: 100, with churn 900.")
+    ] = None,
+    common: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A recorded common error in place of a drawn one.")
+    ] = None,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """Compare the cooperative program with parts removed, with textbook baselines, or in other worlds."""
+    from emulator.experiments import comparisons
+
+    with one_line_errors():
+        folder = _folder(out, study.value)
+        duration_s = duration or (comparisons.CHURN_S if study is Study.CHURN else paper.DEFAULT_S)
+        world = {} if common is None else comparisons.recorded_common(common)
+        sections = paper.network_sections(networks)
+        cells = comparisons.comparison_cells(study.value, sections, range(1, seeds + 1), duration_s, world)
+        results = _run(cells, folder, study.value, only)
+        _show(comparisons.report(study.value, results, duration_s), folder / f"{study.value}.md")
 
 
 @app.command()

@@ -223,6 +223,10 @@ class RecordedTables:
         """A column of points of the states (periods, N, 2); NaN where there is none."""
         return self._spread(self.states[name].combine_chunks(), 2)
 
+    def matrices(self, name: str) -> Array:
+        """A column of covariances of the states (periods, N, 2, 2); NaN where there is none."""
+        return self._spread(self.states[name].combine_chunks(), 4).reshape(self.periods, -1, 2, 2)
+
     def _spread(self, column: pa.Array, size: int) -> Array:
         spread = np.full((self.periods, len(self.node_ids), size), np.nan)
         there = np.asarray(column.is_valid())

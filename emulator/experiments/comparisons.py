@@ -1,0 +1,290 @@
+"""Comparisons of the cooperative program: with parts of it removed, with textbook baselines, in other worlds.
+
+A study is a number of variants of one scenario, each a change of the program, of its options or of the world. All
+run with the same seeds, so that differences are paired; the hears-all bound is that of each run itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.cells.cells import Cell
+from emulator.experiments.paper import Labels, counted_from
+from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.statistics import paired_tests, shown_interval
+from emulator.experiments.tables import MISSING, markdown_table, paired_ratio
+from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
+from emulator.records.paper_values import PAPER_RANGE_M
+from emulator.scenario.scenario import Scenario
+from emulator.scenario.source import scenario_of
+from vnet.counted import counted
+from vnet.errors import VnetError
+
+COOPERATIVE, BASELINES = "agents.cooperative:main", "agents.baselines:main"
+REFERENCE_OPTIONS: dict[str, Any] = {"exchange": "information", "particles": 1000}
+"""Options of the first variant of each study."""
+EQUAL_RIDGE_M2 = 1e6
+"""Ridge of the quadratic program beside which nothing else counts: all weights are equal."""
+CHURN_S = 900.0
+"""Length of a run with churn."""
+CHURN_EVERY_S = 30.0
+"""Time from one loss of vehicles to the next."""
+CHURN_FOR_S = 10.0
+"""Time for which they are away; they come back with nothing remembered."""
+CHURN_VEHICLES = 2
+"""Number of vehicles that are lost at once."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A change: the program's options, and any other keys of the scenario, by "section.key"."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    keys: Mapping[str, Any] = field(default_factory=dict)
+    entry: str = COOPERATIVE
+
+
+def _with(**options: Any) -> Variant:
+    return Variant(REFERENCE_OPTIONS | options)
+
+
+def _in_world(**gnss: Any) -> Variant:
+    return Variant(REFERENCE_OPTIONS, {f"world.gnss.{name}": value for name, value in gnss.items()})
+
+
+def _baseline(method: str) -> Variant:
+    return Variant({"method": method}, entry=BASELINES)
+
+
+ABLATION: dict[str, Variant] = {
+    "reference": _with(),
+    "equal weights": _with(ridge_m2=EQUAL_RIDGE_M2),
+    "random weights": _with(fusion="random"),
+    "priors not pooled": _with(fusion="none"),
+    "nothing passed on": _with(relay_increments=0),
+    "neither": _with(fusion="none", relay_increments=0),
+    "200 particles": _with(particles=200),
+    "2000 particles": _with(particles=2000),
+    "no heading": _in_world(heading=False),
+    "no defence": _with(defence=False),
+    "every fix passed on": Variant({"exchange": "estimates", "particles": 200}),
+    "particles, one hop": Variant({"exchange": "particles", "particles": 200, "relay": False}),
+}
+"""The reference, and what becomes of it without each of its parts."""
+BASELINE: dict[str, Variant] = {
+    "reference": _with(),
+    "intersection": _baseline("intersection"),
+    "diffusion": _baseline("diffusion"),
+    "alone": _baseline("alone"),
+    "differential": _baseline("differential"),
+}
+"""The reference, and textbook methods."""
+RECEIVERS: dict[str, Variant] = {
+    "reference": _with(),
+    "multipath 1 m": _in_world(multipath_sigma_m=1.0),
+    "multipath 1 m, told": _in_world(multipath_sigma_m=1.0, covariance="total"),
+    "outliers 2 %": _in_world(outlier_probability=0.02),
+    "gradient 0.1 m/km": Variant(REFERENCE_OPTIONS, {"world.common_error.gradient_m_per_km": 0.1}),
+    "no heading": _in_world(heading=False),
+}
+"""The same program in worlds whose receivers are worse than it assumes."""
+CHURN: dict[str, Variant] = {"reference": _with(), "priors not pooled": _with(fusion="none")}
+"""Runs of 15 minutes in which vehicles leave and come back."""
+FACTORS: dict[str, dict[str, Variant]] = {
+    "exchange": {"information": _with(), "estimates": Variant({"exchange": "estimates"})},
+    "relay": {"": Variant(), "no relay": Variant({"relay_increments": 0, "relay": False})},
+    "particles": {str(count): Variant({"particles": count}) for count in (200, 1000)},
+    "heading": {"": Variant(), "no heading": Variant({}, {"world.gnss.heading": False})},
+    "defence": {"": Variant(), "no defence": Variant({"defence": False})},
+}
+"""Levels of each factor of the full ablation."""
+
+
+def full_ablation() -> dict[str, Variant]:
+    """Return every combination of the factors; the first is the reference."""
+    variants = {}
+    for levels in product(*(factor.items() for factor in FACTORS.values())):
+        name = ", ".join(label for label, _ in levels if label)
+        options: dict[str, Any] = {}
+        keys: dict[str, Any] = {}
+        for _, variant in levels:
+            options |= variant.options
+            keys |= variant.keys
+        variants[name] = Variant(options, keys)
+    return variants
+
+
+STUDIES: dict[str, Callable[[], dict[str, Variant]]] = {
+    "ablation": lambda: ABLATION,
+    "ablation-full": full_ablation,
+    "baselines": lambda: BASELINE,
+    "receivers": lambda: RECEIVERS,
+    "churn": lambda: CHURN,
+}
+"""The studies by name."""
+
+
+def comparison_cells(
+    study: str,
+    networks: Mapping[str, Mapping[str, Any]],
+    seeds: Sequence[int],
+    duration_s: float,
+    world: Mapping[str, Any] | None = None,
+) -> list[Cell]:
+    """Return a cell for each network, variant and seed; `world` has further keys of all scenarios."""
+    cells = []
+    for network, section in networks.items():
+        for name, variant in STUDIES[study]().items():
+            for seed in seeds:
+                labels: Labels = {"network": network, "mechanism": name, "seed": seed}
+                faults = list(_churn(duration_s)) if study == "churn" else []
+                scenario = _scenario(section, seed, variant, duration_s, world or {}, faults)
+                cells.append(Cell(labels, scenario, counted_from(duration_s)))
+    return cells
+
+
+def recorded_common(path: Path) -> dict[str, Any]:
+    """Return the keys of a world whose common error is recorded. Raises VnetError for a file that is not there."""
+    if not path.is_file():
+        raise VnetError(f"--common {path}: no such file")
+    return {"world.common_error.kind": "file", "world.common_error.path": str(path.resolve())}
+
+
+def _scenario(
+    network: Mapping[str, Any],
+    seed: int,
+    variant: Variant,
+    duration_s: float,
+    world: Mapping[str, Any],
+    faults: list[dict[str, Any]],
+) -> Scenario:
+    data = {
+        "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": min(5.0, duration_s / 2)},
+        "network": dict(network),
+        "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
+        "program": {"entry": variant.entry, "options": dict(variant.options)},
+        "fault": faults,
+    }
+    return scenario_of(Scenario.model_validate(data), {**world, **variant.keys})
+
+
+def _churn(duration_s: float) -> Iterator[dict[str, Any]]:
+    """Yield the faults of a run with churn."""
+    start_s = CHURN_EVERY_S
+    while start_s + CHURN_FOR_S <= duration_s - CHURN_FOR_S:
+        nodes = {"count": CHURN_VEHICLES}
+        yield {"kind": "kill", "at_s": start_s, "duration_s": CHURN_FOR_S, "nodes": nodes}
+        start_s += CHURN_EVERY_S
+
+
+# The report.
+
+HEADER = ["variant", "c [m]", "c : bound", "position [m]", "ANEES of c", "95 % ellipses: c / position"]
+HEADER += ["within 0.5 / 1.5 m", "converged [s]", "bytes", "diverged"]
+
+
+def report(study: str, results: Sequence[Result], duration_s: float) -> str:
+    """Return the table of each network, and the tests against the first variant, in Markdown."""
+    parts = [f"# Comparison: {study}"]
+    for network in unique(results, "network"):
+        rows = [row for row in results if row["network"] == network]
+        parts += [f"## {network.upper()}", markdown_table(HEADER, [*_bound_rows(rows), *_rows(rows)]), _tests(rows)]
+    parts.append(_notes(results, duration_s))
+    return "\n\n".join(parts) + "\n"
+
+
+def _rows(results: Sequence[Result]) -> Iterator[list[str]]:
+    for name in unique(results, "mechanism"):
+        rows = select(results, mechanism=name)
+        yield [
+            name,
+            shown_interval(column(rows, "rmse_m")),
+            _ratio(rows),
+            shown_interval(column(rows, "position_rmse_m")),
+            shown_interval([value for row in rows for value in row["anees_batches"]], 2),
+            f"{_percent(rows, 'coverage_95')} / {_percent(rows, 'position_coverage_95')}",
+            f"{_percent(rows, 'within_05_m')} / {_percent(rows, 'within_15_m')}",
+            _median(rows, "converged_s"),
+            _mean(rows, "bytes"),
+            f"{sum(column(rows, 'divergent'))} / {sum(column(rows, 'divergent_sigmas'))}",
+        ]
+
+
+def _bound_rows(results: Sequence[Result]) -> Iterator[list[str]]:
+    """Yield a row of the bound, if it is the same for all variants."""
+    seeds: dict[int, set[float | None]] = {}
+    for row in results:
+        if row["mechanism"] != "no heading":
+            seeds.setdefault(row["seed"], set()).add(row.get("bound_common_rmse_m"))
+    if any(len(found) > 1 or None in found for found in seeds.values()):
+        return
+    rows = select(results, mechanism=unique(results, "mechanism")[0])
+    common, position = (column(rows, f"bound_{name}_rmse_m") for name in ("common", "position"))
+    anees = shown_interval(column(rows, "bound_common_anees"), 2)
+    yield ["bound", shown_interval(common), "1", shown_interval(position), anees, *[MISSING] * 5]
+
+
+def _ratio(rows: Sequence[Result]) -> str:
+    bounds = [row.get("bound_common_rmse_m") for row in rows]
+    ratio, _ = paired_ratio(column(rows, "rmse_m"), bounds)
+    return MISSING if np.isnan(ratio) else f"{ratio:.2f}"
+
+
+def _known(rows: Sequence[Result], name: str) -> list[float]:
+    return [row[name] for row in rows if row.get(name) is not None]
+
+
+def _percent(rows: Sequence[Result], name: str) -> str:
+    known = _known(rows, name)
+    return f"{100 * np.mean(known):.1f} %" if known else MISSING
+
+
+def _mean(rows: Sequence[Result], name: str) -> str:
+    known = _known(rows, name)
+    return f"{np.mean(known):.0f}" if known else MISSING
+
+
+def _median(rows: Sequence[Result], name: str) -> str:
+    known = _known(rows, name)
+    return f"{np.median(known):.1f}" if known else MISSING
+
+
+def _tests(results: Sequence[Result]) -> str:
+    """Return the tests of each variant against the first, by errors of c and of positions."""
+    first, *others = unique(results, "mechanism")
+    seeds = {name: set(column(select(results, mechanism=name), "seed")) for name in (first, *others)}
+
+    def values(name: str, of: str, figure: str) -> list[float]:
+        both = seeds[first] & seeds[name]
+        return [row[figure] for row in select(results, mechanism=of) if row["seed"] in both]
+
+    tables = [
+        paired_tests({name: (values(name, name, figure), values(name, first, figure)) for name in others})
+        for figure in ("rmse_m", "position_rmse_m")
+    ]
+    rows = [
+        [common.name, str(common.pairs), *common.shown, *position.shown]
+        for common, position in zip(*tables, strict=True)
+    ]
+    header = ["against the first", "seeds", "c [m]", "p", "adjusted p", "position [m]", "p", "adjusted p"]
+    return markdown_table(header, rows) if rows else ""
+
+
+def _notes(results: Sequence[Result], duration_s: float) -> str:
+    seeds, variants = len(unique(results, "seed")), len(unique(results, "mechanism"))
+    tests = counted(max(0, variants - 1), "comparison")
+    return (
+        f"{duration_s:g} s, counted from {counted_from(duration_s):g} s on; {counted(seeds, 'seed')}; ± half a "
+        f"95 % interval (Student's t). Tests are paired t-tests, {tests} a network and figure, adjusted by Holm's "
+        "method. The bound is a Kalman filter a component that hears every fix of it. ANEES is the mean of batches "
+        "of 10 s, 1 for a consistent filter. Ellipses: the share of the stated 95 % ellipses that hold the truth. "
+        "Converged: median of the time from which on, for 5 s, the error of c is at most 1.5 times its later one. "
+        f"Diverged: vehicles whose c was over {DIVERGENT_M:g} m off for {DIVERGENT_S:g} s / beyond "
+        f"{DIVERGENT_SIGMAS:g} stated deviations for {DIVERGENT_S:g} s."
+    )
