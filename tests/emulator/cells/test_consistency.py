@@ -14,10 +14,10 @@ def test_normalized_errors_of_a_consistent_estimate_are_chi_squared() -> None:
     rng = np.random.default_rng(1)
     covariance_m2 = np.array([[2.0, 0.7], [0.7, 0.5]])
     error_m = rng.multivariate_normal(np.zeros(2), covariance_m2, (400, 25))
-    nees = normalized(error_m, np.broadcast_to(covariance_m2, (400, 25, 2, 2)))
-    assert nees.mean() == pytest.approx(2.0, rel=0.05)
-    assert np.mean(nees <= chi2_quantiles(0.95, 2)) == pytest.approx(0.95, abs=0.01)
-    assert batch_means(nees / 2, 100) == pytest.approx([1.0] * 4, abs=0.08)
+    squares = normalized(error_m, np.broadcast_to(covariance_m2, (400, 25, 2, 2)))
+    assert squares.mean() == pytest.approx(2.0, rel=0.05)
+    assert np.mean(squares <= chi2_quantiles(0.95, 2)) == pytest.approx(0.95, abs=0.01)
+    assert batch_means(squares / 2, 100) == pytest.approx([1.0] * 4, abs=0.08)
 
 
 def test_what_is_missing_or_no_covariance_does_not_count() -> None:
