@@ -88,6 +88,11 @@ class Estimator:
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
     @property
+    def mean_m(self) -> Array | None:
+        """The network's mean (2,) as far as it is known, None before the first."""
+        return self.consensus.mean_m
+
+    @property
     def rejected(self) -> Counter[str]:
         """Number of frames and shares of others that were not used, by reason."""
         return self._admission.rejected

@@ -8,6 +8,7 @@ import numpy as np
 
 from agents.cooperative.options import Options
 from vnet.cmm.weights import (
+    ActiveSetWeights,
     OptimizedWeights,
     constant_weights,
     max_degree_weights,
@@ -27,7 +28,8 @@ class FusionRule:
     def __init__(self, options: Options, rng: np.random.Generator) -> None:
         self._options = options
         self._rng = rng
-        self._optimized = OptimizedWeights(options.self_floor, options.ridge_m2 or None)
+        solver = ActiveSetWeights if options.chosen_solver == "daqp" else OptimizedWeights
+        self._optimized = solver(options.self_floor, options.ridge_m2 or None)
         self.largest_degree = 0
 
     def notice(self, largest_degrees: Sequence[int], own_degree: int) -> None:

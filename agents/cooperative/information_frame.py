@@ -8,15 +8,17 @@ decode to absurd values, raise a `FrameError` with a reason of one word.
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
+from vnet.cmm.consensus import Share
 from vnet.types import Array
 
 VERSION = 4
@@ -33,6 +35,7 @@ MAX_HEARD = 255
 # version, heard, passed on, largest degree, name, fix time, prior (Λ, η), increment (δΛ, δη), epoch, running sums
 _HEADER = struct.Struct("<BBBBIq5f5fI3d")
 _CHECKSUM = struct.Struct("<I")
+_FINGERPRINT = struct.Struct("<5f")
 PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
 """An increment that is passed on: its origin, and (δΛ_xx, δΛ_xy, δΛ_yy, δη_x, δη_y) with half precision."""
 
@@ -61,20 +64,37 @@ class InformationFrame:
     passed: NDArray[np.void] = field(default_factory=_nothing_passed)
     largest_degree: int = 0
 
-    @property
+    # In a process of many vehicles a frame is decoded once and read by each receiver, so these are computed once.
+
+    @cached_property
     def out_neighbours(self) -> frozenset[str]:
         """The out-neighbours: those of `heard` that are given a share."""
         return frozenset(name for name, is_given in self.heard.items() if is_given)
 
-    @property
+    @cached_property
     def names_heard(self) -> frozenset[str]:
         """The names in `heard`."""
         return frozenset(self.heard)
 
-    @property
+    @cached_property
+    def share(self) -> Share:
+        """The state of the consensus."""
+        return Share(self.epoch, self.running_sum, self.out_neighbours, self.names_heard)
+
+    @cached_property
+    def passed_numbers(self) -> Array:
+        """The increments (n, 5) that are passed on, as numbers."""
+        return self.passed["information"].astype(np.float64)
+
+    @cached_property
+    def passed_codes(self) -> NDArray[np.uint32]:
+        """The origins (n,) of the increments that are passed on."""
+        return np.ascontiguousarray(self.passed["name"])
+
+    @cached_property
     def fingerprint(self) -> bytes:
         """Bytes that no two senders share at one time: they come from the noise of a receiver."""
-        return np.array(self.increment, dtype="<f4").tobytes()
+        return _FINGERPRINT.pack(*self.increment)
 
 
 def encode(frame: InformationFrame) -> bytes:
@@ -92,9 +112,22 @@ def encode(frame: InformationFrame) -> bytes:
         *frame.running_sum,
     )
     names = bytes.fromhex("".join(frame.heard))
-    flags = np.packbits(np.array(list(frame.heard.values()), dtype=bool)).tobytes()
+    flags = _pack_flags(list(frame.heard.values()))
     body = header + names + flags + frame.passed.tobytes()
     return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
+def _pack_flags(flags: list[bool]) -> bytes:
+    """Return flags as bits, the first the highest of the first byte."""
+    size = (len(flags) + 7) // 8
+    bits = int("0" + "".join("1" if flag else "0" for flag in flags), 2)
+    return (bits << (8 * size - len(flags))).to_bytes(size, "big")
+
+
+def _unpack_flags(packed: bytes, count: int) -> list[bool]:
+    """Return the first `count` flags of `_pack_flags`."""
+    bits = f"{int.from_bytes(packed, 'big'):0{8 * len(packed)}b}" if count else ""
+    return [bit == "1" for bit in bits[:count]]
 
 
 def room(heard: int, max_payload: int) -> int:
@@ -122,27 +155,27 @@ def decode(payload: bytes) -> InformationFrame:
     if (zlib.crc32(payload[:end]),) != _CHECKSUM.unpack_from(payload, end):
         raise FrameError("checksum")
     prior, increment, epoch, running_sum = numbers[:5], numbers[5:10], numbers[10], numbers[11:]
-    passed = np.frombuffer(payload[flags_end:end], dtype=PASSED)
-    _check(prior, increment, running_sum, passed["information"])
-    flags = np.unpackbits(np.frombuffer(payload[names_end:flags_end], dtype=np.uint8), count=heard_count)
+    _check(prior, increment, running_sum)
     names, width = payload[_HEADER.size : names_end].hex(), 2 * NAME_BYTES
     each = (names[i : i + width] for i in range(0, len(names), width))
-    return InformationFrame(
+    frame = InformationFrame(
         name=name_of_code(name),
         fix_time_ns=fix_time_ns,
         prior=tuple(prior),
         increment=tuple(increment),
         epoch=epoch,
         running_sum=(running_sum[0], running_sum[1], running_sum[2]),
-        heard=dict(zip(each, flags.astype(bool).tolist(), strict=True)),
-        passed=passed,
+        heard=dict(zip(each, _unpack_flags(payload[names_end:flags_end], heard_count), strict=True)),
+        passed=np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end),
         largest_degree=degree,
     )
+    if passed_count:
+        _check_passed(frame.passed_numbers)
+    return frame
 
 
-def _check(prior: list[float], increment: list[float], running_sum: list[float], passed: Array) -> None:
-    numbers = np.array([*prior, *increment, *running_sum])
-    if not (np.isfinite(numbers).all() and np.isfinite(passed).all()):
+def _check(prior: list[float], increment: list[float], running_sum: list[float]) -> None:
+    if not all(map(math.isfinite, [*prior, *increment, *running_sum])):
         raise FrameError("not_finite")
     s_x, s_y, weight = running_sum
     if not 0 <= weight < MAX_WEIGHT or max(abs(s_x), abs(s_y)) > COMMON_LIMIT_M * weight:
@@ -151,7 +184,7 @@ def _check(prior: list[float], increment: list[float], running_sum: list[float],
     determinant = a * d - b * b
     if not (a > 0 and d > 0 and determinant > 1e-6 * a * d):
         raise FrameError("covariance")
-    if not is_increment(np.array([increment]))[0] or not is_increment(passed.astype(float)).all():
+    if not _is_semidefinite(*increment[:3]):
         raise FrameError("covariance")
     if max(map(abs, increment)) > INCREMENT_LIMIT:
         raise FrameError("absurd")
@@ -160,8 +193,21 @@ def _check(prior: list[float], increment: list[float], running_sum: list[float],
         raise FrameError("absurd")
 
 
+def _check_passed(passed: Array) -> None:
+    if not np.isfinite(passed).all():
+        raise FrameError("not_finite")
+    if not is_increment(passed).all():
+        raise FrameError("covariance")
+
+
+def _is_semidefinite(a: float, b: float, d: float) -> bool:
+    """Tell whether a matrix (xx, xy, yy) is positive semidefinite, but for rounding."""
+    slack = 1e-2 * max(abs(a), abs(d)) + 1e-6
+    return a >= 0 and d >= 0 and (a + slack) * (d + slack) >= b * b
+
+
 def is_increment(information: Array) -> NDArray[np.bool_]:
     """Tell which of (n, 5) have a matrix that is positive semidefinite, but for rounding."""
     a, b, d = information[:, 0], information[:, 1], information[:, 2]
-    slack = 1e-2 * np.abs(information[:, [0, 2]]).max(axis=1) + 1e-6
+    slack = 1e-2 * np.maximum(np.abs(a), np.abs(d)) + 1e-6
     return np.asarray((a >= 0) & (d >= 0) & ((a + slack) * (d + slack) >= b * b))

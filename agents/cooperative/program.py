@@ -111,7 +111,7 @@ def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, c
         "bytes": counts["bytes"],
         "rejected": estimator.rejected.total(),
     }
-    mean_m = estimator.consensus.mean_m
+    mean_m = estimator.mean_m
     if mean_m is not None:
         values["mean_m"] = mean_m
     if (fix.time_ns // node.period_ns) % max(1, NS_PER_S // node.period_ns) == 0:

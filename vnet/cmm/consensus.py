@@ -142,13 +142,14 @@ class RatioConsensus:
         self._penalties: dict[str, tuple[float, int]] = {}  # penalty, and the epoch up to which it accounts
         self.epoch = 0
         self._highest = 0
-        self._mass = np.zeros(3)
-        self._running_sum = np.zeros(3)
-        self._input: Array | None = None
+        # Three numbers each, (s_x, s_y, w): for so few, plain ones take a fifth of the time of arrays.
+        self._mass = (0.0, 0.0, 0.0)
+        self._running_sum = (0.0, 0.0, 0.0)
+        self._input: tuple[float, float] | None = None
         self._out_neighbours: frozenset[str] = frozenset()
         self._changed_rounds = 0
         self._age = 0
-        self._seen: dict[str, Array] = {}
+        self._seen: dict[str, tuple[float, float, float]] = {}
         self._peers = Peers(node, self._config.silence_rounds)
         self._mean: Array | None = None
         self._mean_rounds = 0  # since it was the ratio
@@ -162,7 +163,7 @@ class RatioConsensus:
     @property
     def mass(self) -> Array:
         """(s_x, s_y, w), for tests of conservation."""
-        return self._mass
+        return np.array(self._mass)
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
@@ -174,9 +175,9 @@ class RatioConsensus:
             self._take(peer, shares[peer])
         self._split()
         self._divide()
-        self._input = np.array(value, dtype=float)
-        s_x, s_y, w = self._running_sum.tolist()
-        return Share(self.epoch, (s_x, s_y, w), self._out_neighbours, self._peers.heard)
+        x, y = value.tolist()
+        self._input = float(x), float(y)
+        return Share(self.epoch, self._running_sum, self._out_neighbours, self._peers.heard)
 
     def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
         """Return the shares without those of banned peers and of implausible mass: as if these were not received.
@@ -227,8 +228,10 @@ class RatioConsensus:
         """Tell whether the mass that a peer has added since its last sum may be of common errors near (x, y)."""
         if share.epoch != self.epoch or self._node not in share.out_neighbours:
             return True
-        seen = self._seen.get(peer)
-        s_x, s_y, w = share.running_sum if seen is None else (np.array(share.running_sum) - seen).tolist()
+        s_x, s_y, w = share.running_sum
+        if peer in self._seen:
+            seen_x, seen_y, seen_w = self._seen[peer]
+            s_x, s_y, w = s_x - seen_x, s_y - seen_y, w - seen_w
         return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + MIN_MASS)
 
     def _follow(self, value: Array) -> None:
@@ -242,14 +245,16 @@ class RatioConsensus:
             self._start(self._highest, value, wanted)
         elif self.epoch:
             assert self._input is not None
-            self._mass[:2] += value - self._input
+            (x, y), (s_x, s_y, w) = value.tolist(), self._mass
+            self._mass = s_x + (x - self._input[0]), s_y + (y - self._input[1]), w
             self._age += 1
 
     def _start(self, epoch: int, value: Array, out_neighbours: frozenset[str]) -> None:
         self.epoch = self._highest = epoch
-        self._mass = np.array([value[0], value[1], 1.0])
+        x, y = value.tolist()
+        self._mass = float(x), float(y), 1.0
         self._usual_weight = 1.0
-        self._running_sum = np.zeros(3)
+        self._running_sum = (0.0, 0.0, 0.0)
         self._out_neighbours = out_neighbours
         self._changed_rounds = 0
         self._age = 0
@@ -258,9 +263,10 @@ class RatioConsensus:
     def _take(self, peer: str, share: Share) -> None:
         if share.epoch != self.epoch or self._node not in share.out_neighbours:
             return
-        total = np.array(share.running_sum)
-        self._mass += total - self._seen.get(peer, 0.0)
-        self._seen[peer] = total
+        (x, y, w), (s_x, s_y, s_w) = share.running_sum, self._mass
+        seen_x, seen_y, seen_w = self._seen.get(peer, (0.0, 0.0, 0.0))
+        self._mass = s_x + (x - seen_x), s_y + (y - seen_y), s_w + (w - seen_w)
+        self._seen[peer] = share.running_sum
 
     def _divide(self) -> None:
         """Take the ratio for the mean, if it can be trusted.
@@ -269,18 +275,21 @@ class RatioConsensus:
         are then too much for it; in the end for all nodes, whose mass goes there too.
         """
         self._mean_rounds += 1
-        weight = float(self._mass[2]) * (len(self._out_neighbours) + 1)  # before it was split
+        s_x, s_y, w = self._mass
+        weight = w * (len(self._out_neighbours) + 1)  # before it was split
         self._usual_weight += (weight - self._usual_weight) / USUAL_ROUNDS
         settled = self.epoch and self._age >= self._config.settle_rounds
         doubtful = self._peers.longest_silence(self._out_neighbours) >= DOUBTFUL_ROUNDS
         if settled and not doubtful and weight >= MIN_WEIGHT_SHARE * self._usual_weight:
-            self._mean, self._mean_rounds = self._mass[:2] / self._mass[2], 0
+            self._mean, self._mean_rounds = np.array([s_x / w, s_y / w]), 0
 
     def _split(self) -> None:
         if self.epoch:
-            share = self._mass / (len(self._out_neighbours) + 1)
-            self._running_sum += share
-            self._mass = self._mass - share * len(self._out_neighbours)
+            given, (x, y, w) = len(self._out_neighbours), self._mass
+            x_given, y_given, w_given = x / (given + 1), y / (given + 1), w / (given + 1)
+            r_x, r_y, r_w = self._running_sum
+            self._running_sum = r_x + x_given, r_y + y_given, r_w + w_given
+            self._mass = x - x_given * given, y - y_given * given, w - w_given * given
 
 
 class DirectMean:
@@ -382,3 +391,19 @@ def _towards(state: Array, degree: float, other: tuple[float, float, float]) -> 
     """Step (2,) from a node's own state towards a peer's, by the larger of both degrees."""
     x, y, other_degree = other
     return np.asarray((np.array([x, y]) - state) / max(degree, other_degree, 1.0))
+
+
+CONSENSUS_SHARE = 0.2
+"""Weight of the consensus where inputs move: on N2 the error of the mean is then 0.072 m, of the neighbours' mean
+0.070 m, of consensus alone 0.147 m, and the estimates themselves are 0.086 m from the mean."""
+
+
+def tracked_mean(neighbours_mean_m: Array, mean_m: Array | None) -> Array:
+    """Return the network's mean (2,) from the neighbours' of this instant and what consensus says, if anything.
+
+    Consensus takes dozens of rounds, in which the inputs move by more than they differ; what neighbours say is of
+    this instant, but of few.
+    """
+    if mean_m is None:
+        return neighbours_mean_m
+    return np.asarray(neighbours_mean_m + CONSENSUS_SHARE * (mean_m - neighbours_mean_m))

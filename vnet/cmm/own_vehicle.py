@@ -104,13 +104,14 @@ class OwnVehicle:
             return nothing
         if not self._is_placed:
             self._place(fix)
-        elif self._filter.distance(fix.position_m, fix.covariance_m2) > GATE_SIGMAS**2:
+        distance, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
+        if distance > GATE_SIGMAS**2:
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
                 return nothing
             self._place(fix)
+            _, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
         self._outliers_s = 0.0
-        increment = self._filter.increment(fix.position_m, fix.covariance_m2)
         self._filter.update(fix.position_m, fix.covariance_m2)
         return increment
 

@@ -36,19 +36,20 @@ def matrices(information: Array) -> Array:
     return information.take(_ENTRIES, axis=1).reshape(-1, 2, 2)
 
 
-def inverses(matrix: Array) -> Array:
-    """Return the inverses of symmetric matrices (n, 2, 2)."""
-    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
-    determinant = a * d - b * b
-    inverse = np.empty_like(matrix)
-    inverse[:, 0, 0], inverse[:, 1, 1] = d / determinant, a / determinant
-    inverse[:, 0, 1] = inverse[:, 1, 0] = -b / determinant
-    return inverse
+def moments(information: Array) -> tuple[Array, Array]:
+    """Return means (n, 2) and covariances (n, 2, 2) of beliefs (n, 5)."""
+    a, b, d, x, y = np.ascontiguousarray(information.T)
+    entries = np.stack([d, -b, a]) / (a * d - b * b)
+    variance_x, covariance, variance_y = entries
+    mean = np.stack([variance_x * x + covariance * y, covariance * x + variance_y * y], axis=1)
+    return mean, matrices(entries.T)
 
 
 def scaled_down(information: Array, largest_trace: float) -> Array:
     """Return information (n, 5) with traces of at most `largest_trace`; means stay."""
     trace = information[:, 0] + information[:, 2]
+    if not len(trace) or trace.max() <= largest_trace:
+        return information
     return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
 
 
@@ -57,14 +58,18 @@ def deviation(information: Array, mean_m: Array, covariance_m2: Array, noise: Ar
 
     `noise` (n, 3) is the covariance D of η given c, (xx, xy, yy); that of one increment is its Λ.
     """
-    matrix = matrices(information)
-    total = matrices(noise) + matrix @ covariance_m2 @ matrix
-    off = information[:, 3:] - matrix @ mean_m
+    a, b, d, x, y = np.ascontiguousarray(information.T)
+    (p, q), (_, r) = covariance_m2.tolist()
+    off_x, off_y = x - a * mean_m[0] - b * mean_m[1], y - b * mean_m[0] - d * mean_m[1]
+    ap_bq, aq_br, bp_dq, bq_dr = a * p + b * q, a * q + b * r, b * p + d * q, b * q + d * r
+    total_x = noise[:, 0] + ap_bq * a + aq_br * b
+    total_xy = noise[:, 1] + ap_bq * b + aq_br * d
+    total_y = noise[:, 2] + bp_dq * b + bq_dr * d
     # A lane says nothing along itself: rounding there is not counted.
-    slack = 1e-4 * (total[:, 0, 0] + total[:, 1, 1]) + 1e-9
-    a, b, d = total[:, 0, 0] + slack, total[:, 0, 1], total[:, 1, 1] + slack
-    x, y = off[:, 0], off[:, 1]
-    return np.asarray((d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b))
+    slack = 1e-4 * (total_x + total_y) + 1e-9
+    total_x, total_y = total_x + slack, total_y + slack
+    squared = total_y * off_x * off_x - 2 * total_xy * off_x * off_y + total_x * off_y * off_y
+    return np.asarray(squared / (total_x * total_y - total_xy * total_xy))
 
 
 def priors_agree(
@@ -94,17 +99,17 @@ class Origins:
         """
         if not codes:
             return np.zeros(0, dtype=np.bool_)
-        rows = self._rows(codes, now_s)
-        keep = np.exp((self._time_s[rows] - now_s) / MEMORY_S)[:, None]
-        sums = self._sums[rows]
-        sums *= np.hstack([np.tile(keep, 5), np.tile(keep * keep, 3)])
-        sums[:, :5] += increments
-        sums[:, 5:] += increments[:, :3]
-        self._sums[rows], self._time_s[rows] = sums, now_s
-        both = np.concatenate([increments, sums[:, :5]])
-        noise = np.concatenate([increments[:, :3], sums[:, 5:]])
-        near = deviation(both, *belief, noise) < INCREMENT_GATE
-        return np.asarray(near[: len(codes)] & near[len(codes) :])
+        rows, count = self._rows(codes, now_s), len(codes)
+        keep = np.exp((self._time_s.take(rows) - now_s) / MEMORY_S)[:, None]
+        sums = self._sums.take(rows, axis=0)
+        sums *= keep
+        sums[:, 5:] *= keep
+        said = np.empty((2 * count, 8))  # each increment with its noise, then each sum
+        said[:count, :5], said[:count, 5:] = increments, increments[:, :3]
+        np.add(sums, said[:count], out=said[count:])
+        self._sums[rows], self._time_s[rows] = said[count:], now_s
+        near = deviation(said[:, :5], *belief, said[:, 5:]) < INCREMENT_GATE
+        return np.asarray(near[:count] & near[count:])
 
     def _rows(self, codes: Sequence[int], now_s: float) -> NDArray[np.intp]:
         """Return the rows of origins; new ones are added, and old ones forgotten when there are too many."""
@@ -125,7 +130,7 @@ class Origins:
 
 def median_belief(priors: Array) -> Information:
     """Return a belief at the coordinate-wise median of the means of `priors` (n, 5), as wide as the widest."""
-    covariance = inverses(matrices(priors))
-    mean = np.median(np.einsum("nij,nj->ni", covariance, priors[:, 3:]), axis=0)
+    means, covariance = moments(priors)
+    mean = np.median(means, axis=0)
     variance = float(np.max(covariance[:, 0, 0] + covariance[:, 1, 1]))
     return Information.of(mean, variance * np.eye(2))

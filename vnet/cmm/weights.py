@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import lru_cache
 
+import daqp
 import numpy as np
 import osqp
 import scipy.sparse as sp
@@ -47,20 +48,31 @@ class OptimizedWeights:
         count = len(estimates_m)
         if count == 1:
             return np.ones(1)
+        hessian = self._hessian(estimates_m, covariances_m2, mean_m)
+        weights = self._minimize(hessian)
+        weights = np.minimum(np.maximum(weights, 0.0), 1.0)
+        total = float(weights.sum())
+        return np.asarray(weights / total) if np.isfinite(total) and total > 0 else no_fusion_weights(count)
+
+    def _hessian(self, estimates_m: Array, covariances_m2: Array, mean_m: Array) -> Array:
+        count = len(estimates_m)
         offset = estimates_m - mean_m
         if self._ridge_m2 is None:
-            ridge = np.maximum(np.trace(covariances_m2, axis1=1, axis2=2), RIDGE_FLOOR_M2)
+            ridge = np.maximum(covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1], RIDGE_FLOOR_M2)
         else:
             ridge = np.full(count, self._ridge_m2)
         hessian = 2 * (offset @ offset.T)
         hessian.flat[:: count + 1] += 2 * ridge
+        return np.asarray(hessian)
+
+    def _minimize(self, hessian: Array) -> Array:
+        """Return the weights (n,) that minimize ½ aᵀ H a, but for the solver's tolerance."""
+        count = len(hessian)
         scale = float(hessian.flat[:: count + 1].mean())  # OSQP's tolerances are absolute
         rows, columns = _upper_triangle(count)
         solver = self._solver(count)
         solver.update(Px=(hessian / scale)[rows, columns])
-        weights = np.clip(np.asarray(solver.solve(raise_error=False).x), 0.0, 1.0)
-        total = float(weights.sum())
-        return np.asarray(weights / total) if np.isfinite(total) and total > 0 else no_fusion_weights(count)
+        return np.asarray(solver.solve(raise_error=False).x)
 
     def _solver(self, count: int) -> osqp.OSQP:
         if count not in self._solvers:
@@ -75,6 +87,31 @@ class OptimizedWeights:
             solver.setup(hessian, np.zeros(count), constraints, lower, np.ones(count + 1), **_SETTINGS)
             self._solvers[count] = solver
         return self._solvers[count]
+
+
+class ActiveSetWeights(OptimizedWeights):
+    """The same weights by DAQP (Arnström, Bemporad and Axehill 2022), a dual active-set solver.
+
+    It solves exactly, from scratch each time, and in a fifth of OSQP's time: 12 in place of 56 µs with 8 estimates,
+    26 in place of 133 µs with 31. The weights of OSQP differ by 10⁻⁵ at most.
+    """
+
+    def _minimize(self, hessian: Array) -> Array:
+        count = len(hessian)
+        linear, total, upper, lower, kinds = _simplex(count, self._self_floor)
+        return np.asarray(daqp.solve(hessian, linear, total, upper, lower, kinds)[0])
+
+
+_DAQP_EQUALITY = 5
+"""DAQP's code of an equality constraint."""
+
+
+@lru_cache(maxsize=256)
+def _simplex(count: int, self_floor: float) -> tuple[Array, Array, Array, Array, NDArray[np.int32]]:
+    """Return linear cost, constraint matrix, bounds and kinds: 0 ≤ a_j ≤ 1, a_0 ≥ floor, and Σ a_j = 1."""
+    lower, kinds = np.zeros(count + 1), np.zeros(count + 1, dtype=np.int32)
+    lower[0], lower[count], kinds[count] = self_floor, 1.0, _DAQP_EQUALITY
+    return np.zeros(count), np.ones((1, count)), np.ones(count + 1), lower, kinds
 
 
 def no_fusion_weights(count: int) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -294,7 +294,8 @@ def test_a_frame_comes_back(frame: InformationFrame) -> None:
     payload = encode(frame)
     got = decode(payload)
     assert np.array_equal(got.passed, frame.passed)
-    assert vars(got) | {"passed": None} == vars(frame) | {"passed": None}
+    others = [field.name for field in fields(frame) if field.name != "passed"]
+    assert [getattr(got, name) for name in others] == [getattr(frame, name) for name in others]
     assert len(frame.passed) <= room(len(frame.heard), len(payload))
 
 

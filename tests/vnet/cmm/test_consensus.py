@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vnet.cmm.consensus import AveragingConsensus, ConsensusConfig, RatioConsensus, Share
+from vnet.cmm.consensus import AveragingConsensus, ConsensusConfig, RatioConsensus, Share, tracked_mean
 from vnet.errors import VnetError
 
 Hears = Callable[[int, int, int], bool]
@@ -322,3 +322,9 @@ def test_who_gives_to_the_dead_keeps_the_mean_of_before(alive_rounds: int) -> No
         mean = nodes["a"].mean_m
         assert mean is None or np.linalg.norm(mean - (5.0, -3.0)) < 0.6, mean
     assert mean is not None
+
+
+def test_a_moving_mean_is_mostly_what_neighbours_say_now() -> None:
+    neighbours, consensus = np.array([1.0, 2.0]), np.array([2.0, 2.0])
+    assert tracked_mean(neighbours, None).tolist() == [1.0, 2.0]
+    assert tracked_mean(neighbours, consensus).tolist() == [1.2, 2.0]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from vnet.cmm.information import Information, gained, inverse, square_root, transport
-from vnet.cmm.plausibility import Origins, deviation, inverses, matrices, median_belief, priors_agree, scaled_down
+from vnet.cmm.plausibility import Origins, deviation, matrices, median_belief, moments, priors_agree, scaled_down
 from vnet.types import Array
 
 
@@ -26,7 +26,35 @@ def covariances(draw: st.DrawFn) -> Array:
 def test_inverse_and_square_root_are_those_of_the_matrix(matrix: Array) -> None:
     assert_allclose(inverse(matrix) @ matrix, np.eye(2), atol=1e-6)
     assert_allclose(square_root(matrix) @ square_root(matrix), matrix, rtol=1e-9, atol=1e-9)
-    assert_allclose(inverses(matrix[None])[0], np.linalg.inv(matrix), rtol=1e-6, atol=1e-9)
+
+
+@st.composite
+def many(draw: st.DrawFn) -> Array:
+    """Draw one to five pieces of information (n, 5)."""
+    matrix = [draw(covariances()) for _ in range(draw(st.integers(1, 5)))]
+    return np.array([[m[0, 0], m[0, 1], m[1, 1], draw(st.floats(-9, 9)), draw(st.floats(-9, 9))] for m in matrix])
+
+
+@given(many())
+def test_moments_of_many_are_those_of_each(information: Array) -> None:
+    means_m, covariances_m2 = moments(information)
+    for row, mean_m, covariance_m2 in zip(information, means_m, covariances_m2, strict=True):
+        expected = Information(matrices(row[None])[0], row[3:]).moments()
+        assert_allclose(mean_m, expected[0], rtol=1e-6, atol=1e-6)
+        assert_allclose(covariance_m2, expected[1], rtol=1e-6, atol=1e-9)
+
+
+@given(many(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
+def test_deviations_of_many_are_those_of_each(
+    information: Array, covariance_m2: Array, mean: tuple[float, float]
+) -> None:
+    got = deviation(information, np.array(mean), covariance_m2, information[:, :3])
+    for row, value in zip(information, got.tolist(), strict=True):
+        matrix = matrices(row[None])[0]
+        total = matrix + matrix @ covariance_m2 @ matrix
+        total += (1e-4 * np.trace(total) + 1e-9) * np.eye(2)
+        off = row[3:] - matrix @ np.array(mean)
+        assert value == pytest.approx(off @ np.linalg.solve(total, off), rel=1e-5, abs=1e-9)
 
 
 @given(covariances(), covariances())

@@ -104,7 +104,7 @@ def test_the_increment_is_what_the_fix_adds() -> None:
     own = OwnRbpf(EAST, LaneModel(), 50_000, np.random.default_rng(2))
     for fix in _fixes(5, 0.0, np.array([1.0, 1.0]), 5):
         own.predict(0.1)
-        before, increment = own.belief, own.increment(fix, NOISE_M2)
+        before, (_, increment) = own.belief, own.expects(fix, NOISE_M2)
         own.update(fix, NOISE_M2)
         expected = before.plus(increment).moments()
         assert_allclose(own.estimate_m, expected[0], atol=0.05)
@@ -117,7 +117,7 @@ def test_nothing_counts_twice() -> None:
     said = []
     for fix in _fixes(300, 0.0, np.zeros(2), 9):
         own.predict(0.1)
-        said.append(np.trace(own.increment(fix, NOISE_M2).matrix))
+        said.append(np.trace(own.expects(fix, NOISE_M2)[1].matrix))
         own.update(fix, NOISE_M2)
     assert sum(said) < 1.2 / 0.38**2  # no more than what an offset of 0.38 m can tell
     assert said[-1] < said[0] / 50
@@ -162,8 +162,8 @@ def test_a_fix_that_is_far_off_is_seen() -> None:
     for fix in _fixes(20, 0.0, np.zeros(2), 4):
         own.predict(0.1)
         own.update(fix, NOISE_M2)
-    assert own.distance(np.array([0.3, 0.2]), NOISE_M2) < 9
-    assert own.distance(np.array([30.0, 0.0]), NOISE_M2) > 25
+    assert own.expects(np.array([0.3, 0.2]), NOISE_M2)[0] < 9
+    assert own.expects(np.array([30.0, 0.0]), NOISE_M2)[0] > 25
 
 
 def test_the_sample_is_of_the_cloud() -> None:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from vnet.cmm.weights import (
+    ActiveSetWeights,
     OptimizedWeights,
     constant_weights,
     largest_remainder,
@@ -26,10 +27,14 @@ def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return estimates, covariances, rng.normal(size=2) * 0.3
 
 
+SOLVERS = [OptimizedWeights, ActiveSetWeights]
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("seed", range(30))
-def test_optimized_weights_are_the_minimum(seed: int) -> None:
+def test_optimized_weights_are_the_minimum(seed: int, solver: type[OptimizedWeights]) -> None:
     estimates, covariances, mean = problem(seed)
-    weights = OptimizedWeights().solve(estimates, covariances, mean)
+    weights = solver().solve(estimates, covariances, mean)
     offset = estimates - mean
     hessian = offset @ offset.T + np.diag(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.01))
     count = len(estimates)
@@ -53,11 +58,12 @@ def test_the_same_history_gives_the_same_bits() -> None:
         assert np.array_equal(first.solve(*problem(seed)), second.solve(*problem(seed)))
 
 
-def test_a_floor_keeps_ones_own_estimate() -> None:
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_floor_keeps_ones_own_estimate(solver: type[OptimizedWeights]) -> None:
     estimates = np.array([[5.0, 5.0], [0.0, 0.0], [0.1, 0.0]])
     covariances = np.eye(2) * np.full((3, 1, 1), 0.01)
-    assert OptimizedWeights().solve(estimates, covariances, np.zeros(2))[0] < 0.01
-    assert OptimizedWeights(0.25).solve(estimates, covariances, np.zeros(2))[0] == pytest.approx(0.25, abs=1e-4)
+    assert solver().solve(estimates, covariances, np.zeros(2))[0] < 0.01
+    assert solver(0.25).solve(estimates, covariances, np.zeros(2))[0] == pytest.approx(0.25, abs=1e-4)
 
 
 @pytest.mark.parametrize(
