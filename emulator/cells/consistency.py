@@ -28,6 +28,8 @@ CONVERGED_S = 5.0
 def consistency_figures(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
     """Return figures of the states of a run from `from_s` on; None where nothing was reported.
 
+    median_error_m, median_position_error_m: medians over vehicles and periods. median_anees: that of the normalized
+    squared errors of the common error, relative to the one of χ² with 2 degrees of freedom: 1 if consistent.
     coverage_95, position_coverage_95: share of the 95 % ellipses of common error and position that hold the truth.
     anees_batches: means of the normalized squared errors of the common error, one of each 10 s. within_05_m,
     within_15_m: share of the positions that are so near the truth. converged_s: beginning of the first 5 s in which
@@ -43,6 +45,9 @@ def consistency_figures(recorded: RecordedTables, from_s: float) -> dict[str, An
     inside = float(chi2_quantiles(COVERED, 2))
     away_m = np.linalg.norm(position_m[first:], axis=2)
     return {
+        "median_error_m": _median(np.linalg.norm(common_m[first:], axis=2)),
+        "median_position_error_m": _median(away_m),
+        "median_anees": _median(common_nees[first:] / float(chi2_quantiles(0.5, 2))),
         "coverage_95": _share(common_nees[first:], inside),
         "position_coverage_95": _share(position_nees[first:], inside),
         "anees_batches": batch_means(common_nees[first:] / 2, max(1, round(BATCH_S * NS_PER_S / period_ns))),
@@ -65,6 +70,11 @@ def normalized(error_m: Array, covariance_m2: Array) -> Array:
 def _share(values: Array, limit: float) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.mean(known <= limit)) if len(known) else None
+
+
+def _median(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 def batch_means(values: Array, periods: int) -> list[float]:

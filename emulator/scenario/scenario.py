@@ -101,6 +101,9 @@ class Network(Section):
     """Trips: what is faster is a jump."""
     longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
     """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
+    max_acceleration_mps2: float | None = Field(None, gt=0, le=FAR_M)
+    """Trips: where a vehicle would need a greater acceleration, in the mean of half a second, it leaves, and enters
+    again behind; such jumps are driven if left out. Vehicles reach 10."""
     impossible_trips: Literal["leave_out", "refuse"] = "leave_out"
     """Trips: a vehicle with many steps that no vehicle can make is left out, which one line says, or the run is
     refused. If most vehicles are so, units or ids are wrong, and the run is refused in any case."""

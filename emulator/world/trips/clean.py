@@ -58,11 +58,14 @@ class ImpossibleTripError(ScenarioError):
 
 @dataclass(frozen=True)
 class Rules:
-    """Greatest speed of a vehicle, longest gap between its samples, and whether impossible trips are left out."""
+    """Greatest speed of a vehicle, longest gap between its samples, whether impossible trips are left out, and the
+    greatest acceleration that is driven, if there is one.
+    """
 
     fastest_mps: float
     longest_gap_s: float
     leaves_out: bool = True
+    hardest_mps2: float | None = None
 
 
 def clean(trip: Trip, rules: Rules) -> list[Rows]:

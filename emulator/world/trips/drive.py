@@ -32,7 +32,12 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     """
     path = network.path
     assert path is not None
-    rules = Rules(network.fastest_mps, network.longest_gap_s, network.impossible_trips == "leave_out")
+    rules = Rules(
+        fastest_mps=network.fastest_mps,
+        longest_gap_s=network.longest_gap_s,
+        leaves_out=network.impossible_trips == "leave_out",
+        hardest_mps2=network.max_acceleration_mps2,
+    )
     duration_s = (periods - 1) * period_ns / NS_PER_S
     start_s = network.start_s
     if network.kind == "sumo":

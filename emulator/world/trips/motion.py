@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 
 from emulator.world.trips.clean import ImpossibleTripError, Rules, clean
 from emulator.world.trips.samples import Trip
+from vnet.counted import counted
 from vnet.errors import ScenarioError, first_names
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
 STANDING_MPS = 0.5
 """Speed below which a vehicle stands and keeps its heading."""
+ACCELERATION_S = 0.5
+"""Time before and after an instant over which speeds are taken for an acceleration: recordings have noise."""
 CHORD_S = 0.5
 """Half of the time over which a heading is computed from positions."""
 SHORTEST_STAY_S = 1.0
@@ -63,10 +66,13 @@ def motion_of(trips: list[Trip], selection: Selection, rules: Rules) -> Motion:
     impossible trip that is not to be left out.
     """
     driven: list[tuple[str, Array | None]] = []
+    cuts: list[int] = []
     impossible: list[ImpossibleTripError] = []
     for trip in trips:
         try:
-            driven.append((trip.node_id, _drive(trip, selection, rules)))
+            states, cut = _drive(trip, selection, rules)
+            driven.append((trip.node_id, states))
+            cuts += [cut] if cut else []
         except ImpossibleTripError as error:
             impossible.append(error)
             if not rules.leaves_out or len(impossible) > MOST_LEFT_OUT * len(trips):
@@ -88,7 +94,12 @@ def motion_of(trips: list[Trip], selection: Selection, rules: Rules) -> Motion:
         )
     states = np.stack([driven for _, _, driven in present], axis=1)
     names = tuple(name for _, name, _ in present)
-    return Motion(names, states[..., :2], states[..., 2], notes=_left_out(impossible, len(trips)))
+    return Motion(
+        names,
+        states[..., :2],
+        states[..., 2],
+        notes=(*_left_out(impossible, len(trips)), *_cut(cuts, len(trips), rules)),
+    )
 
 
 def _left_out(impossible: Sequence[ImpossibleTripError], of: int) -> tuple[str, ...]:
@@ -99,11 +110,24 @@ def _left_out(impossible: Sequence[ImpossibleTripError], of: int) -> tuple[str, 
     return (f"{len(impossible)} of {of} vehicles left out as impossible: {reasons}",)
 
 
-def _drive(trip: Trip, selection: Selection, rules: Rules) -> Array | None:
-    """Return a vehicle's position and heading (K, 3) at the start of each period; None if it is never present."""
+def _cut(cuts: Sequence[int], of: int, rules: Rules) -> tuple[str, ...]:
+    """Return the line that says how many vehicles were cut, and how often."""
+    if not cuts:
+        return ()
+    places = counted(sum(cuts), "place")
+    return (f"{len(cuts)} of {of} vehicles cut at {places} where they would need over {rules.hardest_mps2:g} m/s²",)
+
+
+def _drive(trip: Trip, selection: Selection, rules: Rules) -> tuple[Array | None, int]:
+    """Return a vehicle's position and heading (K, 3) at the start of each period, and at how many places it is cut.
+
+    None if it is never present.
+    """
     driven = np.full((selection.periods, 3), np.nan)
     for rows in clean(trip, rules):
         _resample(driven, trip, rows, selection)
+    impossible = _too_hard(driven[:, :2], selection.period_ns, rules)
+    driven[impossible] = np.nan
     present = np.isfinite(driven[:, 0])
     if selection.disc is not None:
         x, y, radius_m = selection.disc
@@ -114,7 +138,21 @@ def _drive(trip: Trip, selection: Selection, rules: Rules) -> Array | None:
     for begin, end in _runs_of_true(present):
         present[begin:end] = end - begin >= shortest
     driven[~present] = np.nan
-    return driven if present[: selection.periods - 1].any() else None
+    is_there = bool(present[: selection.periods - 1].any())
+    return (driven, len(_runs_of_true(impossible))) if is_there else (None, 0)
+
+
+def _too_hard(position_m: Array, period_ns: int, rules: Rules) -> NDArray[np.bool_]:
+    """Return the mask (K,) of the periods between positions (K, 2) that no possible acceleration connects."""
+    hard = np.zeros(len(position_m), dtype=bool)
+    step = max(1, round(ACCELERATION_S * NS_PER_S / period_ns))
+    if rules.hardest_mps2 is None or len(position_m) <= 2 * step:
+        return hard
+    speed_mps = (position_m[step:] - position_m[:-step]) / (step * period_ns / NS_PER_S)
+    change_mps2 = np.hypot(*(speed_mps[step:] - speed_mps[:-step]).T) / (step * period_ns / NS_PER_S)
+    for middle in (np.flatnonzero(change_mps2 > rules.hardest_mps2) + step).tolist():
+        hard[middle - step + 1 : middle + step] = True
+    return hard
 
 
 def _without_excursions(inside: NDArray[np.bool_], present: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:

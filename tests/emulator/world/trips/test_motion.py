@@ -1,6 +1,7 @@
 """Cleaning of recorded trips, and the motion: standing, held positions, jumps, gaps, headings."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -130,6 +131,39 @@ def test_impossible_trips_are_refused_if_wanted_or_if_most_are() -> None:
         drive(good, *wild)
     with pytest.raises(ScenarioError, match="check units"):
         motion_of([good, wild[0]], Selection(0.0, 101, TENTH_NS), Rules(70.0, 10.0, leaves_out=False))
+
+
+CUT = replace(RULES, hardest_mps2=10.0)
+
+
+def test_what_needs_an_impossible_acceleration_is_cut_and_counted() -> None:
+    time_s = np.arange(0, 30, 0.1)
+    jumping = trip(time_s, 12 * time_s + np.where(time_s < 15, 0.0, 17.0), name="jumps")
+    braking = trip(
+        time_s, np.minimum(12 * time_s - 4.5 * np.clip(time_s - 10, 0, 12 / 9) ** 2, 128.0), name="brakes"
+    )
+    selection = Selection(0.0, 301, TENTH_NS)
+    course = motion_of([jumping, braking], selection, CUT)
+    assert course.notes == ("1 of 2 vehicles cut at 2 places where they would need over 10 m/s²",)
+    gone = np.flatnonzero(np.isnan(x_of(course)[:299])) / 10
+    assert gone[0] == pytest.approx(14.5, abs=1.0)
+    assert 1.0 < gone[-1] - gone[0] < 3.0, "where it comes up to speed, and where it slows down again"
+    assert there(course, 1) == (0.0, 29.9), "hard braking is possible"
+    assert not np.isnan(x_of(motion_of([jumping], selection, RULES))[:299]).any(), "driven if not asked for"
+
+
+@settings(max_examples=30)
+@given(st.lists(st.floats(-30, 30), min_size=30, max_size=120))
+def test_nothing_that_is_driven_needs_more_than_allowed(steps_m: list[float]) -> None:
+    x_m = np.cumsum(steps_m)
+    try:
+        course = motion_of([trip(np.arange(len(x_m)) / 10, x_m)], Selection(0.0, len(x_m), TENTH_NS), CUT)
+    except ScenarioError:
+        return
+    speed_mps = (course.position_m[5:, 0, 0] - course.position_m[:-5, 0, 0]) / 0.5
+    change_mps2 = np.abs(speed_mps[5:] - speed_mps[:-5]) / 0.5
+    unbroken = np.lib.stride_tricks.sliding_window_view(np.isfinite(course.position_m[:, 0, 0]), 11).all(axis=1)
+    assert not (change_mps2[unbroken] > 10 + 1e-6).any()
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 12.0])
