@@ -129,7 +129,9 @@ class Csma:
         if station is None:
             station = self._stations[frame.sender] = _Station(frame.sender)
         frame.signal = self._signals.of(frame)
-        ready_ns = frame.sent_ns + int(self._jitter_ns * sender_draw(frame, JITTER))
+        ready_ns = frame.sent_ns
+        if self._jitter_ns:
+            ready_ns += int(self._jitter_ns * sender_draw(frame, JITTER))
         if self._throttle.slows(frame.sender):
             slow_ns = self._throttle.put(frame, ready_ns, self._limit)
             if slow_ns is None:

@@ -28,7 +28,7 @@ class Signal:
     """A frame's signal at the receivers, (N,) each; the entry of its own sender holds the transmit power.
 
     `random_draws` are words of 64 random bits, which give the draws that decide about it. `power_mw` is the
-    received power in mW, 0 out of range.
+    received power in mW, 0 out of range. `sender_draws` is the word of the frame's own sender.
 
     `locked` marks the receivers that are locked on this frame; None if no other frame kept any from it. `pieces`
     are tuples (time, total power): until this time in ns the sum of all powers on air was this (N,), in mW. They
@@ -37,6 +37,7 @@ class Signal:
 
     random_draws: NDArray[np.uint64]
     power_mw: NDArray[np.float64]
+    sender_draws: int
     locked: NDArray[np.bool_] | None = None
     pieces: list[tuple[int, NDArray[np.float64]]] = field(default_factory=list)
 
@@ -142,7 +143,7 @@ class Receptions:
 
     def decide(self, mask: NDArray[np.bool_] | bool, outcome: Outcome) -> None:
         """Give `outcome` to the pending receptions of a mask that broadcasts to (K, M)."""
-        self.outcome[(self.outcome == PENDING) & mask] = outcome.value
+        np.copyto(self.outcome, np.uint8(outcome.value), where=(self.outcome == PENDING) & mask)
 
     def fault(self, index: int, columns: NDArray[np.bool_], cause: int) -> None:
         """Lose the frame at row `index` by fault number `cause` where it is still pending.

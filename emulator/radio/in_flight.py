@@ -97,7 +97,8 @@ class Deliveries(Sequence[Delivery]):
 class InFlight:
     """The receptions in flight to `count` nodes.
 
-    Rows of the table are arrival time, receiver, row of the trace, and frame; columns are receptions.
+    Rows of the table are arrival time, receiver, row of the trace, and frame; columns are receptions. The first
+    `_compared` of them are in `_by_receiver`: many drivers never ask for it.
     """
 
     def __init__(self, count: int) -> None:
@@ -107,7 +108,7 @@ class InFlight:
         self._frames_kept = 64
         self._next_frame = 0
         self._by_receiver: IntArray = np.full(count, NO_ARRIVAL_NS)
-        self._by_receiver_is_valid = True
+        self._compared = 0
         self._soonest_ns = NO_ARRIVAL_NS
         self._foreseen_ns = -1
 
@@ -135,8 +136,6 @@ class InFlight:
         self._next_frame += len(frames)
         self._length += len(row)
         self._soonest_ns = min(self._soonest_ns, soonest_ns)
-        if self._by_receiver_is_valid:
-            np.minimum.at(self._by_receiver, receiver, arrival_ns)
 
     def _make_room(self, more: int) -> None:
         if self._length + more > self._table.shape[1]:
@@ -155,11 +154,10 @@ class InFlight:
 
     def by_receiver(self) -> IntArray:
         """Return the time of the next arrival at each receiver (N,), or `NO_ARRIVAL_NS`; not to be changed."""
-        if not self._by_receiver_is_valid:
-            self._by_receiver[:] = NO_ARRIVAL_NS
-            flying = self._table[:, : self._length]
-            np.minimum.at(self._by_receiver, flying[_RECEIVER], flying[_ARRIVAL])
-            self._by_receiver_is_valid = True
+        if self._compared < self._length:
+            new = self._table[:, self._compared : self._length]
+            np.minimum.at(self._by_receiver, new[_RECEIVER], new[_ARRIVAL])
+            self._compared = self._length
         return self._by_receiver
 
     def foresee(self, time_ns: int, up: NDArray[np.bool_], trace: Trace) -> Deliveries:
@@ -187,7 +185,7 @@ class InFlight:
         self._length = left.shape[1]
         self._table[:, : self._length] = left
         self._soonest_ns = int(left[_ARRIVAL].min(initial=NO_ARRIVAL_NS))
-        self._by_receiver_is_valid = False
+        self._by_receiver[:], self._compared = NO_ARRIVAL_NS, 0
         return taken
 
     def deliveries(self, table: IntArray, trace: Trace) -> Deliveries:

@@ -119,7 +119,8 @@ class Medium:
 
     def _sense(self, total_mw: Array, time_ns: int) -> None:
         sensed, before = total_mw >= self._carrier_sense_mw, self.sensed
-        sensed[[frame.sender for frame in self._frames]] = True  # half duplex
+        for frame in self._frames:
+            sensed[frame.sender] = True  # half duplex
         if before is None:
             self._busy_since_ns = time_ns
         else:
@@ -133,13 +134,13 @@ class Medium:
         while time_ns >= self._slice_ends_ns:
             self._count(self._slice_ends_ns)
             self._end_slice()
-        if time_ns > self._counted_ns:
-            self._count(time_ns)
+        self._count(time_ns)
 
     def _count(self, time_ns: int) -> None:
-        if self.sensed is not None:
-            self._spans.append((self.sensed, time_ns - self._counted_ns))
-        self._counted_ns = time_ns
+        if time_ns > self._counted_ns:
+            if self.sensed is not None:
+                self._spans.append((self.sensed, time_ns - self._counted_ns))
+            self._counted_ns = time_ns
 
     def _end_slice(self) -> None:
         busy_ns = np.zeros_like(self._window_ns)

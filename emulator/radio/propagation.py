@@ -129,11 +129,11 @@ class Nakagami:
         self._until_m = np.array(fading.until_m if fading is not None else ())
         self._factor = np.concatenate([_quantiles(m) for m in fading.m]) if fading is not None else np.ones(1)
 
-    def shape(self, distance_m: Array) -> NDArray[np.uint64]:
+    def shape(self, distance_m: Array) -> NDArray[np.intp]:
         """Return the table offsets of the shapes at these distances (any shape), as `factor` takes them."""
-        return np.searchsorted(self._until_m, distance_m).astype(np.uint64) * np.uint64(QUANTILES)
+        return np.asarray(np.searchsorted(self._until_m, distance_m) * QUANTILES)
 
-    def factor(self, shape: NDArray[np.uint64], step: NDArray[np.uint64]) -> Array:
+    def factor(self, shape: NDArray[np.intp], step: NDArray[np.intp]) -> Array:
         """Return the factors for table offsets from `shape` and drawn steps in [0, QUANTILES)."""
         if len(self._factor) == 1:
             return np.ones(step.shape)

@@ -6,7 +6,7 @@ not have been received without interference has `faded`; one that would have bee
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from emulator.radio.dot11p import COST_STEPS, PREAMBLE_NS, airtime_ns, cost
 from emulator.radio.frames import Frame, Receptions, Signal
 from emulator.radio.outcomes import Outcome
-from emulator.radio.signals import Signals, reception_draws
+from emulator.radio.signals import Signals, Words, reception_draws
 from emulator.scenario.radio import Receiver
 from emulator.scenario.scenario import Radio
-from vnet.types import Array
+from vnet.types import Array, IntArray
 
 
 def milliwatts(dbm: float) -> float:
@@ -56,58 +56,70 @@ class Reception:
             return
         signals = [self._signal(frames[index]) for index in sent]
         power_mw = np.array([signal.power_mw for signal in signals])
-        # A frame is received if the cost of its payload, summed over time, is less than this.
-        max_cost = -np.log(reception_draws(np.array([signal.random_draws for signal in signals]))) * COST_STEPS
+        random_draws = np.array([signal.random_draws for signal in signals])
         on_air_ns = np.array([airtime_ns(frames[index].size_bytes, self._bitrate_mbps) for index in sent])
-        detected = power_mw >= self._threshold.alone_mw
-        snr = np.where(detected, power_mw / self._threshold.noise_mw, np.inf)
-        alone = detected & (self._cost(snr) * (on_air_ns - PREAMBLE_NS)[:, None] < max_cost)
-        faded, collided = np.zeros_like(receptions.outcome, bool), np.zeros_like(receptions.outcome, bool)
+        alone = self._received_alone(power_mw, random_draws, on_air_ns - PREAMBLE_NS)
+        faded = np.zeros_like(receptions.outcome, bool)
         faded[sent] = ~alone
-        interfered = [number for number, signal in enumerate(signals) if signal.pieces]
-        if interfered:
-            indices = [sent[number] for number in interfered]
-            survives = self._survive([frames[index] for index in indices], alone[interfered], max_cost[interfered])
-            collided[indices] = ~survives
         receptions.decide(faded, Outcome.faded)
-        receptions.decide(collided, Outcome.collided)
+        if interfered := [number for number, signal in enumerate(signals) if signal.pieces]:
+            some = [frames[sent[number]] for number in interfered]
+            locked = np.array([signals[number].locked for number in interfered], dtype=bool)
+            candidates = alone[interfered] & locked
+            lost = alone[interfered] & ~locked
+            lost |= self._destroyed(some, candidates, power_mw[interfered], random_draws[interfered])
+            collided = np.zeros_like(faded)
+            collided[[sent[number] for number in interfered]] = lost
+            receptions.decide(collided, Outcome.collided)
 
     def _signal(self, frame: Frame) -> Signal:
         if frame.signal is None:  # without a shared medium nothing needed it before
             frame.signal = self._signals.of(frame)
         return frame.signal
 
-    def _cost(self, snr: Array) -> NDArray[np.int64]:
-        return cost(snr, self._bitrate_mbps)
+    def _received_alone(self, power_mw: Array, random_draws: Words, payload_ns: IntArray) -> NDArray[np.bool_]:
+        """Return the mask (K, N) of receptions that would succeed without interference.
 
-    def _survive(self, frames: Sequence[Frame], alone: NDArray[np.bool_], max_cost: Array) -> NDArray[np.bool_]:
-        """Return the mask (M, N) of receptions that survive their interference.
-
-        `alone` (M, N) marks those received without interference, and `max_cost` (M, N) is the cost they may sum to.
+        Draws decide only where bits are in error: at the edge of the range.
         """
-        candidates = []
-        for number, frame in enumerate(frames):
-            signal = self._signal(frame)
-            assert signal.locked is not None
-            candidates.append(np.flatnonzero(alone[number] & signal.locked))
-        ratios = [self._ratios(self._signal(frame), at) for frame, at in zip(frames, candidates, strict=True)]
-        costs = self._cost(np.concatenate([ratio.ravel() for ratio in ratios]))
-        survives = np.zeros_like(alone)
-        ends = np.cumsum([ratio.size for ratio in ratios])[:-1]
-        for number, some in enumerate(np.split(costs, ends)):
-            spent = _lengths_ns(frames[number]) @ some.reshape(ratios[number].shape)
-            survives[number, candidates[number]] = spent < max_cost[number, candidates[number]]
-        return survives
+        alone = power_mw >= self._threshold.alone_mw
+        costs = cost(np.where(alone, power_mw / self._threshold.noise_mw, np.inf), self._bitrate_mbps)
+        if costs.any():
+            edge = costs > 0
+            spent = (costs * payload_ns[:, None])[edge]
+            alone[edge] = spent < _max_cost(random_draws[edge])
+        return alone
 
-    def _ratios(self, signal: Signal, at: NDArray[np.intp]) -> Array:
-        """Return the SINR (P, n), linear, in each piece of a frame's time at the receivers `at` (n,)."""
-        power_mw = signal.power_mw[at]
-        others_mw = np.array([total_mw[at] for _, total_mw in signal.pieces]) - power_mw
-        return np.asarray(power_mw / (self._threshold.noise_mw + np.maximum(others_mw, 0.0)))
+    def _destroyed(
+        self, frames: Sequence[Frame], candidates: NDArray[np.bool_], power_mw: Array, random_draws: Words
+    ) -> NDArray[np.bool_]:
+        """Return the mask (M, N) of those `candidates` (M, N) that their interference destroys.
+
+        The other arguments are those of the frames: powers and words (M, N).
+        """
+        pieces = [[*self._pieces(frame)] for frame in frames]
+        each = [len(some) for some in pieces]
+        lengths_ns = np.array([length_ns for some in pieces for length_ns, _ in some])
+        total_mw = np.array([total_mw for some in pieces for _, total_mw in some])
+        frame_of = np.repeat(np.arange(len(frames)), each)
+        own_mw = power_mw[frame_of]
+        others_mw = np.maximum(total_mw - own_mw, 0.0)
+        snr = np.where(candidates[frame_of], own_mw / (self._threshold.noise_mw + others_mw), np.inf)
+        costs = cost(snr, self._bitrate_mbps) * lengths_ns[:, None]
+        spent = np.add.reduceat(costs, np.cumsum([0, *each[:-1]]), axis=0)
+        destroyed: NDArray[np.bool_] = spent > 0
+        destroyed[destroyed] = spent[destroyed] >= _max_cost(random_draws[destroyed])
+        return destroyed
+
+    def _pieces(self, frame: Frame) -> Iterator[tuple[int, Array]]:
+        """Yield the pieces of a frame's payload: time in ns, and the sum of all powers (N,) in mW."""
+        begin_ns = frame.on_air_ns + PREAMBLE_NS
+        for until_ns, total_mw in self._signal(frame).pieces:
+            if until_ns > begin_ns:
+                yield until_ns - begin_ns, total_mw
+                begin_ns = until_ns
 
 
-def _lengths_ns(frame: Frame) -> NDArray[np.int64]:
-    """Return the time in ns (P,) of a frame's payload that lies in each piece of its time on air."""
-    assert frame.signal is not None
-    edges_ns = np.array([frame.on_air_ns, *(until_ns for until_ns, _ in frame.signal.pieces)])
-    return np.asarray(np.diff(np.maximum(edges_ns, frame.on_air_ns + PREAMBLE_NS)))
+def _max_cost(random_draws: Words) -> Array:
+    """Return the costs (n,) below which a payload's cost, summed over time, must stay to be received."""
+    return np.asarray(-np.log(reception_draws(random_draws)) * COST_STEPS)

@@ -20,7 +20,7 @@ Words = NDArray[np.uint64]
 JITTER, BACKOFF, NEXT_BACKOFF = 0, 16, 32
 """Lowest of 16 bits each in a sender's word: access jitter, backoff before the frame, backoff after it."""
 _STEPS = 1 << 16
-_LAST = np.uint64(_STEPS - 1)
+_LAST = np.array(_STEPS - 1, np.uint64)
 _LATENCY, _RECEPTION = np.uint64(16), np.uint64(32)
 
 assert QUANTILES == _STEPS
@@ -39,7 +39,7 @@ def reception_draws(random_draws: Words) -> Array:
 def sender_draw(frame: Frame, lowest_bit: int) -> float:
     """Return a draw in [0, 1) of a frame's sender: JITTER, BACKOFF or NEXT_BACKOFF."""
     assert frame.signal is not None
-    return (int(frame.signal.random_draws[frame.sender]) >> lowest_bit & _STEPS - 1) / _STEPS
+    return (frame.signal.sender_draws >> lowest_bit & _STEPS - 1) / _STEPS
 
 
 class Signals:
@@ -57,6 +57,7 @@ class Signals:
         assert topology.power_mw is not None
         assert topology.fading is not None
         mean_mw = topology.power_mw[sender]
-        power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], random_draws & _LAST)
+        steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
+        power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], steps)
         power_mw[sender] = mean_mw[sender]
-        return Signal(random_draws, power_mw)
+        return Signal(random_draws, power_mw, random_draws.item(sender))

@@ -33,7 +33,7 @@ class TopologySnapshot:
     in_range: Mask
     admitted: Mask
     power_mw: Array | None = None
-    fading: NDArray[np.uint64] | None = None
+    fading: NDArray[np.intp] | None = None
     receiver: NDArray[np.intp] | None = None
 
     def receivers(self, sender: int) -> NDArray[np.intp] | slice:

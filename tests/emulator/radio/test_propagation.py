@@ -120,14 +120,14 @@ def test_shadowing_of_neighbours_is_no_stronger_than_of_others() -> None:
 def test_factors_are_gamma_distributed_with_mean_one(m: float) -> None:
     nakagami = Nakagami(Fading(m=(m, 1.0), until_m=(1e6,)))
     shape = nakagami.shape(np.full(QUANTILES, 10.0))
-    factors = nakagami.factor(shape, np.arange(QUANTILES, dtype=np.uint64))
+    factors = nakagami.factor(shape, np.arange(QUANTILES))
     assert factors.mean() == pytest.approx(1, abs=1e-4)
     assert stats.kstest(factors, stats.gamma(m, scale=1 / m).cdf).statistic < 1e-4
 
 
 def test_each_stretch_has_its_shape() -> None:
     nakagami = Nakagami(Fading(m=(1.5, 0.75), until_m=(80.0,)))
-    middle = np.full(3, QUANTILES // 2, np.uint64)
+    middle = np.full(3, QUANTILES // 2)
     near, edge, far = nakagami.factor(nakagami.shape(np.array([5.0, 80.0, 80.1])), middle)
     assert near == edge == pytest.approx(stats.gamma(1.5, scale=1 / 1.5).ppf(0.5), rel=1e-4)
     assert far == pytest.approx(stats.gamma(0.75, scale=1 / 0.75).ppf(0.5), rel=1e-4)
