@@ -14,10 +14,10 @@ import os
 import pdb
 import sys
 import sysconfig
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType, TracebackType
-from typing import IO, Any, cast
+from typing import IO, Any, TextIO, cast
 
 from vnet.errors import LONGEST_MESSAGE, printable
 from vnet.runtime.debug_target import DebugTarget
@@ -168,7 +168,7 @@ class NodeDebugger(pdb.Pdb):
 
     def interaction(self, *where: Any) -> None:
         """Ask the user what to do; say of whom and when."""
-        with self._at_prompt():
+        with self._at_prompt(), self._standard_streams():
             self.message(f"{self._target.node}, {self._now_ns() / NS_PER_S:.6f} s of emulated time")
             super().interaction(*where)
             quits, self.quitting = self.quitting, False
@@ -176,6 +176,17 @@ class NodeDebugger(pdb.Pdb):
             self.clear_all_breaks()
             self._is_here = lambda: False
             self._on_quit()
+
+    @contextmanager
+    def _standard_streams(self) -> Iterator[None]:
+        """Let commands that use `input` and `print`, such as `clear` and `interact`, ask where the debugger does."""
+        before = sys.stdin, sys.stdout, sys.stderr
+        if not self.use_rawinput:
+            sys.stdin, sys.stdout, sys.stderr = (cast("TextIO", self.stdin), *2 * (cast("TextIO", self.stdout),))
+        try:
+            yield
+        finally:
+            sys.stdin, sys.stdout, sys.stderr = before
 
     def do_run(self, arg: str) -> None:
         """Refuse to start again: the run is not this program's alone."""

@@ -155,6 +155,20 @@ def test_a_line_is_a_breakpoint_for_one_vehicle(debug: Debug) -> None:
     assert [line for line in said if "'v0" in line] == ["(Pdb) ('v02', 0)", "(Pdb) ('v02', 1)"]
 
 
+def test_clear_asks_where_the_debugger_does(debug: Debug) -> None:
+    _, said, _ = debug("sends", f"v02:{THIS_FILE}:{line_of('counted')}", "clear", "y", "c")
+    assert stops(said) == ["count += 1  # counted"]
+    assert any("Clear all breaks? Deleted breakpoint" in line for line in said)
+
+
+def test_interact_asks_where_the_debugger_does(debug: Debug) -> None:
+    streams = sys.stdin, sys.stdout, sys.stderr
+    _, said, _ = debug("sends", "v03", "interact", "print(node.id + '!')", "1 / 0")
+    assert ">>> v03!" in said
+    assert "ZeroDivisionError: division by zero" in said
+    assert (sys.stdin, sys.stdout, sys.stderr) == streams
+
+
 def test_a_crash_can_be_looked_at(debug: Debug) -> None:
     emulation, said, _ = debug("crashes", "v02", "c", "p node.id", "c")
     assert "v02 has crashed: ValueError: boom of v02" in "\n".join(said)
