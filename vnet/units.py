@@ -42,14 +42,25 @@ UNITS = {
 
 
 def unit_of(name: str) -> str:
-    """Return the unit that a name ends in, or "": "ms" for `delay_ms`."""
-    return UNITS.get(_suffix(name), "")
+    """Return the unit that a name ends in, or "": "ms" for `delay_ms` and for `delay_ms.v03`."""
+    return UNITS.get(_suffix(_stem(name)), "")
 
 
 def title_of(name: str) -> str:
-    """Return a name as words, without its unit: "warning delay" for `warning_delay_ms`."""
-    suffix = _suffix(name)
-    return (name.removesuffix(f"_{suffix}") if suffix else name).replace("_", " ")
+    """Return a name as words, without its unit: "warning delay" for `warning_delay_ms`.
+
+    What is behind a dot stays: "delay.v_03" for `delay_ms.v_03`.
+    """
+    stem = _stem(name)
+    suffix = _suffix(stem)
+    words = (stem.removesuffix(f"_{suffix}") if suffix else stem).replace("_", " ")
+    return words + name.removeprefix(stem)
+
+
+def _stem(name: str) -> str:
+    """Return what is before the dot of a reported value's name, and any other name as it is."""
+    before = name.partition(".")[0]
+    return before if before.isidentifier() else name
 
 
 def _suffix(name: str) -> str:

@@ -122,7 +122,7 @@ STATE = {
     "mean_m": "of its report: what it takes for the mean of all estimates of the common error",
     "stacked_common_error_m": "of its report: the common error right after fusion, before the map",
     "cloud_m": "of its report: some hypotheses of the common error, x and y in turns",
-    "values": "lists, and names such as `weight.v03`, that it reported besides, by name",
+    "values": "what it reported besides and has no column, by name: lists, and weights of a fusion (`weight.v03`)",
 }
 STATES_ABOUT = (
     "Then a column for each number (`double`), boolean (`bool`) or text (`string`) that programs report by a name "

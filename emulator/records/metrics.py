@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.records.distributions import chi2_quantiles
-from emulator.records.reported import ValueColumns
+from emulator.records.reported import Figure, ValueColumns, figures_among
 from emulator.records.states import COMMON_VALUES, STATES
 from emulator.world.world import Instant
 from vnet.node import Report, Value
@@ -153,21 +153,25 @@ class Metrics:
         for number, node in enumerate(self._node_ids):
             report = last.get(node)
             values = {} if report is None else dict(report.values)
+            figures = figures_among(values)
             states["estimate_m"].append(None if report is None else report.estimate_m)
             states["covariance_m2"].append(None if report is None else report.covariance_m2)
             for name, column in COMMON_VALUES.items():
                 value = values.pop(name, None)
                 fits = isinstance(value, list) and len(value) == _SIZES.get(name, len(value))
                 states[column].append(value if fits else None)
-            states["values"].append(self._other_values(len(self.rows) * len(self._node_ids) + number, values))
+            states["values"].append(self._other_values(len(self.rows) * count + number, values, figures))
         if len(states["period"]) >= ROWS_A_PIECE:
             self._pack()
 
-    def _other_values(self, row: int, values: dict[str, Value]) -> list[tuple[str, list[float]]]:
-        """Put the values of a row of the states into columns; returns those that have none."""
+    def _other_values(
+        self, row: int, values: dict[str, Value], figures: dict[str, Figure]
+    ) -> list[tuple[str, list[float]]]:
+        """Put the figures of a row of the states into columns; returns the values that have none."""
         others = []
         for name, value in sorted(values.items()):
-            if not self._values.put(row, name, value) and not isinstance(value, str):
+            has_column = name in figures and self._values.put(row, name, figures[name])
+            if not has_column and not isinstance(value, str):
                 others.append((name, value if isinstance(value, list) else [value]))
         return others
 

@@ -1,12 +1,13 @@
 """Values that programs report by names of their own: columns of the states, and a run's figures of them.
 
-Numbers, booleans and texts have a column each. Lists, and names that are no identifiers (`weight.v03`), stay in the
-column `values`, as do further names once there are `MOST_COLUMNS`.
+Numbers, booleans and texts have a column each. Lists stay in the column `values`, as do further names once there are
+`MOST_COLUMNS`, and the weights of a fusion of common errors (`weight.v03`): as many as there are pairs of vehicles.
 """
 
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from emulator.records.beliefs import WEIGHT
 from emulator.records.states import TAKEN
 from vnet.node import Value
 from vnet.types import Array
@@ -22,14 +24,31 @@ from vnet.units import title_of, unit_of
 
 MOST_COLUMNS = 64
 """Names that have a column: a table of thousands of columns would help nobody."""
+MOST_DOTTED = 32
+"""Names with a dot among them: figures of each peer (`delay_ms.v03`) leave room for a program's others."""
+Figure = bool | float | str
+"""What one value can be that is a figure."""
 TEXT = pa.dictionary(pa.int32(), pa.string())
 """Type of a column of texts."""
 _BOOLEAN, _NUMBER, _TEXT = range(3)
 
 
-def is_figure(name: str, value: Value) -> bool:
-    """Return whether a value is a figure of its vehicle: one number, boolean or text with a name of its own."""
-    return not isinstance(value, list) and name.isidentifier() and name not in TAKEN
+def figures_among(values: Mapping[str, Value]) -> dict[str, Figure]:
+    """Return the figures among the values of one report: numbers, booleans and texts with names of their own."""
+    return {
+        name: value
+        for name, value in values.items()
+        if not isinstance(value, list) and _is_name(name) and not is_weight(name, values)
+    }
+
+
+def is_weight(name: str, values: Mapping[str, Value]) -> bool:
+    """Return whether a value of a report is a weight of the fusion of common errors that is reported beside it."""
+    return name.startswith(WEIGHT) and "common_error_m" in values
+
+
+def _is_name(name: str) -> bool:
+    return name.partition(".")[0].isidentifier() and name not in TAKEN
 
 
 @dataclass
@@ -47,15 +66,15 @@ class ValueColumns:
     def __init__(self) -> None:
         self._columns: dict[str, _Column] = {}
         self._text_index: dict[str, int] = {}
+        self._dotted = 0
 
-    def put(self, row: int, name: str, value: Value) -> bool:
-        """Take the value of a row; returns false for a value that has no column."""
-        if isinstance(value, list) or not is_figure(name, value):
-            return False
+    def put(self, row: int, name: str, value: Figure) -> bool:
+        """Take a figure of a row; returns false for one that has no column."""
         column = self._columns.get(name)
         if column is None:
-            if len(self._columns) == MOST_COLUMNS:
+            if len(self._columns) == MOST_COLUMNS or ("." in name and self._dotted == MOST_DOTTED):
                 return False
+            self._dotted += "." in name
             column = self._columns[name] = _Column()
         column.row.append(row)
         if isinstance(value, str):
@@ -98,7 +117,7 @@ class ValueColumns:
 
 def value_columns(schema: pa.Schema) -> list[str]:
     """Return the names of the columns of reported values in the states' schema."""
-    names = [each.name for each in schema if each.name not in TAKEN and each.name.isidentifier()]
+    names = [each.name for each in schema if _is_name(each.name)]
     return [name for name in names if _is_value(schema.field(name).type)][:MOST_COLUMNS]
 
 

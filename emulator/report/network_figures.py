@@ -17,6 +17,7 @@ from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.drawing import DASHES, Drawing
+from emulator.records.beliefs import WEIGHT
 from emulator.report.source import NothingToShow, Source
 from emulator.world.world import components
 from vnet.errors import VnetError, printable
@@ -32,7 +33,6 @@ LINK_BAND = 0.99
 OPACITY = {0.05: 0.16, 0.1: 0.32, 0.2: 0.52, 0.4: 0.76, 1.0: 1.0}
 """Opacity of a fusion weight, by the largest weight that has it."""
 _NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()))])
-_WEIGHT = "weight."
 
 
 def links(source: Source) -> Drawing:
@@ -190,16 +190,16 @@ def mean_weights(source: Source) -> Array:
     lists = recorded.states["values"].combine_chunks().cast(pa.list_(_NAMED_VALUES))
     row, pair = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
     key, value = pair.field("key"), pair.field("value")
-    single = pc.and_(pc.starts_with(key, _WEIGHT), pc.equal(pc.list_value_length(value), 1))
+    single = pc.and_(pc.starts_with(key, WEIGHT), pc.equal(pc.list_value_length(value), 1))
     chosen = np.flatnonzero(pc.fill_null(single, False).to_numpy(zero_copy_only=False))
     names = key.take(pa.array(chosen)).dictionary_encode()
-    numbers = [recorded.number.get(name.removeprefix(_WEIGHT), -1) for name in names.dictionary.to_pylist()]
+    numbers = [recorded.number.get(name.removeprefix(WEIGHT), -1) for name in names.dictionary.to_pylist()]
     of = np.array(numbers, dtype=np.intp)[names.indices.to_numpy()]
     weight = pc.list_flatten(value.take(pa.array(chosen))).to_numpy(zero_copy_only=False)
     node = np.array([recorded.number[node] for node in recorded.states["node"].to_pylist()], dtype=np.intp)
     at, fits = node[row[chosen]], (of >= 0) & np.isfinite(weight)
     if not fits.any():
-        raise NothingToShow("no program reported any (as values named weight.ID)")
+        raise NothingToShow("no program reported any (as values named weight.ID, beside common_error_m)")
     total = np.bincount((at * count + of)[fits], weights=weight[fits], minlength=count * count)
     reports = np.bincount(node[np.unique(row[chosen])], minlength=count)
     return np.asarray(total.reshape(count, count) / np.maximum(1, reports)[:, None])

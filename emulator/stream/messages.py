@@ -21,7 +21,7 @@ from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
 from emulator.records.metrics import PeriodFigures, collect
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reported import is_figure
+from emulator.records.reported import MOST_DOTTED, figures_among, is_weight
 from emulator.records.run_folder import Event
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
@@ -38,7 +38,8 @@ LONGEST_DETAIL = 200
 
 def pack(array: ArrayLike) -> bytes:
     """Return an array as float32 bytes."""
-    return np.ascontiguousarray(array, dtype="<f4").tobytes()
+    with np.errstate(over="ignore"):  # 1e300 becomes infinite, which is not drawn
+        return np.ascontiguousarray(array, dtype="<f4").tobytes()
 
 
 def unpack(data: bytes, columns: int = 1) -> NDArray[np.float32]:
@@ -105,9 +106,13 @@ def beliefs_of(number: Mapping[str, int], reports: Iterable[Report]) -> Beliefs:
 def _values(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, Array]:
     """Return the numbers and booleans that programs report by names of their own, by name, as arrays (n,)."""
     values: dict[str, Array] = {}
+    dotted = 0
     for node, report in last.items():
-        for name, value in report.values.items():
-            if is_figure(name, value) and not isinstance(value, (str, list)):
+        for name, value in figures_among(report.values).items():
+            if name not in values and "." in name and dotted == MOST_DOTTED:
+                continue
+            if not isinstance(value, str):
+                dotted += name not in values and "." in name
                 values.setdefault(name, np.full(len(number), np.nan))[number[node]] = value
     return {name: each for name, each in values.items() if np.isfinite(each).any()}
 
@@ -116,8 +121,8 @@ def _texts(number: Mapping[str, int], last: Mapping[str, Report]) -> dict[str, l
     """Return the texts that programs report by names of their own, by name, one for each node."""
     texts: dict[str, list[str]] = {}
     for node, report in last.items():
-        for name, value in report.values.items():
-            if is_figure(name, value) and isinstance(value, str):
+        for name, value in figures_among(report.values).items():
+            if isinstance(value, str):
                 texts.setdefault(name, [""] * len(number))[number[node]] = value
     return {name: each for name, each in texts.items() if any(each)}
 
@@ -131,7 +136,7 @@ def _weights(index: Mapping[str, int], report: Report) -> Array | None:
     for name in report.values.keys() & index.keys():
         value = report.values[name]
         one = value if isinstance(value, list) else [value]
-        if len(one) == 1 and not isinstance(one[0], str):
+        if is_weight(name, report.values) and len(one) == 1 and not isinstance(one[0], str):
             weights = np.zeros(len(index)) if weights is None else weights
             weights[index[name]] = one[0]
     return weights

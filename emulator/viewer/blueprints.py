@@ -6,7 +6,7 @@ import rerun.blueprint as rrb
 
 from emulator.viewer.drawing import TIMELINE
 from emulator.viewer.layout import EVERYTHING, Content
-from emulator.viewer.program_scene import titled
+from emulator.viewer.program_scene import entity, titled
 from emulator.viewer.radio_scene import WINDOW_S
 
 COMMON_VIEW_M, POSITION_VIEW_M = 1.15, 5.6
@@ -76,7 +76,7 @@ def _curves(content: Content) -> list[rrb.TimeSeriesView | rrb.Tabs]:
     more = [_against_time("figures/consensus", "Consensus (m)")] if content.consensus else []
     more += [_against_time("figures/position", "RMSE of position (m)")] if content.position else []
     if not content.common:
-        more += [_against_time(f"program/curve/{name}", titled(name)) for name in content.values]
+        more += [_against_time(entity("curve", name), titled(name)) for name in content.values]
     if more:
         curves.append(rrb.Tabs(*more))
     # The heading has the colours of the outcomes already.
@@ -87,9 +87,9 @@ def program(vehicle: str, content: Content) -> rrb.Vertical:
     """Values that programs report: each against time, and on a map."""
     each = [
         rrb.Horizontal(
-            _against_time(f"program/curve/{name}", f"{titled(name)}: mean, 5 to 95 %, {vehicle}"),
+            _against_time(entity("curve", name), f"{titled(name)}: mean, 5 to 95 %, {vehicle}"),
             rrb.Spatial2DView(
-                origin=f"program/map/{name}",
+                origin=entity("map", name),
                 contents=["$origin/**", "/map/lanes"],
                 name=f"{titled(name)}: blue least, yellow most, grey not reported",
             ),

@@ -24,6 +24,11 @@ def titled(name: str) -> str:
     return drawable(f"{title_of(name)} ({unit})" if unit else title_of(name))
 
 
+def entity(kind: str, name: str) -> str:
+    """Return the entity of a value: of its "curve", its "map", or its "texts"."""
+    return f"program/{kind}/{rr.escape_entity_path_part(name)}"
+
+
 class ProgramScene:
     """Draws what programs report by names of their own below `/program`, from the messages of a run."""
 
@@ -59,21 +64,21 @@ class ProgramScene:
             self._next_colours_s = next_charts_s(period.time_s)
             self._colour(values)
         for name in self._bounds:
-            self._canvas.points(f"program/map/{name}", period.points("position_m"))
+            self._canvas.points(entity("map", name), period.points("position_m"))
         self._texts(period.texts())
 
     def _announce(self, name: str) -> None:
         self._bounds[name] = (np.inf, -np.inf)
         band = [("95 % of the vehicles", GREY, 1.0), ("5 %", GREY, 1.0)]
         lines = [("mean", BLUE, 2.0), (self._vehicle, ORANGE, 1.5)]
-        self._canvas.series(f"program/curve/{name}", band + lines)
-        self._canvas.point_style(f"program/map/{name}", None, 6.0, self._node_ids)
+        self._canvas.series(entity("curve", name), band + lines)
+        self._canvas.point_style(entity("map", name), None, 6.0, self._node_ids)
 
     def _curve(self, name: str, value: Floats) -> None:
         known = value[np.isfinite(value)]
         low, high = np.percentile(known, [5, 95]) if len(known) else (np.nan, np.nan)
         mean = float(known.mean()) if len(known) else float("nan")
-        self._canvas.plot(f"program/curve/{name}", float(high), float(low), mean, float(value[self._number]))
+        self._canvas.plot(entity("curve", name), float(high), float(low), mean, float(value[self._number]))
         if len(known):
             least, most = self._bounds[name]
             self._bounds[name] = min(least, float(known.min())), max(most, float(known.max()))
@@ -82,12 +87,12 @@ class ProgramScene:
         """Colour the vehicles by their values, between the least and the largest so far; grey without one."""
         for name, (least, most) in self._bounds.items():
             value = values.get(name)
-            if value is None:
+            if value is None or least > most:
                 continue
             share = np.clip((value - least) / max(most - least, 1e-12), 0, 1)
             scaled = np.column_stack([np.interp(share, (0, 0.5, 1), SCALE[:, part]) for part in range(3)])
             colours = np.where(np.isfinite(share)[:, None], scaled, np.array(GREY[:3], dtype=float))
-            self._canvas.log(f"program/map/{name}", rr.Points2D.from_fields(colors=colours.astype(np.uint8)))
+            self._canvas.log(entity("map", name), rr.Points2D.from_fields(colors=colours.astype(np.uint8)))
 
     def _texts(self, texts: Mapping[str, list[str]]) -> None:
         """Draw the texts of the vehicle that is looked at closely, as states against time."""
@@ -100,6 +105,6 @@ class ProgramScene:
             ):
                 continue
             if name not in self._told:
-                self._canvas.states(f"program/texts/{name}", {text: SKY})
+                self._canvas.states(entity("texts", name), {text: SKY})
             self._told[name] = text
-            self._canvas.log(f"program/texts/{name}", rr.StateChange(state=text))
+            self._canvas.log(entity("texts", name), rr.StateChange(state=text))

@@ -19,6 +19,9 @@ from vnet.units import title_of, unit_of
         ("_s", " s", ""),
         ("informed", "informed", ""),
         ("hops", "hops", ""),
+        ("delay_ms.v_03", "delay.v_03", "ms"),
+        ("queue_length.high_s", "queue length.high_s", ""),
+        ("own:warned.delay_ms", "own:warned.delay", "ms"),
     ],
 )
 def test_a_name_is_words_and_a_unit(name: str, title: str, unit: str) -> None:

@@ -10,6 +10,7 @@ import pytest
 from emulator.records.metrics import Metrics
 from emulator.records.reported import (
     MOST_COLUMNS,
+    MOST_DOTTED,
     ReportedFigure,
     ValueColumns,
     figure_text,
@@ -52,10 +53,23 @@ def test_numbers_stay_numbers_whatever_else_vehicles_report_by_their_name() -> N
     assert reported_figures(table)["y"].mean == 1.25
 
 
-def test_lists_odd_names_and_names_of_vnets_own_have_no_column() -> None:
-    table = states({"a": {"weight.b": 0.5, "many": [1.0, 2.0], "period": 3.0, "mean_m": 4.0, "text.x": "lost"}})
+def test_lists_and_names_of_vnets_own_have_no_column() -> None:
+    table = states({"a": {"many": [1.0, 2.0], "period": 3.0, "mean_m": 4.0}})
     assert value_columns(table.schema) == []
-    assert dict(table["values"][0].as_py()) == {"many": [1.0, 2.0], "period": [3.0], "weight.b": [0.5]}
+    assert dict(table["values"][0].as_py()) == {"many": [1.0, 2.0], "period": [3.0]}
+
+
+def test_names_with_a_dot_are_figures_like_others() -> None:
+    table = states({"a": {"weight.b": 0.5, "state.flow.0/x": "idle"}})
+    assert table["weight.b"].to_pylist() == [0.5, None]
+    assert table["state.flow.0/x"].to_pylist() == ["idle", None]
+    assert reported_figures(table)["weight.b"].mean == 0.5
+
+
+def test_weights_of_a_fusion_of_common_errors_have_no_column() -> None:
+    table = states({"a": {"common_error_m": [1.0, 2.0], "weight.b": 0.5, "rejected.old": 3.0}})
+    assert value_columns(table.schema) == ["rejected.old"]
+    assert dict(table["values"][0].as_py()) == {"weight.b": [0.5]}
 
 
 def test_a_program_that_makes_up_names_has_only_so_many_columns() -> None:
@@ -63,6 +77,13 @@ def test_a_program_that_makes_up_names_has_only_so_many_columns() -> None:
     assert all(columns.put(0, f"x{i}", 1.0) for i in range(MOST_COLUMNS))
     assert not columns.put(0, "one_more", 1.0)
     assert columns.put(0, "x0", 1.0)
+
+
+def test_figures_of_each_peer_leave_columns_to_others() -> None:
+    columns = ValueColumns()
+    assert [columns.put(0, f"delay_ms.v{i}", 1.0) for i in range(MOST_COLUMNS)].count(True) == MOST_DOTTED
+    assert columns.put(0, "delay_ms.v0", 1.0)
+    assert columns.put(0, "sent", 1.0)
 
 
 def test_figures_count_all_reports_and_each_vehicles_last() -> None:
