@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
+from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, SKY, Canvas, canvas, legend
 from emulator.records.reported import figure_text, is_text
@@ -28,10 +30,14 @@ MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 8000, 3000, 400
 """Road segments, links and trajectories that are drawn: more would make a page of many megabytes."""
 MOST_NAMED = 30
 """Vehicles up to which each has its name beside it."""
+LARGEST_INTEGER = 1e15
+"""Bound of numbers up to which classes are of whole numbers: beyond it they are shown with four digits."""
 POINTS_A_TRAJECTORY = 80
-LEVELS = 5
+MOST_CLASSES = 5
 OPACITY = (0.06, 0.25, 0.45, 0.7, 1.0)
-"""Opacity of a vehicle's point, by the level of its value."""
+"""Opacity of a vehicle's point, by the class of its value."""
+LONG_LABEL = 14
+"""Letters of a class from which on the legend has two columns instead of three."""
 MOST_COLOURED = 6
 """Values with a map of their own."""
 KILOMETRES_FROM_M = 3000.0
@@ -70,35 +76,51 @@ def _coloured(source: Source, name: str) -> Drawing:
     """Draw each vehicle by the last value that it reported."""
     last = _last_values(source.values_of(name))
     known = np.isfinite(last)
-    low, high = float(last[known].min()), float(last[known].max())
-    if low == high:
+    if len(set(last[known].tolist())) == 1:
         raise NothingToShow("all vehicles ended with the same value")
-    made, scale = _frame(source, 1)
+    index, labels = classes(last, source.is_boolean(name))
+    columns = 2 if max(map(len, labels)) > LONG_LABEL else 3
+    made, scale = _frame(source, -(-len(labels) // columns))
     position_m = _last_positions(source) * scale
-    level = np.clip(((last - low) / (high - low) * LEVELS), 0, LEVELS - 1)
-    level = np.where(known, level, -1).astype(int)
     handles = []
     dots: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 7, "markeredgewidth": 0.8}
     dots["markeredgecolor"] = BLUE
-    levels = sorted(set(level[known].tolist()))
-    for each in levels:
-        some = position_m[level == each]
-        dots["markerfacecolor"] = to_rgba(BLUE, OPACITY[each])
-        made.axes.plot(*some.T, **dots)
-        label = _range(low, high, each, source.is_boolean(name))
+    for number, label in enumerate(labels):
+        dots["markerfacecolor"] = to_rgba(BLUE, OPACITY[round(number * (len(OPACITY) - 1) / (len(labels) - 1))])
+        made.axes.plot(*position_m[index == number].T, **dots)
         handles.append(Line2D([], [], label=label, **dots))
     _draw_vehicles(made, position_m[~known], GREY)
-    legend(made, [handles[0], handles[-1]])
+    legend(made, handles, columns)
     silent = " Grey: never reported it." if (~known).any() else ""
     return Drawing(made, f"{label_of(name)}: what each vehicle reported last.{silent}")
 
 
-def _range(low: float, high: float, level: int, is_boolean: bool) -> str:
-    """Name a level: by the range of its values."""
+def classes(value: Array, is_boolean: bool = False) -> tuple[NDArray[np.intp], list[str]]:
+    """Return the class (n,) of each value, -1 of one that is not finite, and the classes' labels, the least first.
+
+    There are at most `MOST_CLASSES`: false and true; each integer, or as many of them in each class; or ranges of
+    one width. Ranges without any value stay.
+    """
+    known = np.isfinite(value)
+    number = value[known]
+    low, high = float(number.min()), float(number.max())
     if is_boolean:
-        return "true" if level else "false"
-    width = (high - low) / LEVELS
-    return f"{figure_text(low + level * width)} – {figure_text(low + (level + 1) * width)}"
+        edges, labels = np.array([0.0, 1.0]), ["false", "true"]
+    elif (number == np.rint(number)).all() and max(high, -low) < LARGEST_INTEGER:
+        count = min(MOST_CLASSES, int(high - low + 1))
+        bounds = low + np.floor((high - low + 1) * np.arange(count + 1) / count)
+        edges = bounds[:-1]
+        labels = [
+            figure_text(first) + (f" – {figure_text(behind - 1)}" if behind - first > 1 else "")
+            for first, behind in pairwise(bounds.tolist())
+        ]
+    else:
+        edges = np.linspace(low, high, MOST_CLASSES + 1)
+        labels = [f"{figure_text(first)} – {figure_text(end)}" for first, end in pairwise(edges.tolist())]
+        edges = edges[:-1]
+    index = np.full(len(value), -1, dtype=np.intp)
+    index[known] = np.searchsorted(edges, number, side="right") - 1
+    return index, labels
 
 
 def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:

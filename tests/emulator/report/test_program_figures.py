@@ -1,5 +1,6 @@
 """Charts and maps of what programs report, from a run's folder."""
 
+import numpy as np
 import pytest
 
 from emulator.drivers.conclude import conclude
@@ -7,7 +8,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import draw_charts
-from emulator.report.map_figures import map_charts
+from emulator.report.map_figures import classes, map_charts
 from emulator.report.program_figures import program_charts
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
@@ -59,7 +60,27 @@ def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
     found = {chart.title: chart for chart in charts}
     assert set(found) == {"Map", "Map: load"}, "all others end with one value for all vehicles"
     assert "v04" in found["Map"].svg and "links that delivered frames" in found["Map"].caption
-    assert "10 – 16" in found["Map: load"].svg and "34 – 40" in found["Map: load"].svg
+    legend = ["10 – 15", "16 – 21", "22 – 27", "28 – 33", "34 – 40"]
+    assert [text for text in legend if text in found["Map: load"].svg] == legend
+
+
+@pytest.mark.parametrize(
+    ("values", "is_boolean", "index", "labels"),
+    [
+        ([1, 2, 3, 3], False, [0, 1, 2, 2], ["1", "2", "3"]),
+        ([0, 11, np.nan], False, [0, 4, -1], ["0 – 1", "2 – 3", "4 – 6", "7 – 8", "9 – 11"]),
+        ([-1, 5], False, [0, 4], ["-1", "0", "1 – 2", "3", "4 – 5"]),
+        ([0, 0.5, 1], False, [0, 2, 4], ["0 – 0.2", "0.2 – 0.4", "0.4 – 0.6", "0.6 – 0.8", "0.8 – 1"]),
+        ([0, 1], True, [0, 1], ["false", "true"]),
+        ([0, 1e300], False, [0, 4], ["0 – 2e+299", "2e+299 – 4e+299", "4e+299 – 6e+299", "6e+299 – 8e+299"]),
+    ],
+)
+def test_values_are_classes_that_the_legend_explains(
+    values: list[float], is_boolean: bool, index: list[int], labels: list[str]
+) -> None:
+    found, names = classes(np.array(values, dtype=float), is_boolean)
+    assert found.tolist() == index
+    assert names[: len(labels)] == labels
 
 
 def test_shares_of_texts_are_those_of_the_vehicles_that_report(source: Source) -> None:
