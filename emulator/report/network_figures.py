@@ -14,10 +14,10 @@ from matplotlib.ticker import MaxNLocator
 
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
 from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.records.beliefs import WEIGHT
 from emulator.records.distributions import binomial_interval
 from emulator.records.radio_metrics import BIN_M
 from emulator.report.drawing import DASHES, Drawing
-from emulator.records.beliefs import WEIGHT
 from emulator.report.source import NothingToShow, Source
 from emulator.world.world import components
 from vnet.errors import VnetError, printable

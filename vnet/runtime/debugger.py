@@ -179,7 +179,7 @@ class NodeDebugger(pdb.Pdb):
 
     @contextmanager
     def _standard_streams(self) -> Iterator[None]:
-        """Let commands that use `input` and `print`, such as `clear` and `interact`, ask where the debugger does."""
+        """Let commands that use `input`, such as `clear` and `interact`, ask where the debugger does."""
         before = sys.stdin, sys.stdout, sys.stderr
         if not self.use_rawinput:
             sys.stdin, sys.stdout, sys.stderr = (cast("TextIO", self.stdin), *2 * (cast("TextIO", self.stdout),))
