@@ -1,7 +1,7 @@
 """Values that programs report by names of their own: columns of the states, and a run's figures of them.
 
-Numbers, booleans and texts have a column each. Lists stay in the column `values`, as do further names once there are
-`MOST_COLUMNS`, and the weights of a fusion of common errors (`weight.v03`): as many as there are pairs of vehicles.
+Numbers, booleans and texts have a column each. Lists stay in the column `values`, as do further names once there
+are `MOST_COLUMNS`, and the weights of a fusion of common errors (`weight.v03`): one for each pair of vehicles.
 """
 
 from __future__ import annotations
