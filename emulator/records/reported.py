@@ -27,7 +27,7 @@ MOST_COLUMNS = 64
 MOST_DOTTED = 32
 """Names with a dot among them: figures of each peer (`delay_ms.v03`) leave room for a program's others."""
 Figure = bool | float | str
-"""What one value can be that is a figure."""
+"""Types of a figure."""
 TEXT = pa.dictionary(pa.int32(), pa.string())
 """Type of a column of texts."""
 _BOOLEAN, _NUMBER, _TEXT = range(3)
