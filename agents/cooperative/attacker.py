@@ -1,68 +1,27 @@
 """An attacker: a vehicle that cooperates honestly inside, and broadcasts false frames, which others must withstand.
 
 `[[program.exceptions]]` makes some vehicles attackers. Their options are those of `agents.cooperative`, and
-
-`lie`: what is false in the frames.
-    `offset`: the own fix, estimate and running sums are shifted by `offset_m`.
-    `overconfident`: the estimate is shifted by `offset_m`, with a deviation of a millimetre.
-    `sums`: the running sums alone are shifted by `offset_m`.
-    `relay`: relayed fixes are shifted by `offset_m`, and claim to be new.
-    `epoch`: each frame starts a new epoch of the consensus, `EPOCH_LEAP` ahead of the last.
-    `non_finite`: estimate and covariance are NaN and infinite in turns.
-    `absurd`: huge estimates, negative covariances, and fixes 20 000 km away, in turns.
-    `random`: random bytes, as long as a frame.
-`offset_m`: [east, north] in metres.
-`from_s`: time of the run before which the frames are honest.
+those of `attack`, which says what is false.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, Literal
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 
-from agents import options as parsing
+from agents.cooperative.attack import EPOCH_LEAP, Attack, shifted_sum
 from agents.cooperative.estimator import Estimator
-from agents.cooperative.frame import COMMON_LIMIT_M, CooperativeFrame, encode
-from agents.cooperative.options import Options
+from agents.cooperative.frame import CooperativeFrame, encode
+from agents.cooperative.information_attacker import InformationAttacker
 from agents.cooperative.program import cooperate
 from vnet import Fix, Node
-from vnet.types import Array
 from vnet.units import NS_PER_S
 
-Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
-
-EPOCH_LEAP = 20
-"""Number of epochs by which each frame of the lie `epoch` is ahead: more than a leap's largest penalty."""
 _NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
 """Values of a non-finite estimate and covariance, in turns."""
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))
 """Absurd frames, in turns: estimate in metres, variance in m², and position of the fix in centimetres."""
-
-
-class Attack(msgspec.Struct, frozen=True, kw_only=True):
-    """The attacker's own options."""
-
-    lie: Literal["offset", "overconfident", "sums", "relay", "epoch", "non_finite", "absurd", "random"] = "offset"
-    """The fields that are false; see the module's text."""
-    offset_m: tuple[Finite, Finite] = (50.0, 0.0)
-    """Shift (east, north) of what is false."""
-    from_s: Finite = 0.0
-    """Time of the run from which on frames are false."""
-
-    @classmethod
-    def split(cls, options: Mapping[str, Any]) -> tuple[Attack, Options]:
-        """Convert the options of a scenario into those of the attack, and those of the program that it extends.
-
-        Raises ProgramError with the key, the value and what is allowed.
-        """
-        own = {key: value for key, value in options.items() if key in cls.__struct_fields__}
-        others = {key: value for key, value in options.items() if key not in own}
-        return parsing.parse(own, cls), Options.parse(others)
 
 
 class Attacker(Estimator):
@@ -90,12 +49,12 @@ class Attacker(Estimator):
                     frame,
                     fix_m=frame.fix_m + offset_m,
                     estimate_m=frame.estimate_m + offset_m,
-                    running_sum=_shifted(frame.running_sum, offset_m),
+                    running_sum=shifted_sum(frame.running_sum, offset_m),
                 )
             case "overconfident":
                 return replace(frame, estimate_m=frame.estimate_m + offset_m, covariance_m2=1e-6 * np.eye(2))
             case "sums":
-                return replace(frame, running_sum=_shifted(frame.running_sum, offset_m))
+                return replace(frame, running_sum=shifted_sum(frame.running_sum, offset_m))
             case "relay":
                 relayed = frame.relayed.copy()
                 relayed["x_cm"] += round(100 * offset_m[0])
@@ -114,16 +73,10 @@ class Attacker(Estimator):
                 return replace(frame, fix_m=fix_m, estimate_m=np.full(2, estimate), covariance_m2=covariance)
 
 
-def _shifted(running_sum: tuple[float, float, float], offset_m: Array) -> tuple[float, float, float]:
-    """Return sums whose ratio is off by `offset_m`, within the bounds of a frame."""
-    s_x, s_y, w = running_sum
-    s_x, s_y = np.clip([s_x + w * offset_m[0], s_y + w * offset_m[1]], -COMMON_LIMIT_M * w, COMMON_LIMIT_M * w)
-    return float(s_x), float(s_y), w
-
-
 async def main(node: Node) -> None:
     """Cooperate inside, and broadcast false frames, until the run ends."""
     attack, options = Attack.split(node.options)
-    attacker = Attacker(node.id, options, node.map, node.rng, node.period_ns)
+    kind = InformationAttacker if options.exchange == "information" else Attacker
+    attacker = kind(node.id, options, node.map, node.rng, node.period_ns)
     attacker.attack = attack
     await cooperate(node, options, attacker)

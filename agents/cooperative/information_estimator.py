@@ -42,6 +42,8 @@ from vnet.cmm.plausibility import (
     moments,
     priors_agree,
     scaled_down,
+    spread_limit_m,
+    unless_most_disagree,
 )
 from vnet.cmm.rbpf import Observation
 from vnet.roads.lanes import LaneMap
@@ -69,10 +71,12 @@ def as_sent(information: Information) -> tuple[float, ...]:
 class InformationEstimator:
     """The state of one vehicle's cooperation by information.
 
+    period_s, rng: the period and the vehicle's own random numbers.
     own: what the vehicle knows of itself and of the common error.
     fused_m: (2,), the estimate of the common error right after the latest fusion.
     weights: the latest fusion weights by node id, the vehicle's own included.
     mean_m: (2,), the network's mean as far as it is known, None before the first.
+    limit_m: distance from the median of what is heard beyond which the latest period's priors were not used.
     imported: number of increments that the latest period took from others.
     """
 
@@ -87,9 +91,12 @@ class InformationEstimator:
         self.mean_m: Array | None = None
         self.weights: dict[str, float] = {}
         self.imported = 0
+        self.limit_m = np.inf
         self._node_id = node_id
         self._options = options
         self._period_ns = period_ns
+        self.period_s = period_ns / NS_PER_S
+        self.rng = rng
         self._rule = FusionRule(options, rng)
         self._origins = Origins()
         self._frames: dict[str, InformationFrame] = {}
@@ -189,10 +196,15 @@ class InformationEstimator:
             return believed
         own = means_m[0], covariances_m2[0]
         near = priors_agree(means_m[1:], covariances_m2[1:], *own)
+        median_m, self.limit_m = spread_limit_m(means_m)
+        off_m = means_m[1:] - median_m
+        usual = off_m[:, 0] ** 2 + off_m[:, 1] ** 2 < self.limit_m**2
         agrees = self._origins.agree([_code(name) for name in names], said[1:, 5:], own, self._now_ns / NS_PER_S)
+        agrees = unless_most_disagree(agrees)
+        self._notice_being_lost(near, said[1:, :5])
+        near &= usual
         self._reject("prior", ~near)
         self._reject("increment", near & ~agrees)
-        self._notice_being_lost(near, said[1:, :5])
         believed[1:] = near & agrees
         return believed
 

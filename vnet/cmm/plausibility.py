@@ -22,8 +22,16 @@ INCREMENT_GATE = 16.0
 """Largest squared deviation of an increment, or of an origin's sum, from what is believed."""
 PRIOR_GATE = 4.0
 """Largest squared deviation of a prior's mean from one's own."""
+SPREAD_GATE = 3.5
+"""Largest distance of a prior's mean from the median of all, in deviations of their spread."""
+SPREAD_FLOOR_M = 0.05
+"""Distance (m) from the median that is always allowed."""
+MAJORITY = 4
+"""Least number of priors or increments of which a majority can be told."""
 MEMORY_S = 5.0
 """Time (s) in which an origin's sum decays."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a normal vector in the plane, in deviations an axis."""
 MAX_ORIGINS = 1024
 """Number of origins whose sums are kept: names cost an attacker nothing."""
 
@@ -79,6 +87,27 @@ def priors_agree(
     total, off = covariance_m2 + own_covariance_m2, mean_m - own_mean_m
     a, b, d, x, y = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1], off[:, 0], off[:, 1]
     return np.asarray((d * x * x - 2 * b * x * y + a * y * y) < PRIOR_GATE * (a * d - b * b))
+
+
+def spread_limit_m(means_m: Array) -> tuple[Array, float]:
+    """Return the median (2,) of means (n, 2), and the distance from it beyond which one of them is an outlier.
+
+    Estimates that are pooled in each period differ by less than each is uncertain, because they err together: who
+    stays within its uncertainty, but always on one side, would draw all others along.
+    """
+    median_m = np.median(means_m, axis=0)
+    if len(means_m) < MAJORITY:
+        return median_m, np.inf
+    off_m = means_m - median_m
+    distance_m = float(np.median(np.hypot(off_m[:, 0], off_m[:, 1])))
+    return median_m, SPREAD_FLOOR_M + SPREAD_GATE * distance_m / RAYLEIGH_MEDIAN
+
+
+def unless_most_disagree(agrees: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return all true where most are false: then it is what is believed that is wrong, and not they."""
+    if len(agrees) >= MAJORITY - 1 and 2 * np.count_nonzero(agrees) < len(agrees):
+        return np.ones_like(agrees)
+    return agrees
 
 
 class Origins:

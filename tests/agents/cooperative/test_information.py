@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from agents.cooperative.attack import Attack, Lie
 from agents.cooperative.frame import FrameError, name_of_code, short_name
+from agents.cooperative.information_attacker import InformationAttacker
 from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
@@ -53,8 +56,12 @@ class Network:
             fixes = [self.fix(k) for k in range(len(self.ids))]
             sent: list[bytes | None] = []
             for name, estimator, fix in zip(self.ids, self.estimators, fixes, strict=True):
-                frame = change(name, decode(estimator.frame(fix, 1400)))
-                sent.append(None if frame is None else encode(frame))
+                payload = estimator.frame(fix, 1400)
+                if change is not _honest:
+                    frame = change(name, decode(payload))
+                    sent.append(None if frame is None else encode(frame))
+                else:
+                    sent.append(payload)
             for k, estimator in enumerate(self.estimators):
                 packets = [
                     Packet(self.ids[j], now_ns, now_ns + 5_000_000, payload)
@@ -155,6 +162,18 @@ def test_a_liar_moves_nobody(off_m: float, factor: float) -> None:
     network.run(80, lie)
     assert network.errors_m()[1:].max() < 0.7
     assert all(e.rejected["prior"] > 20 for e in network.estimators[1:])
+
+
+@pytest.mark.parametrize("lie", get_args(Lie))
+def test_an_attacker_moves_nobody(lie: Lie) -> None:
+    """One of eight lies from second 2 on, in each of the ways that there are."""
+    network = Network(8)
+    attacker = InformationAttacker("v0", network.options, network.lanes, np.random.default_rng(0), PERIOD_NS)
+    attacker.attack = Attack(lie=lie, offset_m=(10.0, 0.0), from_s=2.0)
+    network.estimators[0] = attacker
+    network.run(80)
+    assert attacker.sent == 60
+    assert network.errors_m()[1:].max() < 0.7
 
 
 def test_passed_on_increments_that_are_forged_are_seen() -> None:

@@ -9,7 +9,17 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from vnet.cmm.information import Information, gained, inverse, square_root, transport
-from vnet.cmm.plausibility import Origins, deviation, matrices, median_belief, moments, priors_agree, scaled_down
+from vnet.cmm.plausibility import (
+    Origins,
+    deviation,
+    matrices,
+    median_belief,
+    moments,
+    priors_agree,
+    scaled_down,
+    spread_limit_m,
+    unless_most_disagree,
+)
 from vnet.types import Array
 
 
@@ -144,3 +154,29 @@ def test_the_median_belief_is_not_moved_by_one_liar() -> None:
     mean_m, covariance_m2 = median_belief(priors).moments()
     assert_allclose(mean_m, [1.2, 0.8])
     assert_allclose(covariance_m2, 0.4 * np.eye(2))
+
+
+def test_a_prior_far_from_the_spread_of_all_is_an_outlier() -> None:
+    rng = np.random.default_rng(3)
+    means_m = 0.05 * rng.standard_normal((20, 2)) + [2.0, 1.0]
+    means_m[4] += [0.4, 0.0]
+    median_m, limit_m = spread_limit_m(means_m)
+    distances_m = np.hypot(*(means_m - median_m).T)
+    assert np.flatnonzero(distances_m > limit_m).tolist() == [4]
+    assert limit_m == pytest.approx(0.05 + 3.5 * 0.05, rel=0.4)
+
+
+def test_of_three_no_majority_can_be_told() -> None:
+    assert spread_limit_m(np.array([[0.0, 0.0], [0.0, 0.0], [9.0, 0.0]]))[1] == np.inf
+
+
+@pytest.mark.parametrize(
+    ("agrees", "expected"),
+    [
+        ([True, True, False], [True, True, False]),
+        ([True, False, False], [True, True, True]),
+        ([False, False], [False, False]),
+    ],
+)
+def test_where_most_disagree_the_belief_is_wrong(agrees: list[bool], expected: list[bool]) -> None:
+    assert unless_most_disagree(np.array(agrees)).tolist() == expected
