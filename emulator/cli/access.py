@@ -9,7 +9,15 @@ from typing import Annotated
 
 import typer
 
-from emulator.cli.options import DEFAULT_LISTEN, HostsOption, ScenarioArgument, SetOption, host_names, load
+from emulator.cli.options import (
+    DEFAULT_LISTEN,
+    HostsOption,
+    ProgramOption,
+    ScenarioArgument,
+    SetOption,
+    host_names,
+    load,
+)
 from emulator.drivers.join import split_into_processes
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import one_line_errors
@@ -43,11 +51,12 @@ def access(
         typer.Option(metavar="FOLDER", help="Where the zenohd sees --out, if elsewhere (in a container)."),
     ] = None,
     hosts: HostsOption = None,
+    program: ProgramOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Write the configuration of a separate router (zenohd) and everybody's credentials."""
     with one_line_errors():
-        loaded = load(scenario, overrides)
+        loaded = load(scenario, overrides, program)
         users = create_access(loaded, build_world(loaded), listen, tls_name or (), host_names(hosts))
         users.save(out, listen, router_folder or out.resolve())
         if users.hosts:

@@ -22,6 +22,9 @@ def check(
     own_checks: Annotated[
         bool, typer.Option("--own-checks", metavar="", help="Run its own checks again: code that the folder names.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", metavar="", help="Ignored: all checks are listed anyway.")
+    ] = False,
 ) -> None:
     """Judge a run again, from its files alone; its own checks stand as recorded unless asked."""
     with one_line_errors():

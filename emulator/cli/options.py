@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import dataclass
 from enum import StrEnum
@@ -23,9 +24,11 @@ LATEST = Path("runs/latest")
 
 
 def path_of(text: str) -> Path:
-    """Return a path that an option or an argument names. Raises BadParameter for an empty one."""
+    """Return a path that an option or an argument names. Raises BadParameter for an empty one and for a URL."""
     if not text:
         raise typer.BadParameter("'': a path is needed")
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
+        raise typer.BadParameter(f"{printable(text)!r}: a path of this machine is needed, not a URL")
     return Path(text)
 
 

@@ -16,6 +16,7 @@ from rich.text import Text
 from emulator.cli.options import LATEST, RunArgument
 from emulator.records.frame_log import FrameEntry, frame_log
 from emulator.records.recorded_run import RecordedRun
+from emulator.scenario.program import split_file
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.program_path import search_programs_in
@@ -37,7 +38,9 @@ def trace(
     decode: Annotated[
         str | None,
         typer.Option(
-            metavar="MODULE:FUNCTION", help="Show what this function returns for each payload (run.keep_payloads)."
+            metavar="FUNCTION",
+            help="Show what this function returns for each payload (run.keep_payloads): decode.py:decode, or "
+            "package.module:decode.",
         ),
     ] = None,
 ) -> None:
@@ -99,10 +102,15 @@ def _decoded_by(function: Callable[[bytes], Any]) -> Callable[[FrameEntry], str]
 
 def _load(entry: str) -> Callable[[bytes], Any]:
     """Import a function. Raises VnetError for what is none."""
-    module, _, name = entry.partition(":")
+    module, _, name = entry.rpartition(":")
     if not module or not name:
-        raise VnetError(f"--decode {shown(entry)}: write it as package.module:function")
-    search_programs_in((Path.cwd(),))
+        raise VnetError(f"--decode {shown(entry)}: write it as file.py:function or package.module:function")
+    folder = Path.cwd()
+    if split_file(entry) is not None:
+        if not (file := Path(module)).is_file():
+            raise VnetError(f"--decode {entry}: {module}: no such file")
+        folder, module = file.resolve().parent, file.stem
+    search_programs_in((folder,))
     try:
         function = getattr(import_module(module), name)
     except (Exception, SystemExit) as error:

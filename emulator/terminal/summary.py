@@ -98,7 +98,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str, verbose
             console.print(Text(f"not applicable: {', '.join(names)}: {reason}", style="dim"))
     for check in judgement.checks:
         if check.verdict is not Verdict.VALID:
-            _print_details(check.figures, console)
+            _print_details(check, console)
         if rows := check.figures.get("rows"):
             console.print(Text(f"{check.name}: the first offending rows", style="bold red"))
             console.print(offending(rows))
@@ -142,11 +142,11 @@ def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     return table
 
 
-def _print_details(figures: dict[str, Any], console: Console) -> None:
-    for item in figures.get("gone", [figures])[:3]:  # the others are in verdict.json
+def _print_details(check: CheckResult, console: Console) -> None:
+    for item in check.figures.get("gone", [check.figures])[:3]:  # the others are in verdict.json
         for key in ("where", "log_tail"):
             if item.get(key):
-                console.print(Text(f"{item.get('node', '')} {key}:", style="bold"))
+                console.print(Text(f"{item.get('node', check.name)} {key}:", style="bold"))
                 console.print(Text(str(item[key]).rstrip()))
 
 

@@ -146,6 +146,7 @@ def test_one_that_raises_is_unknown_and_named_and_its_results_so_far_count(here:
     status, text = simulate("raising", "sound")
     assert status == 3
     assert "raises KeyError: 'v01' (own_checks.py:19)" in text
+    assert "own:own_checks.raising where:" in text
     checks = {check.name: check for check in emulator.Run.open(here / "run").checks}
     assert checks["own:first"].verdict == checks["own:silent"].verdict == "valid"
     broken = checks["own:own_checks.raising"]
@@ -326,7 +327,7 @@ def test_another_check_judges_a_finished_run(here: Path, monkeypatch: pytest.Mon
     (here / "later").mkdir()
     (here / "later" / "own_later.py").write_text('def check(run):\n    yield "late", "invalid", "too late"\n')
     monkeypatch.chdir(here / "later")
-    status, text = vnet("check", "../run", "--check", "own_later.py")
+    status, text = vnet("check", "../run", "--check", "own_later.py", "-v")
     assert status == 1 and "too late" in text and "nobody was silent" in text
     del sys.modules["own_checks"]
     status, text = vnet("check", "../run", "--check", "own_checks:sound")

@@ -86,6 +86,19 @@ def test_an_empty_path_is_none(arguments: list[str], capsys: pytest.CaptureFixtu
     assert stderr.count("\n") == 1
 
 
+def test_a_url_is_no_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_app(app, ["simulate", BEACON, "--out", "s3://bucket/x"]) == 2
+    stderr = capsys.readouterr().err
+    assert "'s3://bucket/x': a path of this machine is needed, not a URL" in stderr
+    assert stderr.count("\n") == 1
+    assert not Path("s3:").exists()
+
+
+def test_users_of_a_run_are_made_for_its_program(here: Path) -> None:
+    assert vnet("access", BEACON, "--program", "good:main", "--out", "access")[0] == 0
+    assert (here / "access" / "credentials").is_dir()
+
+
 def test_an_error_of_the_file_names_the_file(here: Path) -> None:
     (here / "own.toml").write_text("[run]\nseed = -1\n")
     status, stderr = vnet("simulate", "own.toml", "--set", "radio.loss=0.1")

@@ -82,6 +82,21 @@ def test_logs_and_events_are_the_same_live_and_simulated(nodes_per_process: int)
     assert ">half way<" in page
 
 
+async def breaks_lines(node: Node) -> None:
+    node.log("one\ntwo")
+    node.event("said", text="one\ntwo")
+
+
+def test_lines_that_are_broken_keep_their_beginning_apart() -> None:
+    emulation = run_together(scenario_of([], f"{__name__}:breaks_lines", vehicles=2))
+    lines = (emulation.folder.logs / "v01.log").read_text().splitlines()
+    assert lines[:3] == [
+        "0.000000 v01 info: one",
+        "    two",
+        "0.000000 v01 info: event said text=one\\ntwo",
+    ]
+
+
 def test_a_flood_is_cut_and_counted() -> None:
     emulation = run_together(scenario_of([], f"{__name__}:floods", vehicles=2))
     conclude(emulation, 1.0, "simulate")
