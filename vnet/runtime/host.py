@@ -116,13 +116,12 @@ class Host:
         """Take a line of a log or an event of a program; the line is written at once."""
         self._notes.append(wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details))  # type: ignore[arg-type]
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
-        self._line(node, level, f"{text} {said}".rstrip() if kind == "log" else f"event {text} {said}".rstrip())
+        self._line(node, level, f"{'event ' * (kind != 'log')}{text} {said}".rstrip().replace("\n", "\n    "))
         self._on_traffic()
 
     def _line(self, node: str, level: str, text: str) -> None:
-        """Write a line to a node's log, unless there were too many; those that it is broken into are indented."""
+        """Write a line to a node's log, unless there were too many."""
         self._lines[node] += 1
-        text = text.replace("\n", "\n    ")
         if self._lines[node] <= MOST_LINES:
             self._on_line(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {text}")
         elif self._lines[node] == MOST_LINES + 1:
