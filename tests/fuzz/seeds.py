@@ -67,6 +67,7 @@ HOST_TX: tuple[messages.FromHost, ...] = (
             messages.Part("file", "v01", "a/b", b"data"),
             messages.LeftOut("file", "v01", 1, ["a: a link"]),
             messages.Figures({"v01": 5}, [("v01", [0.0, 0.5], [1, 2])]),
+            messages.HandingIn(),
             messages.HandedIn(),
         ],
     ),

@@ -299,8 +299,7 @@ class HostProcess:
 
     def _hand_in(self, order: messages.HandIn) -> None:
         """End all agents and put what they leave; each part is a bundle of its own."""
-        if bundle := self._relay.take_bundle():
-            self._up.put(bundle)
+        self._up.put([*self._relay.take_bundle(), messages.HandingIn()])
         for thread in self._leaving.values():
             thread.join()
         self._launcher.stop(order.patience_s)

@@ -183,11 +183,15 @@ class Figures(Message, frozen=True):
     memory: Sequence[tuple[str, Sequence[float], Sequence[int]]]
 
 
+class HandingIn(Message, frozen=True):
+    """The order to hand in has come: what follows may take its time."""
+
+
 class HandedIn(Message, frozen=True):
     """All has been handed in."""
 
 
-Item = FromNode | Token | Ended | LogTail | Part | LeftOut | Figures | HandedIn
+Item = FromNode | Token | Ended | LogTail | Part | LeftOut | Figures | HandingIn | HandedIn
 
 
 class News(Message, frozen=True):

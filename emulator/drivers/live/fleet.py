@@ -31,6 +31,10 @@ from vnet.transport.access import Access
 
 DETACH_PATIENCE_S = 1.0
 """Seconds that a process which was told to end has for it, before its host kills it."""
+ANSWER_PATIENCE_S = 5.0
+"""Seconds at the end of a run after which a host that has not answered is taken for cut off."""
+HAND_IN_PATIENCE_S = 20.0
+"""Seconds of silence at the end of a run, beyond what its processes have, that are granted to hosts that answer."""
 
 
 @dataclass
@@ -42,6 +46,7 @@ class _Host:
     where: str = ""
     is_ready: bool = False
     is_gone: bool = False
+    is_handing_in: bool = False
     has_handed_in: bool = False
     orders: list[Order] = field(default_factory=list)
 
@@ -275,6 +280,9 @@ class Fleet:
                 host.retrieval.tell_left_out(self._time_ns(), item)
             case messages.Figures(cpu_ns, memory):
                 self._take_figures(host, cpu_ns, memory)
+            case messages.HandingIn():
+                host.is_handing_in = True
+                self._changes.set()
             case messages.HandedIn():
                 host.has_handed_in = True
                 self._changes.set()
@@ -317,19 +325,21 @@ class Fleet:
 
     # The end.
 
-    async def hand_in(self, patience_s: float, silence_s: float) -> None:
+    async def hand_in(self, patience_s: float) -> None:
         """Have all agents ended after `patience_s`, and take what they leave.
 
-        A host that hands in nothing more for `silence_s` is not waited for any longer.
+        A host is not waited for any longer that does not answer for `ANSWER_PATIENCE_S`; nor is one that does, once
+        there has been nothing from any host for `HAND_IN_PATIENCE_S`.
         """
         left = [host for host in self._hosts.values() if host.is_ready and not host.is_gone]
         for host in left:
             self._order(host, messages.HandIn(patience_s))
-        silent_at = time.monotonic() + patience_s + silence_s
+        silent_at = dict.fromkeys([host.name for host in left], time.monotonic() + ANSWER_PATIENCE_S)
         while left := [host for host in left if not (host.has_handed_in or host.is_gone)]:
-            if not await self._changes.wait(silent_at - time.monotonic()):
+            if not await self._changes.wait(max(silent_at[host.name] for host in left) - time.monotonic()):
                 break
-            silent_at = max(silent_at, time.monotonic() + silence_s)
+            at_least = time.monotonic() + patience_s + HAND_IN_PATIENCE_S
+            silent_at |= {host.name: at_least for host in left if host.is_handing_in}
         for host in left:
             self._folder.event(self._time_ns(), "host_silent", None, host=host.name, where=host.where)
         for host in self._hosts.values():

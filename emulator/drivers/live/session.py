@@ -52,10 +52,6 @@ FULL_PATIENCE_S = 5.0
 """Seconds for which a run that came to its end does."""
 RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
-HAND_IN_PATIENCE_S = 2.0
-"""Seconds of silence after which a run that did not come to its end waits no longer for a host."""
-FULL_HAND_IN_PATIENCE_S = 20.0
-"""Seconds of silence after which a run that came to its end does not."""
 EMULATOR_PROCESS = "emulator"
 
 
@@ -292,10 +288,7 @@ class LiveSession:
             while self._inbox.connected and await self._changes.wait(deadline_s - time.monotonic()):
                 pass
         if self._fleet is not None:
-            if completed:
-                await self._fleet.hand_in(FULL_PATIENCE_S, FULL_HAND_IN_PATIENCE_S)
-            else:
-                await self._fleet.hand_in(PATIENCE_S, HAND_IN_PATIENCE_S)
+            await self._fleet.hand_in(FULL_PATIENCE_S if completed else PATIENCE_S)
         self._feed.end()
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)

@@ -12,7 +12,18 @@ import pytest
 from emulator.drivers.hosts import host as host_module
 from emulator.drivers.hosts import messages
 from emulator.drivers.hosts.host import Event, HostProcess
-from emulator.drivers.hosts.messages import Ended, Figures, FromNode, HandedIn, LogTail, Order, Part, Token, ToNode
+from emulator.drivers.hosts.messages import (
+    Ended,
+    Figures,
+    FromNode,
+    HandedIn,
+    HandingIn,
+    LogTail,
+    Order,
+    Part,
+    Token,
+    ToNode,
+)
 from emulator.drivers.launch import Exit
 from emulator.records.run_folder import RunFolder
 from tests.emulator.drivers.live.fakes import FakeLauncher
@@ -178,12 +189,13 @@ def test_at_the_end_everything_is_handed_in(play: Play) -> None:
     bundles = play.work(("tx", "v01", FINAL), orders(messages.HandIn(2.0)))
     assert ("stop", "2.0") in play.launcher.done
     items = [item for bundle in bundles for item in bundle]
-    assert items[:3] == [
+    assert items[:4] == [
         FromNode("v01", FINAL),
+        HandingIn(),
         Part("log", "v01", "", b"hello\n"),
         Part("file", "v02", "data", b"left"),
     ]
-    assert isinstance(items[3], Figures) and items[4:] == [HandedIn()]
+    assert isinstance(items[4], Figures) and items[5:] == [HandedIn()]
 
 
 def test_orders_of_another_and_nonsense_change_nothing(play: Play, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,7 @@ from emulator.drivers.hosts.messages import (
     Ended,
     FromNode,
     HandedIn,
+    HandingIn,
     HostHello,
     HostRefusal,
     HostWelcome,
@@ -24,7 +25,7 @@ from emulator.drivers.hosts.messages import (
     ToNode,
 )
 from emulator.drivers.launch import Exit
-from emulator.drivers.live.fleet import Fleet
+from emulator.drivers.live.fleet import ANSWER_PATIENCE_S, Fleet
 from emulator.drivers.live.supervisor import DEATH_GRACE_S
 from emulator.drivers.live.waiting import ChangeSignal
 from emulator.records.code_digest import vnet_digest
@@ -233,8 +234,11 @@ def test_the_end_waits_for_what_is_handed_in_and_not_for_the_silent(monkeypatch:
         play = Play()
         play.join()
         await play.bundles()
-        ending = asyncio.ensure_future(play.fleet.hand_in(1.0, 5.0))
+        ending = asyncio.ensure_future(play.fleet.hand_in(1.0))
         assert [host for host, _ in await play.bundles()] == ["a", "b"]
+        play.news("a", HandingIn())
+        await asyncio.sleep(4 * ANSWER_PATIENCE_S)  # on a machine that is busy
+        assert not ending.done()
         play.news("a", HandedIn())
         play.fleet.take_token("a", False)
         await ending
