@@ -130,14 +130,14 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
         raise KeyboardInterrupt
     if cell.is_judged:
         _, verdict = conclude(emulation, wall_s, "run" if live else "simulate")
-        figures = judged_figures(verdict)
+        figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
         if broken := [event for event in folder.events if event.kind in BROKEN]:
             event = broken[0]
             raise VnetError(f"{event.node} {event.kind}: {event.details.get('error', '')}")
-        figures = measure(emulation, cell.from_s)
+        figures, metrics = measure(emulation, cell.from_s)
     states = emulation.metrics.states_table() if cell.keeps_states else None
-    return CellResult(figures, emulation.metrics.metrics_table(), states)
+    return CellResult(figures, metrics, states)
 
 
 # Results.

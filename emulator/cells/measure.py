@@ -13,7 +13,7 @@ from emulator.cells.consistency import consistency_figures
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
-from emulator.records.hears_all import bound_of
+from emulator.records.hears_all import BoundSeries, bound_of
 from emulator.records.recorded_tables import RecordedTables
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
@@ -58,12 +58,17 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     return row
 
 
-def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
+BOUND, BOUND_POSITION = "bound_rmse_m", "bound_position_rmse_m"
+"""Columns of a cell's metrics: the hears-all bound's RMSE of common error and position, where the run has one."""
+
+
+def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Table]:
     """Figures of a run from `from_s` on: roots of mean squares over the periods, in metres.
 
     Of the common error at the end of the period (`rmse_m`, `deviation_m`, by component), right after stacking
     (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period;
-    what `consistency_figures` and, as `bound_…`, the hears-all bound have.
+    what `consistency_figures` and, as `bound_…`, the hears-all bound have. Returned beside is the table of metrics,
+    with the bound's errors in each period as further columns.
     """
     rows = [row for row in emulation.metrics.rows if row.time_ns >= from_s * 1e9]
 
@@ -77,7 +82,8 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
 
     states = emulation.metrics.states_table()
     recorded = _recorded(emulation, states)
-    return {
+    bound, metrics = _bound(recorded), emulation.metrics.metrics_table()
+    figures = {
         "rmse_m": rms("common_error_rmse_m"),
         "deviation_m": rms("deviation_m"),
         "bias_m": rms("bias_m"),
@@ -94,8 +100,13 @@ def measure(emulation: Emulation, from_s: float) -> dict[str, Any]:
         "not_finite": sum(row.not_finite for row in rows),
         "metrics_sha256": emulation.metrics.sha256(),
         **consistency_figures(recorded, from_s),
-        **_bound(recorded, from_s),
     }
+    if bound is not None:
+        found = bound.after(math.ceil(from_s * NS_PER_S / emulation.world.period_ns))
+        figures |= {f"bound_{name}": value for name, value in found.items()}
+        for name, series in ((BOUND, bound.common_rmse_m), (BOUND_POSITION, bound.position_rmse_m)):
+            metrics = metrics.append_column(name, pa.array(series, from_pandas=True))
+    return figures, metrics
 
 
 def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
@@ -104,13 +115,12 @@ def _recorded(emulation: Emulation, states: pa.Table) -> RecordedTables:
     return RecordedTables(emulation.scenario, nothing, states, nothing, (), world=world)
 
 
-def _bound(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
-    """Figures of the hears-all bound from `from_s` on; none if the run has no such bound."""
+def _bound(recorded: RecordedTables) -> BoundSeries | None:
+    """Return the errors of the hears-all bound; None if the run has no such bound."""
     try:
-        figures = bound_of(recorded).after(math.ceil(from_s * NS_PER_S / recorded.scenario.period_ns))
+        return bound_of(recorded)
     except VnetError:
-        return {}
-    return {f"bound_{name}": value for name, value in figures.items()}
+        return None
 
 
 def _rms_columns(rows: list[list[float | None]]) -> list[float]:

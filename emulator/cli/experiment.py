@@ -163,6 +163,8 @@ def compare(
         sections = paper.network_sections(networks)
         cells = comparisons.comparison_cells(study.value, sections, range(1, seeds + 1), duration_s, world)
         results = _run(cells, folder, study.value, only)
+        for picture in comparisons.draw(cells, folder):
+            print(picture)
         _show(comparisons.report(study.value, results, duration_s), folder / f"{study.value}.md")
 
 

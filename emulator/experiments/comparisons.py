@@ -13,10 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
-from emulator.cells.cells import Cell
+from emulator.cells.cells import Cell, has_result, read_series
+from emulator.cells.measure import BOUND, BOUND_POSITION
 from emulator.experiments.paper import Labels, counted_from
 from emulator.experiments.reports import Result, column, select, unique
+from emulator.experiments.result_figures import against_time
 from emulator.experiments.statistics import paired_tests, shown_interval
 from emulator.experiments.tables import MISSING, markdown_table, paired_ratio
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
@@ -31,6 +34,11 @@ REFERENCE_OPTIONS: dict[str, Any] = {"exchange": "information", "particles": 100
 """Options of the first variant of each study."""
 EQUAL_RIDGE_M2 = 1e6
 """Ridge of the quadratic program beside which nothing else counts: all weights are equal."""
+COLUMNS = {
+    "common_error_rmse_m": "RMSE of the\ncommon error (m)",
+    "position_rmse_m": "RMSE of the\nposition (m)",
+}
+"""Columns of the metrics that are drawn, and their titles."""
 CHURN_S = 900.0
 """Length of a run with churn."""
 CHURN_EVERY_S = 30.0
@@ -143,14 +151,23 @@ def comparison_cells(
         for name, variant in STUDIES[study]().items():
             for seed in seeds:
                 labels: Labels = {"network": network, "mechanism": name, "seed": seed}
+                if world:
+                    world = {**world, "world.common_error.start_s": COMMON_APART_S * (seed - 1)}
                 faults = list(_churn(duration_s)) if study == "churn" else []
                 scenario = _scenario(section, seed, variant, duration_s, world or {}, faults)
                 cells.append(Cell(labels, scenario, counted_from(duration_s)))
     return cells
 
 
+COMMON_APART_S = 300.0
+"""Time in the file of a recorded common error from the beginning of one seed's run to that of the next one's."""
+
+
 def recorded_common(path: Path) -> dict[str, Any]:
-    """Return the keys of a world whose common error is recorded. Raises VnetError for a file that is not there."""
+    """Return the keys of a world whose common error is recorded. Raises VnetError for a file that is not there.
+
+    The runs of seed s begin `COMMON_APART_S` · (s − 1) after time 0 of the file.
+    """
     if not path.is_file():
         raise VnetError(f"--common {path}: no such file")
     return {"world.common_error.kind": "file", "world.common_error.path": str(path.resolve())}
@@ -184,6 +201,34 @@ def _churn(duration_s: float) -> Iterator[dict[str, Any]]:
 
 
 # The report.
+
+
+def draw(cells: Sequence[Cell], folder: Path) -> Iterator[Path]:
+    """Draw the errors of each variant against time, and the bound's where all have the same; yield the PNGs."""
+    for network in dict.fromkeys(cell.labels["network"] for cell in cells):
+        series: dict[str, list[pa.Table]] = {}
+        for cell in cells:
+            if cell.labels["network"] == network and has_result(cell, folder):
+                series.setdefault(str(cell.labels["mechanism"]), []).append(read_series(cell, folder))
+        if series:
+            title = f"{str(network).upper()}: errors against time"
+            path = folder / f"{network}_against_time"
+            yield against_time(_with_bound(series), path, title, columns=COLUMNS)
+
+
+def _with_bound(series: Mapping[str, list[pa.Table]]) -> dict[str, list[pa.Table]]:
+    """Return the series with that of the bound, if the variants with the same seeds have the same."""
+    first, *others = series.values()
+    if BOUND not in first[0].column_names or any(_bounds(each) != _bounds(first[: len(each)]) for each in others):
+        return dict(series)
+    names = ["time_ns", *COLUMNS]
+    bound = [table.select(["time_ns", BOUND, BOUND_POSITION]).rename_columns(names) for table in first]
+    return {**series, "bound": bound}
+
+
+def _bounds(tables: Sequence[pa.Table]) -> list[Any]:
+    return [table[BOUND].to_pylist() if BOUND in table.column_names else None for table in tables]
+
 
 HEADER = ["variant", "c [m]", "c : bound", "position [m]", "ANEES of c", "95 % ellipses: c / position"]
 HEADER += ["within 0.5 / 1.5 m", "converged [s]", "bytes", "diverged"]

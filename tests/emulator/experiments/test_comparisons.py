@@ -5,12 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 
-from emulator.cells.cells import compute
+from emulator.cells.cells import compute, keep, read_result, read_series
+from emulator.cells.measure import BOUND, BOUND_POSITION
 from emulator.experiments.comparisons import (
     STUDIES,
+    _with_bound,
     comparison_cells,
+    draw,
     full_ablation,
     recorded_common,
     report,
@@ -49,8 +53,9 @@ def test_churn_takes_vehicles_away_until_the_end() -> None:
 def test_a_recorded_common_error_is_in_all_cells(tmp_path: Path) -> None:
     path = tmp_path / "errors.csv"
     path.write_text("time_s,east_m,north_m\n0,1,1\n100,2,2\n")
-    for cell in comparison_cells("baselines", TINY, [1], 50.0, recorded_common(path)):
-        assert cell.scenario.world.common_error.path == path
+    for cell in comparison_cells("baselines", TINY, [1, 2], 50.0, recorded_common(path)):
+        common = cell.scenario.world.common_error
+        assert (common.path, common.start_s) == (path, 300.0 * (cell.labels["seed"] - 1))
     with pytest.raises(VnetError, match="no such file"):
         recorded_common(tmp_path / "other.csv")
 
@@ -97,7 +102,21 @@ def test_without_one_bound_for_all_there_is_no_row_of_it() -> None:
 
 
 @pytest.mark.slow
-def test_a_cell_has_all_figures_that_the_report_needs() -> None:
-    cells = comparison_cells("baselines", TINY, [1], 8.0)
-    rows = [{**cell.labels, **compute(cell).figures} for cell in cells[1:4:2]]
+def test_a_study_leaves_a_table_and_a_picture_with_the_bound(tmp_path: Path) -> None:
+    cells = comparison_cells("baselines", TINY, [1], 8.0)[1:4:2]
+    for cell in cells:
+        (tmp_path / "cells").mkdir(exist_ok=True)
+        keep(cell, compute(cell), tmp_path / "cells")
+    rows = [read_result(cell, tmp_path) for cell in cells]
     assert "alone" in report("baselines", rows, 8.0)
+    assert read_series(cells[0], tmp_path)[BOUND].to_numpy()[-1] > 0
+    (picture,) = draw(cells, tmp_path)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_where_worlds_differ_no_bound_is_drawn() -> None:
+    def table(bound_m: float) -> pa.Table:
+        return pa.table({"time_ns": [0], BOUND: [bound_m], BOUND_POSITION: [2 * bound_m]})
+
+    assert list(_with_bound({"a": [table(0.5)], "b": [table(0.5)]})) == ["a", "b", "bound"]
+    assert list(_with_bound({"a": [table(0.5)], "b": [table(0.6)]})) == ["a", "b"]
