@@ -38,6 +38,8 @@ RESERVED_NAMES = frozenset(
 """Names that no reported value can have: columns that the emulator fills in every row of a run's states."""
 COVARIANCE_TOLERANCE = 1e-6
 """Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
+LARGEST_EXACT = 2**53
+"""Integers below it are numbers of double precision."""
 LEVELS = ("debug", "info", "warning", "error", "critical")
 """Levels of a line of a node's log."""
 NoteDetail = bool | int | float | str
@@ -54,6 +56,18 @@ class Packet:
     sent_ns: int
     received_ns: int
     payload: bytes
+
+    def __init__(self, sender: str, sent_ns: int, received_ns: int, payload: bytes) -> None:
+        # A frozen dataclass sets its fields by name, which takes twice as long; a run has millions of packets.
+        _set_sender(self, sender)
+        _set_sent_ns(self, sent_ns)
+        _set_received_ns(self, received_ns)
+        _set_payload(self, payload)
+
+
+_set_sender, _set_sent_ns, _set_received_ns, _set_payload = (
+    Packet.__dict__[name].__set__ for name in ("sender", "sent_ns", "received_ns", "payload")
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,5 +442,9 @@ def _value(name: str, value: ArrayLike) -> Value:
         if len(value) > LONGEST_TEXT:
             raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
         return str(value)
+    if type(value) is float:
+        return value
+    if type(value) is int and abs(value) < LARGEST_EXACT:
+        return float(value)
     flat = _floats(name, value)
     return flat[0] if np.ndim(value) == 0 else flat

@@ -256,17 +256,21 @@ class Lockstep:
 
     def _show(self, time_ns: int) -> None:
         """Put what arrives up to `time_ns` where its receiver will find it."""
-        node_ids = self._emulation.world.node_ids
         for node in self._crowded:
             if process := self._processes.get(self._process_of[node]):
                 del process.packets[node][:-INBOX_LIMIT]
         self._crowded.clear()
+        inboxes: dict[int, tuple[str, list[wire.WirePacket]]] = {}
         for receiver, sender, sent_ns, arrival_ns, payload in self._emulation.engine.foresee(time_ns).entries():
-            node = node_ids[receiver]
-            packets = self._processes[self._process_of[node]].packets[node]
+            if receiver not in inboxes:
+                inboxes[receiver] = self._inbox(self._emulation.world.node_ids[receiver])
+            node, packets = inboxes[receiver]
             packets.append(wire.WirePacket(node, sender, sent_ns, arrival_ns, payload))
-            if len(packets) > INBOX_LIMIT:
-                self._crowded.add(node)
+        self._crowded.update(node for node, packets in inboxes.values() if len(packets) > INBOX_LIMIT)
+
+    def _inbox(self, node: str) -> tuple[str, list[wire.WirePacket]]:
+        """Return a node and the packets that it has yet to be granted."""
+        return node, self._processes[self._process_of[node]].packets[node]
 
     def _wakes_in_window(self) -> dict[str, int]:
         """Return the first instant in the window of each process that has one, in the order of the processes."""

@@ -72,7 +72,7 @@ class Deliveries(Sequence[Delivery]):
         No object is kept of them, which is what takes time where there are many.
         """
         frames = self._frames
-        for arrival_ns, receiver, _, number in self._table[:, self._order()].T.tolist():
+        for arrival_ns, receiver, _, number in zip(*self._table[:, self._order()].tolist(), strict=True):
             frame = frames[number]
             payload = frame.altered.get(receiver, frame.payload) if frame.altered else frame.payload
             yield receiver, frame.name, frame.sent_ns, arrival_ns, payload

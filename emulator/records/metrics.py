@@ -226,10 +226,11 @@ def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
 def collect(number: Mapping[str, int], last: Mapping[str, Report], get: Any, size: int) -> Array:
     """(N, size) of what `get` finds in each node's report; NaN where it finds nothing of that size."""
     array = np.full((len(number), size), np.nan)
-    for node, report in last.items():
-        value = get(report)
-        if isinstance(value, (list, tuple)) and len(value) == size:
-            array[number[node]] = value
+    found = [(number[node], value) for node, report in last.items() if (value := get(report)) is not None]
+    fitting = [(i, value) for i, value in found if isinstance(value, (list, tuple)) and len(value) == size]
+    if fitting:
+        at, values = zip(*fitting, strict=True)
+        array[[*at]] = values
     return array
 
 

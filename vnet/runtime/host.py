@@ -18,7 +18,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from vnet.node import Node, NoteDetail, Report
+from vnet.node import Node, NoteDetail, Packet, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
@@ -211,7 +211,7 @@ class Host:
             self._clocks.pop(clock.node, None)
             if clock.is_wrong:
                 self._clocks[clock.node] = clock
-        loop.clock_error_of = self._clock_error_of_task if self._clocks else _no_clock_error
+        loop.clock_error_of = self._clock_error_of_task if self._clocks else lambda: None
 
     def _clock_error_of_task(self) -> wire.ClockError | None:
         node = current_node.get()
@@ -226,11 +226,14 @@ class Host:
 
     def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
         """Put packets, then fixes, into the mailboxes."""
+        arrived: dict[str, list[Packet]] = {}
         for packet in packets:
             received = packet.packet()
             if packet.node in self._past_clocks:
                 received = replace(received, received_ns=self._shown_ns(packet.node, received.received_ns))
-            self.nodes[packet.node].radio.inbox.deliver((received,))
+            arrived.setdefault(packet.node, []).append(received)
+        for node, some in arrived.items():
+            self.nodes[node].radio.inbox.deliver(some)
         for fix in fixes:
             self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
 
@@ -270,8 +273,8 @@ class Host:
         return next_ns
 
     def _deliver_due(self, time_ns: int) -> None:
-        due = (packet for packet in self._window.take_packets(time_ns, self._paused) if self._active[packet.node])
-        self.deliver(due, ())
+        active = self._active
+        self.deliver([p for p in self._window.take_packets(time_ns, self._paused) if active[p.node]], ())
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""
@@ -433,11 +436,6 @@ class Host:
         self._tasks[task] = owner
         self._unhandled.watch(task, owner)
         return task
-
-
-def _no_clock_error() -> wire.ClockError | None:
-    """All clocks are right."""
-    return None
 
 
 def _owner(handle: asyncio.Handle) -> Node | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
+from operator import attrgetter
 
 from vnet.transport import wire
 
@@ -25,7 +26,7 @@ class Window:
     def open(self, grant: wire.Grant) -> None:
         """Begin the next window; the steps of the last one have been taken."""
         self.end_ns = grant.end_ns
-        self._packets.extend(sorted(grant.packets, key=_received_ns))
+        self._packets.extend(sorted(grant.packets, key=attrgetter("received_ns")))
 
     def drop(self, node: str) -> None:
         """Drop the packets of a node whose process is gone."""
@@ -48,7 +49,11 @@ class Window:
 
     def take_packets(self, time_ns: int, paused: Collection[str]) -> list[wire.WirePacket]:
         """Remove and return the packets that have arrived by then, oldest first; those of paused nodes wait."""
-        due: list[wire.WirePacket] = []
+        if self._packets and self._packets[-1].received_ns <= time_ns and not paused:
+            due = list(self._packets)
+            self._packets.clear()
+            return due
+        due = []
         waiting: list[wire.WirePacket] = []
         while self._packets and self._packets[0].received_ns <= time_ns:
             packet = self._packets.popleft()
@@ -68,7 +73,3 @@ class Window:
         taken = self._steps, self._instants
         self._steps, self._instants = [], 0
         return taken
-
-
-def _received_ns(packet: wire.WirePacket) -> int:
-    return packet.received_ns

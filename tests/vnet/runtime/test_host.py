@@ -13,6 +13,7 @@ from vnet.roads.lanes import LaneMap
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Program, load_program
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
+from vnet.runtime.window import Window
 from vnet.transport import wire
 
 LANES = LaneMap(np.array([[0.0, 0.0]]), np.array([0.0]), 0.85)
@@ -386,3 +387,15 @@ def test_nodes_draw_from_seeds_of_their_own() -> None:
 def test_a_program_that_cannot_be_loaded_says_why(entry: str, message: str) -> None:
     with pytest.raises(ProgramError, match=message):
         load_program(entry)
+
+
+def test_packets_of_a_paused_node_wait_and_keep_their_order() -> None:
+    """With and without a paused node a window gives what is due, oldest first, and keeps the rest."""
+    packets = [packet_at("v2", 5), packet_at("v1", 3), packet_at("v1", 9)]
+    window = Window()
+    window.open(wire.Grant(0, 0, 10, packets))
+    assert window.take_packets(5, {"v2"}) == [packets[1]]
+    assert window.take_packets(5, ()) == [packets[0]]
+    assert window.take_packets(8, ()) == []
+    assert window.take_packets(9, ()) == [packets[2]]
+    assert not window.has_packets
