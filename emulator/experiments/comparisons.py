@@ -265,8 +265,7 @@ def _bound_rows(results: Sequence[Result]) -> Iterator[list[str]]:
     """Yield a row of the bound, if it is the same for all variants."""
     seeds: dict[int, set[float | None]] = {}
     for row in results:
-        if row["mechanism"] != "no heading":
-            seeds.setdefault(row["seed"], set()).add(row.get("bound_common_rmse_m"))
+        seeds.setdefault(row["seed"], set()).add(row.get("bound_common_rmse_m"))
     if any(len(found) > 1 or None in found for found in seeds.values()):
         return
     rows = select(results, mechanism=unique(results, "mechanism")[0])

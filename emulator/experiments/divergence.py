@@ -11,7 +11,7 @@ from emulator.cells.cells import Cell
 from emulator.experiments.paper import DEFAULT_ROWS, Labels, counted_from, default_scenario
 from emulator.experiments.reports import Result, column, select, unique
 from emulator.experiments.tables import MISSING, markdown_table
-from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
+from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S, DIVERGENT_SIGMAS
 
 LENGTH_S = 30.0
 """Length of a run: a vehicle that diverges does so at first, before any vehicle knows the common error."""
@@ -32,15 +32,24 @@ def divergence_cells(
 
 def report(results: Sequence[Result]) -> str:
     """Return the number of divergent vehicles and the RMSE over the seeds, in Markdown."""
-    header = ["network", "runs", "emulated [s]", "counted from [s]", "divergent vehicles", "runs with any"]
+    header = [
+        "network",
+        "runs",
+        "emulated [s]",
+        "counted from [s]",
+        "divergent vehicles",
+        "runs with any",
+        "beyond stated deviations",
+    ]
     header += ["RMSE, median [m]", "95th percentile [m]", "worst [m]"]
     rows = [_row(select(results, network=network)) for network in unique(results, "network")]
     return (
         "# Divergence: the default profile over many seeds\n\n"
         f"{markdown_table(header, rows)}\n\n"
         f"{_summary(results)} A vehicle is divergent whose common error is over {DIVERGENT_M:g} m for "
-        f"{DIVERGENT_S:g} s at any time of the run. RMSE is that of the common error over all vehicles of a run, "
-        "and its percentiles are over the seeds. "
+        f"{DIVERGENT_S:g} s at any time of the run; beyond stated deviations are vehicles whose common error is "
+        f"over {DIVERGENT_SIGMAS:g} of those that they state, for as long. RMSE is that of the common error over "
+        "all vehicles of a run, and its percentiles are over the seeds. "
         f"{sum(row['not_finite'] for row in results)} reports were not finite.\n"
     )
 
@@ -67,6 +76,7 @@ def _row(rows: Sequence[Result]) -> list[str]:
         " ".join(f"{counted_from(duration_s):g}" for duration_s in durations),
         str(sum(column(rows, "divergent"))),
         str(sum(row["divergent"] > 0 for row in rows)),
+        str(sum(row["divergent_sigmas"] for row in rows)),
         f"{np.median(error):.3f}" if worst else MISSING,
         f"{np.percentile(error, 95):.3f}" if worst else MISSING,
         f"{worst['rmse_m']:.3f} (seed {worst['seed']})" if worst else MISSING,

@@ -125,9 +125,10 @@ def test_the_band_holds_95_percent_of_the_means_of_consistent_filters() -> None:
 
 
 def test_a_run_that_diverged_is_named_and_bounds_nothing() -> None:
-    labels = {"network": "n1", "mechanism": "optimized", "duration_s": 30.0, "not_finite": 0}
+    labels = {"network": "n1", "mechanism": "optimized", "duration_s": 30.0, "not_finite": 0, "divergent_sigmas": 2}
     rows = [labels | {"seed": seed, "rmse_m": 0.1 * seed, "divergent": int(seed == 3)} for seed in (1, 2, 3)]
     rows.append(labels | {"seed": 4, "rmse_m": None, "divergent": 0})
     text = divergence.report(rows)
     assert "1 of 4 runs had a vehicle that diverged." in text and "confidence" not in text
     assert "0.200" in text and "0.300 (seed 3)" in text
+    assert "8" in text.splitlines()[4].split("|")[7], "vehicles beyond what they state, of four runs"
