@@ -13,7 +13,7 @@ def main() -> None:
         from vnet.runtime import interrupts
 
         interrupts.end_at_once()
-    except KeyboardInterrupt:
+    except KeyboardInterrupt:  # of `python -m emulator`, which no console script has guarded
         sys.exit(130)
     from emulator.cli.table import find
     from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread

@@ -95,7 +95,7 @@ def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) 
 
 def test_the_package_has_a_script_of_its_own_name() -> None:
     scripts = {script.name: script.value for script in entry_points(group="console_scripts")}
-    assert scripts["vnet"] == "emulator.cli:main"
+    assert scripts["vnet"] == "vnet.console_scripts:emulator"
 
 
 def test_help_lists_every_command_on_a_line_of_eighty_columns(
