@@ -44,27 +44,41 @@ def _numbers(source: Source, name: str) -> Drawing:
     """Draw mean and 5 to 95 % over the vehicles, and one vehicle; of a boolean the share that is true."""
     value = source.values_of(name)
     time_s = source.period_times_s(len(value))
+    if np.isfinite(value).any(axis=1).sum() < 2:
+        raise NothingToShow("reported in one period only")
     if source.is_boolean(name):
-        share = 100 * _mean(value)
-        made = time_figure(
-            [Line("", time_s, share, BLUE)], f"{title_of(name)} (%)", source.end_s, source.spans, True
-        )
+        share = Line("", *points(time_s, 100 * _mean(value)), BLUE)
+        made = time_figure([share], f"{title_of(name)} (%)", source.end_s, source.spans, True)
         made.axes.set_ylim(0, 105)
         text = "Share of the vehicles that report it that say true."
         return Drawing(made, text + faults_note(made, source))
     node = int(np.isfinite(value).sum(axis=0).argmax())
     who = source.recorded.node_ids[node]
     several = value.shape[1] > 1
-    lines = [Line("mean of the vehicles" if several else who, time_s, _mean(value), BLUE)]
+    lines = [Line("mean of the vehicles" if several else who, *points(time_s, _mean(value)), BLUE)]
     if several:
-        lines.append(Line(who, time_s, value[:, node], RED, DASHES[1]))
+        lines.append(Line(who, *points(time_s, value[:, node]), RED, DASHES[1]))
     made = time_figure(lines, label_of(name), source.end_s, source.spans, linear=True)
     if several:
         low, high = _band(value)
-        made.axes.fill_between(time_s, low, high, color=GREY, alpha=0.3, linewidth=0, zorder=0.7)
+        reported_s, low = points(time_s, low)
+        made.axes.fill_between(
+            reported_s, low, points(time_s, high)[1], color=GREY, alpha=0.3, linewidth=0, zorder=0.7
+        )
     _fit(made.axes, value)
     text = "Grey: 5 to 95 % of the vehicles." if several else ""
     return Drawing(made, f"{text}{faults_note(made, source)}".strip())
+
+
+def points(time_s: Array, value: Array) -> tuple[Array, Array]:
+    """Return times and values of a curve: the finite ones, with a gap where none came for twice the usual time.
+
+    A program need not report in each period, and a curve through NaN would not be drawn.
+    """
+    known = np.flatnonzero(np.isfinite(value))
+    step = np.diff(known)
+    gaps = np.flatnonzero(step > 2 * np.median(step)) + 1 if len(step) else step
+    return np.insert(time_s[known], gaps, np.nan), np.insert(value[known], gaps, np.nan)
 
 
 def _fit(axes: Axes, value: Array) -> None:

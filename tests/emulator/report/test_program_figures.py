@@ -9,7 +9,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import classes, map_charts
-from emulator.report.program_figures import program_charts
+from emulator.report.program_figures import points, program_charts
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
@@ -25,6 +25,10 @@ async def talkative(node: Node) -> None:
         figures = {"load_percent": 10.0 * number, "debt": -seconds, "same": 1}
         if number > 1:
             figures["late"] = seconds
+        if round(10 * seconds) % 3 == 0:
+            figures["seldom"] = seconds
+        if seconds == 0.5:
+            figures["once"] = number
         node.report(**figures, warned=seconds > 0.5, state="busy" if seconds > 0.5 else "idle")
 
 
@@ -48,11 +52,21 @@ def test_each_value_has_a_chart(source: Source) -> None:
     charts, missing = draw_charts(program_charts(source))
     found = {chart.title: chart for chart in charts}
     assert missing == {}
-    assert set(found) == {"load", "debt", "same", "late", "warned", "state"}
+    assert set(found) == {"load", "debt", "same", "late", "seldom", "warned", "state"}, "one point is no curve"
     assert "load (%)" in found["load"].svg and "5 to 95 %" in found["load"].caption
     assert "warned (%)" in found["warned"].svg and "say true" in found["warned"].caption
     assert "busy" in found["state"].svg and "idle" in found["state"].svg
     assert "v02" in found["late"].svg, "v01 never reports it"
+
+
+def test_a_curve_joins_what_is_reported_now_and_then_and_shows_where_nothing_was() -> None:
+    time_s = np.arange(12.0)
+    value = np.full(12, np.nan)
+    value[[0, 2, 4, 9, 11]] = 1.0, 2.0, 3.0, 4.0, 5.0
+    at_s, joined = points(time_s, value)
+    assert np.array_equal(at_s, [0, 2, 4, np.nan, 9, 11], equal_nan=True)
+    assert np.array_equal(joined, [1, 2, 3, np.nan, 4, 5], equal_nan=True)
+    assert [len(each) for each in points(time_s, np.full(12, np.nan))] == [0, 0]
 
 
 def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
