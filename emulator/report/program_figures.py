@@ -46,8 +46,9 @@ def _numbers(source: Source, name: str) -> Drawing:
     time_s = source.period_times_s(len(value))
     if np.isfinite(value).any(axis=1).sum() < 2:
         raise NothingToShow("reported in one period only")
+    curve = partial(points, time_s, usual=usual_periods(value))
     if source.is_boolean(name):
-        share = Line("", *points(time_s, 100 * _mean(value)), BLUE)
+        share = Line("", *curve(100 * _mean(value)), BLUE)
         made = time_figure([share], f"{title_of(name)} (%)", source.end_s, source.spans, True)
         made.axes.set_ylim(0, 105)
         text = "Share of the vehicles that report it that say true."
@@ -55,29 +56,33 @@ def _numbers(source: Source, name: str) -> Drawing:
     node = int(np.isfinite(value).sum(axis=0).argmax())
     who = source.recorded.node_ids[node]
     several = value.shape[1] > 1
-    lines = [Line("mean of the vehicles" if several else who, *points(time_s, _mean(value)), BLUE)]
+    lines = [Line("mean of the vehicles" if several else who, *curve(_mean(value)), BLUE)]
     if several:
-        lines.append(Line(who, *points(time_s, value[:, node]), RED, DASHES[1]))
+        lines.append(Line(who, *curve(value[:, node]), RED, DASHES[1]))
     made = time_figure(lines, label_of(name), source.end_s, source.spans, linear=True)
     if several:
         low, high = _band(value)
-        reported_s, low = points(time_s, low)
-        made.axes.fill_between(
-            reported_s, low, points(time_s, high)[1], color=GREY, alpha=0.3, linewidth=0, zorder=0.7
-        )
+        (band_s, low), (_, high) = curve(low), curve(high)
+        made.axes.fill_between(band_s, low, high, color=GREY, alpha=0.3, linewidth=0, zorder=0.7)
     _fit(made.axes, value)
     text = "Grey: 5 to 95 % of the vehicles." if several else ""
     return Drawing(made, f"{text}{faults_note(made, source)}".strip())
 
 
-def points(time_s: Array, value: Array) -> tuple[Array, Array]:
-    """Return times and values of a curve: the finite ones, with a gap where none came for twice the usual time.
+def usual_periods(value: Array) -> float:
+    """Return the usual number of periods from one report of a vehicle to its next, of values (periods, N)."""
+    node, period = np.nonzero(np.isfinite(value).T)
+    apart = np.diff(period)[np.diff(node) == 0]
+    return float(np.median(apart)) if len(apart) else 1.0
+
+
+def points(time_s: Array, value: Array, usual: float) -> tuple[Array, Array]:
+    """Return times and values of a curve: the finite ones, with a gap where none came for twice `usual` periods.
 
     A program need not report in each period, and a curve through NaN would not be drawn.
     """
     known = np.flatnonzero(np.isfinite(value))
-    step = np.diff(known)
-    gaps = np.flatnonzero(step > 2 * np.median(step)) + 1 if len(step) else step
+    gaps = np.flatnonzero(np.diff(known) > 2 * usual) + 1
     return np.insert(time_s[known], gaps, np.nan), np.insert(value[known], gaps, np.nan)
 
 
@@ -105,9 +110,10 @@ def _texts(source: Source, name: str) -> Drawing:
 
 
 def mean_over_time(source: Source, name: str) -> tuple[Array, Array]:
-    """Return times (periods,) in seconds and the mean of a number over the vehicles; of a boolean in per cent."""
+    """Return times (n,) in seconds and the mean of a number over the vehicles, of a boolean in per cent, as `points`."""
     value = source.values_of(name)
-    return source.period_times_s(len(value)), _mean(value) * (100 if source.is_boolean(name) else 1)
+    mean = _mean(value) * (100 if source.is_boolean(name) else 1)
+    return points(source.period_times_s(len(value)), mean, usual_periods(value))
 
 
 def is_number(source: Source, name: str) -> bool:

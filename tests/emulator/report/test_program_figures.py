@@ -9,7 +9,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import classes, map_charts
-from emulator.report.program_figures import points, program_charts
+from emulator.report.program_figures import points, program_charts, usual_periods
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
@@ -63,10 +63,20 @@ def test_a_curve_joins_what_is_reported_now_and_then_and_shows_where_nothing_was
     time_s = np.arange(12.0)
     value = np.full(12, np.nan)
     value[[0, 2, 4, 9, 11]] = 1.0, 2.0, 3.0, 4.0, 5.0
-    at_s, joined = points(time_s, value)
+    at_s, joined = points(time_s, value, usual_periods(value[:, None]))
     assert np.array_equal(at_s, [0, 2, 4, np.nan, 9, 11], equal_nan=True)
     assert np.array_equal(joined, [1, 2, 3, np.nan, 4, 5], equal_nan=True)
-    assert [len(each) for each in points(time_s, np.full(12, np.nan))] == [0, 0]
+    assert [len(each) for each in points(time_s, np.full(12, np.nan), 1.0)] == [0, 0]
+
+
+def test_vehicles_that_report_in_turns_have_one_curve() -> None:
+    value = np.full((12, 3), np.nan)
+    for node in range(3):
+        value[node::4, node] = 1.0
+    assert usual_periods(value) == 4.0
+    at_s, _ = points(np.arange(12.0), value.max(axis=1, initial=-1.0, where=np.isfinite(value)), 4.0)
+    assert np.isfinite(at_s).all()
+    assert usual_periods(value[:4]) == 1.0, "nobody reports twice"
 
 
 def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
