@@ -110,7 +110,7 @@ def _texts(source: Source, name: str) -> Drawing:
 
 
 def mean_over_time(source: Source, name: str) -> tuple[Array, Array]:
-    """Return times (n,) in seconds and the mean of a number over the vehicles, of a boolean in per cent, as `points`."""
+    """Return times (n,) in seconds and the mean over the vehicles, of a boolean in per cent, as `points` does."""
     value = source.values_of(name)
     mean = _mean(value) * (100 if source.is_boolean(name) else 1)
     return points(source.period_times_s(len(value)), mean, usual_periods(value))
