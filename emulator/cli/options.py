@@ -23,10 +23,12 @@ DEFAULT_LISTEN = f"tcp/{DEFAULT_ADDRESS}"
 LATEST = Path("runs/latest")
 
 
-def path_of(text: str) -> Path:
+def path_of(text: str | Path) -> Path:
     """Return a path that an option or an argument names. Raises BadParameter for an empty one and for a URL."""
     if not text:
         raise typer.BadParameter("'': a path is needed")
+    if isinstance(text, Path):  # a default
+        return text
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", text):
         raise typer.BadParameter(f"{printable(text)!r}: a path of this machine is needed, not a URL")
     return Path(text)

@@ -29,7 +29,7 @@ VARY: dict[str, list[Any]] = {"radio.loss": [0, 0.5]}
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[LocalCluster]:
     """A scheduler, and two workers that are started again if they end."""
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "dashboard_address": "127.0.0.1:0"}
     with LocalCluster(**options, host="127.0.0.1", local_directory=str(tmp_path), silence_logs=50) as started:
         yield started
 

@@ -122,6 +122,7 @@ class Bench:
     def close(self) -> None:
         """Go away, as an emulator that is killed or restarted does."""
         self._stack.close()
+        self.present = False
 
     def _take_tx(self, sample: zenoh.Sample) -> None:
         data, at_ns = sample.payload.to_bytes(), time.monotonic_ns()
@@ -141,7 +142,10 @@ class Bench:
         self._rx.put(message if isinstance(message, bytes) else wire.encode(message))
 
     def hear(self, timeout_s: float) -> Said | None:
-        """The next that the agent says; None if nothing comes in time, or if the agent has ended."""
+        """The next that the agent says; None if nothing comes in time, or if the agent has ended.
+
+        What it said last may come after its exit is known, but comes before its token is gone.
+        """
         deadline_s = time.monotonic() + timeout_s
         ended = False
         while True:
@@ -150,7 +154,7 @@ class Bench:
             except queue.Empty:
                 if ended or time.monotonic() >= deadline_s:
                     return None
-                ended = self.agent.exit_status is not None
+                ended = self.agent.exit_status is not None and not self.present
                 continue
             if isinstance(item, Said):
                 return item
