@@ -24,7 +24,7 @@ LONGEST_LINE = 10_000
 """Characters of a line of the file."""
 FARTHEST_M = 100 * WILD_M
 """Largest recorded error."""
-_EAST = re.compile(r"(?:(.+)_)?east_m")
+_COMPONENT = re.compile(r"(.+_|)(?:east|north)_m")
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,8 @@ def _read(path: Path) -> tuple[Array, Array]:
 def _columns(path: Path, names: object) -> list[str]:
     """Return the columns that are read: time_s, then east and north of each receiver."""
     found = [str(name) for name in names] if isinstance(names, (list, tuple)) else []
-    columns = ["time_s"]
-    for name in found:
-        if match := _EAST.fullmatch(name):
-            columns += [name, f"{match[1]}_north_m" if match[1] else "north_m"]
+    receivers = dict.fromkeys(match[1] for name in found if (match := _COMPONENT.fullmatch(name)))
+    columns = ["time_s", *(f"{receiver}{axis}_m" for receiver in receivers for axis in ("east", "north"))]
     missing = [name for name in columns if name not in found] or (["east_m"] if len(columns) == 1 else [])
     if missing:
         raise ScenarioError(

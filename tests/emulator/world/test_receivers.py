@@ -133,6 +133,7 @@ def test_of_several_receivers_the_mean_is_common_and_the_rest_each_ones_own(tmp_
         ("", "no column time_s"),
         ("time_s,east_m\n0,1\n", "no column north_m"),
         ("time_s,a_east_m,b_north_m\n0,1,1\n", "no column a_north_m"),
+        ("time_s,aeast,a_north_m,b_east_m,b_north_m\n0,1,1,1,1\n", "no column a_east_m"),
         ("east_m,north_m\n1,1\n", "no column time_s"),
         ("time_s,east_m,north_m,east_m\n0,1,1,1\n", "column east_m is there twice"),
         ("time_s,east_m,north_m\n", "no rows"),
