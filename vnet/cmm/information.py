@@ -8,6 +8,7 @@ weights must be 1, so that losses and one-way links do no harm.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,12 @@ class Information:
     def of(cls, mean_m: Array, covariance_m2: Array) -> Information:
         """Return the belief with mean (2,) and covariance (2, 2)."""
         matrix = inverse(covariance_m2)
-        return cls(matrix, matrix @ mean_m)
+        return cls(matrix, matrix.dot(mean_m))
 
     def moments(self) -> tuple[Array, Array]:
         """Return mean (2,) in m and covariance (2, 2) in m²; the matrix must be positive definite."""
         covariance_m2 = inverse(self.matrix)
-        return covariance_m2 @ self.vector, covariance_m2
+        return covariance_m2.dot(self.vector), covariance_m2
 
     def plus(self, other: Information) -> Information:
         """Return this belief with another piece of information added."""
@@ -51,8 +52,8 @@ def square_root(matrix: Array) -> Array:
     In closed form (M + √det M · I) / √(tr M + 2 √det M).
     """
     (a, b), (_, d) = matrix.tolist()
-    root = np.sqrt(max(a * d - b * b, 0.0))
-    scale = np.sqrt(a + d + 2 * root)
+    root = math.sqrt(max(a * d - b * b, 0.0))
+    scale = math.sqrt(a + d + 2 * root)
     return np.array([[(a + root) / scale, b / scale], [b / scale, (d + root) / scale]])
 
 
@@ -63,7 +64,7 @@ def transport(covariance_m2: Array, new_covariance_m2: Array) -> Array:
     """
     root = square_root(covariance_m2)
     inverse_root = inverse(root)
-    return np.asarray(inverse_root @ square_root(root @ new_covariance_m2 @ root) @ inverse_root)
+    return np.asarray(inverse_root.dot(square_root(root.dot(new_covariance_m2).dot(root))).dot(inverse_root))
 
 
 def gained(before: Information, after: Information) -> Information:

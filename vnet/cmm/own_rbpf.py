@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from vnet.cmm.affine_cloud import AffineCloud
 from vnet.cmm.common_error import systematic
 from vnet.cmm.information import Information, inverse, square_root, transport
 from vnet.cmm.kalman_bound import LaneModel, lane_axes
@@ -24,12 +25,14 @@ DECIDED = 1e-4
 COMPETING_FACTOR = 4
 """So many times the particles as long as lanes compete."""
 _IDENTITY = np.eye(2)
+_NOWHERE = np.zeros(5)
 
 
 class OwnRbpf:
     """The filter of a vehicle on one of the lanes through `point_m` (H, 2) with directions `heading_rad` (H,).
 
-    common_m: (2, K), the hypotheses of the common error, and weight: (K,), their normalized weights.
+    common_m: (2, K), the hypotheses of the common error, and weight: (K,), their normalized weights. As long as
+    lanes compete the cloud is an array with rows for each lane, later an `AffineCloud`.
     """
 
     def __init__(
@@ -50,25 +53,30 @@ class OwnRbpf:
         self._dt_s = np.nan
         mean_m, covariance_m2 = belief or (np.zeros(2), model.common_sigma_m**2 * np.eye(2))
         lanes_count, count = len(self._axes), self._wanted
-        # Row 0 and 1 are c, then three rows a lane: what is affine is one product.
-        self._cloud = np.zeros((2 + 3 * lanes_count, count))
-        self._cloud[:2] = mean_m[:, None] + square_root(covariance_m2) @ rng.standard_normal((2, count))
+        # Row 0 and 1 are c, then three rows a lane.
+        cloud = np.zeros((2 + 3 * lanes_count, count))
+        cloud[:2] = mean_m[:, None] + square_root(covariance_m2) @ rng.standard_normal((2, count))
         self._own_covariance = np.tile(model.own_covariance(), (lanes_count, 1, 1))
+        self._one: AffineCloud | None = None
+        if lanes_count == 1:
+            self._decide(cloud, np.zeros(count))
+            return
+        self._cloud = cloud
         self._lane_log = np.full((lanes_count, count), -np.log(lanes_count))
         self._log_weight = np.zeros(count)
-        self._reserve()
         self._normalize()
-        self._take_moments()
+        self._collapse()
 
-    def _reserve(self) -> None:
-        """Reserve arrays for a period: for each new one of this size the system would map and clear pages."""
-        shape = self._cloud.shape
-        self._spread, self._spare, self._noise_m = np.empty(shape), np.empty(shape), np.empty((2, shape[1]))
+    def _decide(self, cloud: Array, log_weight: Array) -> None:
+        """Go on with one lane; `cloud` (5, K) are its rows."""
+        self._one = AffineCloud(cloud, log_weight)
+        self._measure = np.hstack([self._axes[0], np.eye(2, 3)])
+        self._take_moments(self._one)
 
     @property
     def common_m(self) -> Array:
         """The hypotheses (2, K) of the common error."""
-        return self._cloud[:2]
+        return self._cloud[:2] if self._one is None else self._one.points[:2]
 
     @property
     def _own(self) -> Array:
@@ -86,22 +94,16 @@ class OwnRbpf:
         weight = np.exp(self._log_weight - self._log_weight.max())
         self.weight = weight / weight.sum()
 
-    def _take_moments(self) -> None:
-        """Compute the moments of the cloud over c and the vehicle's own state, all lanes taken together."""
-        if len(self._axes) > 1:
-            self._collapse()
-            return
-        mean = self._cloud @ self.weight
-        np.subtract(self._cloud, mean[:, None], out=self._spread)
-        np.multiply(self._spread, self.weight, out=self._spare)
-        self._set_moments(mean, self._spare @ self._spread.T)
-
-    def _set_moments(self, mean: Array, covariance: Array) -> None:
-        """Take mean (5,) and covariance (5, 5) of the cloud, where one lane is left."""
-        self._mean, self._covariance = mean, covariance
-        self.estimate_m, self.estimate_covariance_m2 = mean[:2], covariance[:2, :2]
-        self._slope = covariance[2:, :2] @ inverse(self.estimate_covariance_m2)
+    def _take_moments(self, cloud: AffineCloud) -> None:
+        """Take the moments of the cloud, where one lane is left."""
+        self._mean, self._covariance, self.weight = cloud.mean, cloud.covariance, cloud.weight
+        self.estimate_m, self.estimate_covariance_m2 = self._mean[:2], self._covariance[:2, :2]
         self._place: tuple[Array, Array, Array] | None = None
+
+    @property
+    def _slope(self) -> Array:
+        """The regression (3, 2) of the vehicle's own state on c, where one lane is left."""
+        return np.asarray(self._covariance[2:, :2].dot(inverse(self.estimate_covariance_m2)))
 
     def _placed(self) -> tuple[Array, Array, Array]:
         """Return position (2,), its slope (2, 2) on c and its covariance (2, 2) given c."""
@@ -132,6 +134,8 @@ class OwnRbpf:
     @property
     def lane_probability(self) -> Array:
         """Probabilities (H,) of the lanes that are left."""
+        if self._one is not None:
+            return np.ones(1)
         return np.asarray(np.exp(self._lane_log) @ self.weight)
 
     @property
@@ -158,37 +162,56 @@ class OwnRbpf:
                 self._model.transition(dt_s),
                 self._model.process_noise(dt_s),
             )
-        keep, variance_m2 = self._model.common_step(dt_s)
-        cloud, lanes = self._spare, len(self._axes)
-        np.matmul(self._moves, self._own, out=cloud[2:].reshape(lanes, 3, -1))
-        np.multiply(self._cloud[:2], keep, out=cloud[:2])
-        self._rng.standard_normal(out=self._noise_m)
-        self._noise_m *= math.sqrt(variance_m2)
-        cloud[:2] += self._noise_m
-        self._cloud, self._spare = cloud, self._cloud
+            keep, variance_m2 = self._model.common_step(dt_s)
+            self._all_moves = np.eye(5)
+            self._all_moves[:2, :2] *= keep
+            self._all_moves[2:, 2:] = self._moves
+            self._common_sigma_m = math.sqrt(variance_m2)
         self._own_covariance = self._moves @ self._own_covariance @ self._moves.T + self._noise
-        self._take_moments()
+        if self._one is not None:
+            self._one.move(self._all_moves, _NOWHERE)
+            self._one.diffuse(self._common_sigma_m, self._rng)
+            self._take_moments(self._one)
+            return
+        noise_m = self._common_sigma_m * self._rng.standard_normal((2, len(self.weight)))
+        own = (self._moves @ self._own).reshape(-1, len(self.weight))
+        self._cloud = np.concatenate([self._all_moves[0, 0] * self._cloud[:2] + noise_m, own])
+        self._collapse()
 
     def expects(self, fix_m: Array, noise_m2: Array) -> tuple[float, Information]:
         """Return the squared Mahalanobis distance of a fix (2,) with noise covariance (2, 2) from what is expected.
 
         The second is what the fix says about c beyond the prior: the increment.
         """
-        place_m, slope, given_m2 = self._placed()
-        direction = slope + _IDENTITY
-        given_c = given_m2 + noise_m2
-        off = fix_m - self.estimate_m - place_m
-        distance = off @ inverse(given_c + direction @ self.estimate_covariance_m2 @ direction.T) @ off
-        whitened = direction.T @ inverse(given_c)
-        matrix = whitened @ direction
-        return float(distance), Information(matrix, whitened @ off + matrix @ self.estimate_m)
+        if self._one is None:
+            place_m, slope, given_m2 = self._placed()
+            off = fix_m - self.estimate_m - place_m
+            return _innovation(off, slope + _IDENTITY, given_m2 + noise_m2, self._moments)
+        measure, covariance = self._measure, self._covariance
+        value, fix_noise_m2 = self._measured(fix_m, noise_m2)
+        with_all = measure.dot(covariance)
+        with_common = with_all[:, :2]
+        slope = with_common.dot(inverse(self.estimate_covariance_m2))
+        given_m2 = with_all.dot(measure.T) + fix_noise_m2 - slope.dot(with_common.T)
+        return _innovation(value - measure.dot(self._mean), slope, given_m2, self._moments)
+
+    @property
+    def _moments(self) -> tuple[Array, Array]:
+        """Mean (2,) and covariance (2, 2) of c."""
+        return self.estimate_m, self.estimate_covariance_m2
+
+    def _measured(self, fix_m: Array, noise_m2: Array) -> tuple[Array, Array]:
+        """Return a fix (2,) along the axes of the only lane, and its covariance (2, 2) given a particle."""
+        axes = self._axes[0]
+        noise_m2 = axes.dot(noise_m2).dot(axes.T)
+        return axes.dot(fix_m - self._point_m[0]), self._own_covariance[0, :2, :2] + noise_m2
 
     def absorb(self, pooled: Information) -> None:
         """Replace the belief about c by `pooled`: move the cloud where one lane is left, else weigh it.
 
         A cloud of several humps, one a lane, would be squeezed together if it were moved.
         """
-        if len(self._axes) > 1:
+        if self._one is None:
             belief, c = self.belief, self.common_m
             matrix, vector = pooled.matrix - belief.matrix, pooled.vector - belief.vector
             self._log_weight = self._log_weight + vector @ c - 0.5 * ((matrix @ c) * c).sum(axis=0)
@@ -196,21 +219,19 @@ class OwnRbpf:
             return
         mean_m, covariance_m2 = pooled.moments()
         # What is known of c moves, and the own state along its regression on c: an affine map of the whole cloud.
-        affine = np.eye(5)
+        affine, slope = np.eye(5), self._slope
         affine[:2, :2] = transport(self.estimate_covariance_m2, covariance_m2)
-        affine[2:, :2] = self._slope @ (affine[:2, :2] - _IDENTITY)
-        mean = self._mean.copy()
-        mean[2:] += self._slope @ (mean_m - self.estimate_m)
-        mean[:2] = mean_m
-        np.matmul(affine, self._spread, out=self._spare)
-        self._spread, self._spare = self._spare, self._spread
-        np.add(mean[:, None], self._spread, out=self._cloud)
-        self._set_moments(mean, affine @ self._covariance @ affine.T)
+        affine[2:, :2] = slope.dot(affine[:2, :2] - _IDENTITY)
+        by = -affine.dot(self._mean)
+        by[:2] += mean_m
+        by[2:] += self._mean[2:] + slope.dot(mean_m - self.estimate_m)
+        self._one.move(affine, by)
+        self._take_moments(self._one)
 
     def update(self, fix_m: Array, noise_m2: Array) -> None:
         """Take the vehicle's own fix (2,) with noise covariance (2, 2)."""
-        if len(self._axes) == 1:
-            self._update_one(fix_m, noise_m2)
+        if self._one is not None:
+            self._update_one(self._one, fix_m, noise_m2)
             return
         axes, own = self._axes, self._own
         covariance = self._own_covariance
@@ -225,33 +246,31 @@ class OwnRbpf:
         self._sum_lanes()
         self._settle()
 
-    def _update_one(self, fix_m: Array, noise_m2: Array) -> None:
+    def _update_one(self, cloud: AffineCloud, fix_m: Array, noise_m2: Array) -> None:
         """Take a fix where one lane is left."""
-        axes, covariance = self._axes[0], self._own_covariance[0]
-        innovation = inverse(covariance[:2, :2] + axes @ noise_m2 @ axes.T)
-        gain = covariance[:, :2] @ innovation
-        off, spare = self._noise_m, self._spare
-        np.matmul(axes, self._cloud[:2], out=off)
-        off += self._cloud[2:4]
-        np.subtract((axes @ (fix_m - self._point_m[0]))[:, None], off, out=off)
-        np.matmul(gain, off, out=spare[2:])
-        self._cloud[2:] += spare[2:]
-        self._own_covariance = (covariance - gain @ covariance[:2])[None]
-        np.matmul(innovation, off, out=spare[:2])
-        off *= spare[:2]
-        off *= 0.5
-        self._log_weight -= off[0]
-        self._log_weight -= off[1]
-        self._settle()
+        value, noise_m2 = self._measured(fix_m, noise_m2)
+        innovation, covariance = inverse(noise_m2), self._own_covariance[0]
+        gain = np.zeros((5, 2))
+        gain[2:] = covariance[:, :2].dot(innovation)
+        self._own_covariance = (covariance - gain[2:].dot(covariance[:2]))[None]
+        cloud.weigh(self._measure, value, square_root(innovation), gain)
+        cloud.settle(self._wanted, self._rng)
+        self._take_moments(cloud)
 
     def _settle(self) -> None:
-        """After the weights have changed: drop lanes that are out of question, and resample if it is due."""
+        """After the weights of competing lanes have changed: drop lanes, and resample if it is due."""
         self._normalize()
         self._drop_lanes()
+        if len(self._axes) == 1:
+            self._decide(self._cloud, self._log_weight)
+            assert self._one is not None
+            self._one.settle(self._wanted, self._rng)
+            self._take_moments(self._one)
+            return
         count = self._wanted
-        if count != len(self.weight) or 1 / (self.weight @ self.weight) < count / 2:
+        if 1 / (self.weight @ self.weight) < count / 2:
             self._take(systematic(self.weight, count, self._rng))
-        self._take_moments()
+        self._collapse()
 
     def _sum_lanes(self) -> None:
         """Normalize the probabilities of the lanes given c; their sum goes into the weights."""
@@ -260,8 +279,6 @@ class OwnRbpf:
         self._log_weight = self._log_weight + total
 
     def _drop_lanes(self) -> None:
-        if len(self._axes) == 1:
-            return
         kept = self.lane_probability > DECIDED
         if kept.all():
             return
@@ -269,7 +286,6 @@ class OwnRbpf:
         self._cloud = self._cloud[np.append([True, True], np.repeat(kept, 3))]
         self._own_covariance = self._own_covariance[kept]
         self._lane_log = self._lane_log[kept]
-        self._reserve()
         self._sum_lanes()
         self._normalize()
 
@@ -277,6 +293,20 @@ class OwnRbpf:
         """Go on with the particles `index` (n,), equally likely."""
         self._cloud = self._cloud.take(index, axis=1)
         self._lane_log = self._lane_log.take(index, axis=1)
-        self._reserve()
         self._log_weight = np.zeros(len(index))
         self.weight = np.full(len(index), 1 / len(index))
+
+
+def _innovation(
+    off: Array, slope: Array, given_m2: Array, belief: tuple[Array, Array]
+) -> tuple[float, Information]:
+    """Return the squared Mahalanobis distance of a fix, and what it says about c ~ `belief`.
+
+    The fix is `off` (2,) from what is expected; given c, which moves it by `slope` (2, 2), its covariance is
+    `given_m2` (2, 2).
+    """
+    mean_m, covariance_m2 = belief
+    distance = inverse(given_m2 + slope.dot(covariance_m2).dot(slope.T)).dot(off).dot(off)
+    whitened = slope.T.dot(inverse(given_m2))
+    matrix = whitened.dot(slope)
+    return float(distance), Information(matrix, whitened.dot(off) + matrix.dot(mean_m))
