@@ -39,7 +39,7 @@ from vnet.cmm.plausibility import (
     Origins,
     matrices,
     median_belief,
-    moments,
+    prior_moments,
     priors_agree,
     scaled_down,
     spread_limit_m,
@@ -158,12 +158,16 @@ class InformationEstimator:
         }
         self._frames = {}
         # What this vehicle says itself is the first row of all.
-        said = np.array([[*self._prior, *self._increment], *([*f.prior, *f.increment] for f in frames.values())])
-        means_m, covariances_m2 = moments(said[:, :5])
+        table = np.array(
+            [[*self._prior, *self._increment, *prior_moments(*self._prior.tolist())]]
+            + [frame.numbers for frame in frames.values()]
+        )
+        said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
         believed = self._believed(list(frames), said, means_m, covariances_m2)
         if not believed.all():
             frames = {name: frames[name] for name, good in zip(frames, believed[1:].tolist(), strict=True) if good}
-            said, means_m, covariances_m2 = said[believed], means_m[believed], covariances_m2[believed]
+            table = table[believed]
+            said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
         names = list(frames)
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
@@ -253,9 +257,12 @@ class InformationEstimator:
         codes = np.concatenate([own_codes, *(frame.passed_codes for frame in frames.values())])
         numbers = np.concatenate([own_increments, *(frame.passed_numbers for frame in frames.values())])
         sender = np.repeat(np.arange(len(counts)), counts)
-        origin, first, index = np.unique(codes, return_index=True, return_inverse=True)
+        first, index = first_of_each(codes)
+        origin = codes[first]
         forged = self._forged(numbers, sender, first[index], len(counts))
-        share = np.bincount(index, weights=np.where(forged, 0.0, weights)[sender], minlength=len(origin))
+        if forged.any():
+            weights = np.where(forged, 0.0, weights)
+        share = np.bincount(index, weights=weights[sender], minlength=len(origin))
         new = (first >= len(own_codes)) & (share < 1) & ~forged[sender[first]]
         if not new.any():
             return np.zeros((0, 5))
@@ -325,6 +332,17 @@ def _records(codes: NDArray[np.uint32], increments: NDArray[np.float16]) -> NDAr
     records["name"] = codes
     records["information"] = increments
     return records
+
+
+def first_of_each(codes: NDArray[np.uint32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first row of each origin in `codes` (m,), by code, and the number (m,) of each row's origin."""
+    order = codes.argsort(kind="stable")
+    ordered = codes[order]
+    starts = np.ones(len(codes), dtype=np.bool_)
+    np.not_equal(ordered[1:], ordered[:-1], out=starts[1:])
+    index = np.empty(len(codes), dtype=np.intp)
+    index[order] = starts.cumsum() - 1
+    return order[starts], index
 
 
 def _in_turns(count: int, limit: int, period: int) -> NDArray[np.intp] | slice:

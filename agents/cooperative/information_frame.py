@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from vnet.cmm.consensus import Share
+from vnet.cmm.plausibility import prior_moments
 from vnet.types import Array
 
 VERSION = 4
@@ -80,6 +81,12 @@ class InformationFrame:
     def share(self) -> Share:
         """The state of the consensus."""
         return Share(self.epoch, self.running_sum, self.out_neighbours, self.names_heard)
+
+    @cached_property
+    def numbers(self) -> tuple[float, ...]:
+        """The prior, the increment, and the prior's mean and covariance, fifteen numbers."""
+        a, b, d, x, y = self.prior
+        return (*self.prior, *self.increment, *prior_moments(a, b, d, x, y))
 
     @cached_property
     def passed_numbers(self) -> Array:

@@ -61,8 +61,9 @@ class OptimizedWeights:
             ridge = np.maximum(covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1], RIDGE_FLOOR_M2)
         else:
             ridge = np.full(count, self._ridge_m2)
-        hessian = 2 * (offset @ offset.T)
-        hessian.flat[:: count + 1] += 2 * ridge
+        hessian = offset.dot(offset.T)
+        hessian *= 2
+        hessian.ravel()[:: count + 1] += 2 * ridge
         return np.asarray(hessian)
 
     def _minimize(self, hessian: Array) -> Array:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from agents.cooperative.attack import Attack, Lie
 from agents.cooperative.frame import FrameError, name_of_code, short_name
 from agents.cooperative.information_attacker import InformationAttacker
-from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
+from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator, first_of_each
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
@@ -125,6 +125,14 @@ def test_what_pooled_priors_hold_is_not_added_again() -> None:
     network = Network(6, relay_increments=30)
     network.run(5)
     assert {e.imported for e in network.estimators} == {5}
+
+
+@given(st.lists(st.integers(0, 20), max_size=40))
+def test_origins_are_told_apart(codes: list[int]) -> None:
+    first, index = first_of_each(np.array(codes, dtype=np.uint32))
+    assert codes == [codes[first[origin]] for origin in index]
+    assert [codes[row] for row in first] == sorted(set(codes))
+    assert all(codes.index(codes[row]) == row for row in first)
 
 
 def test_a_frame_holds_as_many_increments_as_there_is_room_for() -> None:

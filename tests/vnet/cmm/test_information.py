@@ -15,6 +15,7 @@ from vnet.cmm.plausibility import (
     matrices,
     median_belief,
     moments,
+    prior_moments,
     priors_agree,
     scaled_down,
     spread_limit_m,
@@ -52,6 +53,8 @@ def test_moments_of_many_are_those_of_each(information: Array) -> None:
         expected = Information(matrices(row[None])[0], row[3:]).moments()
         assert_allclose(mean_m, expected[0], rtol=1e-6, atol=1e-6)
         assert_allclose(covariance_m2, expected[1], rtol=1e-6, atol=1e-9)
+        plain = *mean_m, covariance_m2[0, 0], covariance_m2[0, 1], covariance_m2[1, 1]
+        assert_allclose(prior_moments(*row.tolist()), plain, rtol=1e-12)
 
 
 @given(many(), covariances(), st.tuples(st.floats(-9, 9), st.floats(-9, 9)))
