@@ -36,6 +36,8 @@ Lie = Literal[
 INFORMATION_LIES = ("drift", "gates")
 """Lies about information only."""
 
+NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
+"""Values of an estimate, a covariance or a prior that is not finite, in turns."""
 EPOCH_LEAP = 20
 """Number of epochs by which each frame of the lie `epoch` is ahead: more than a leap's largest penalty."""
 

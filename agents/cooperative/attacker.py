@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.cooperative.attack import EPOCH_LEAP, Attack, shifted_sum
+from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_sum
 from agents.cooperative.estimator import Estimator
 from agents.cooperative.frame import CooperativeFrame, encode
 from agents.cooperative.information_attacker import InformationAttacker
@@ -18,8 +18,6 @@ from agents.cooperative.program import cooperate
 from vnet import Fix, Node
 from vnet.units import NS_PER_S
 
-_NOT_FINITE = (float("nan"), float("inf"), float("-inf"))
-"""Values of a non-finite estimate and covariance, in turns."""
 _ABSURD = ((1e30, 1.0, 0), (0.0, -1.0, 0), (0.0, 1e30, 0), (0.0, 1.0, 2_000_000_000))
 """Absurd frames, in turns: estimate in metres, variance in m², and position of the fix in centimetres."""
 
@@ -64,7 +62,7 @@ class Attacker(Estimator):
             case "epoch":
                 return replace(frame, epoch=frame.epoch + EPOCH_LEAP)
             case "non_finite":
-                wrong = _NOT_FINITE[self.sent % 3]
+                wrong = NOT_FINITE[self.sent % 3]
                 return replace(frame, estimate_m=np.full(2, wrong), covariance_m2=np.full((2, 2), wrong))
             case _:
                 estimate, variance, far_cm = _ABSURD[self.sent % len(_ABSURD)]

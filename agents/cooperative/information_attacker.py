@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from agents.cooperative.attack import EPOCH_LEAP, Attack, shifted_sum
+from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_sum
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.information_frame import InformationFrame, encode
 from vnet import Fix
@@ -21,8 +21,6 @@ EXAGGERATION = 100.0
 """Factor by which an overconfident prior and increment claim more information than they have."""
 BELOW_GATE = 0.9
 """Share of the deviation that a gate lets through which the lie `gates` makes use of."""
-_NOT_FINITE = (math.nan, math.inf, -math.inf)
-"""Values of a prior that is not finite, in turns."""
 
 
 class InformationAttacker(InformationEstimator):
@@ -72,7 +70,7 @@ class InformationAttacker(InformationEstimator):
             case "epoch":
                 return replace(frame, epoch=frame.epoch + EPOCH_LEAP)
             case "non_finite":
-                return replace(frame, prior=(_NOT_FINITE[self.sent % 3],) * 5)
+                return replace(frame, prior=(NOT_FINITE[self.sent % 3],) * 5)
             case _:
                 return replace(frame, prior=(*frame.prior[:3], 1e30, -1e30))
 

@@ -39,6 +39,8 @@ COLUMNS = {
     "position_rmse_m": "RMSE of the\nposition (m)",
 }
 """Columns of the metrics that are drawn, and their titles."""
+COMMON_APART_S = 300.0
+"""Time in the file of a recorded common error from the beginning of one seed's run to that of the next one's."""
 CHURN_S = 900.0
 """Length of a run with churn."""
 CHURN_EVERY_S = 30.0
@@ -151,16 +153,11 @@ def comparison_cells(
         for name, variant in STUDIES[study]().items():
             for seed in seeds:
                 labels: Labels = {"network": network, "mechanism": name, "seed": seed}
-                if world:
-                    world = {**world, "world.common_error.start_s": COMMON_APART_S * (seed - 1)}
+                start = {"world.common_error.start_s": COMMON_APART_S * (seed - 1)} if world else {}
                 faults = list(_churn(duration_s)) if study == "churn" else []
-                scenario = _scenario(section, seed, variant, duration_s, world or {}, faults)
+                scenario = _scenario(section, seed, variant, duration_s, {**(world or {}), **start}, faults)
                 cells.append(Cell(labels, scenario, counted_from(duration_s)))
     return cells
-
-
-COMMON_APART_S = 300.0
-"""Time in the file of a recorded common error from the beginning of one seed's run to that of the next one's."""
 
 
 def recorded_common(path: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,7 @@ def is_weight(name: str, values: Mapping[str, Value]) -> bool:
     return name.startswith(WEIGHT) and "common_error_m" in values
 
 
+@lru_cache(maxsize=4096)  # asked of each value of each report
 def _is_name(name: str) -> bool:
     return name.partition(".")[0].isidentifier() and name not in TAKEN
 

@@ -116,7 +116,9 @@ class Host:
         """Take a line of a log or an event of a program; the line is written at once."""
         self._notes.append(wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details))  # type: ignore[arg-type]
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
-        self._line(node, level, f"{'event ' * (kind != 'log')}{text} {said}".rstrip().replace("\n", "\n    "))
+        self._line(
+            node, level, f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
+        )
         self._on_traffic()
 
     def _line(self, node: str, level: str, text: str) -> None:
