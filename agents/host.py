@@ -101,6 +101,7 @@ def _run_lockstep(
     attachment.time_ns = lambda: loop.now_ns
     asyncio.set_event_loop(loop)
     try:
+        host.order_events(loop)
         loop.start_at(next_grant())
         host.start(loop, programs)
         while True:
@@ -239,7 +240,7 @@ class _RealTimeAgent:
         self._host.apply_clock_error(batch.clocks, self._loop)
         for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
-        self._host.deliver(batch.packets, batch.fixes)
+        self._host.mail.deliver(batch.packets, batch.fixes)
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:

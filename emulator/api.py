@@ -29,6 +29,7 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
+from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.program_check import program_check
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.code_digest import entries_of
@@ -119,6 +120,7 @@ def simulate_into(
 ) -> Path:
     """Simulate in this process and judge the run; returns its folder. `replay` says why none is warranted."""
     search_programs_in(scenario.program.folders)
+    scenario = with_order_steps(scenario)
     emulation = Emulation(scenario, build_world(scenario), RunFolder.prepare(out, scenario))
     for entry in entries_of(scenario):
         load_program(entry)
@@ -133,6 +135,7 @@ def simulate_into(
 def run_into(scenario: Scenario, out: Path | None) -> Path:
     """Run with real processes and judge the run; returns its folder."""
     quiet_zenoh()
+    scenario = with_order_steps(scenario)
     with program_check(scenario) as check:
         emulation = Emulation(scenario, build_world(scenario), RunFolder.prepare(out, scenario))
         check.wait()

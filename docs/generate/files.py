@@ -35,6 +35,7 @@ FOLDER = {
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
+    "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
@@ -200,6 +201,8 @@ VERDICT = {
     "wall_s": "wall-clock time from time 0 to the end",
     "real_time_factor": "emulated by wall-clock time",
     "seed": "`run.seed`",
+    "order": "[the order of events](../orders.md): null in FIFO order, else its kind, its seed, the number of "
+    "deviations, and where a given tape was left",
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
     "figures": "means of some metrics, after the first fifth of the run",

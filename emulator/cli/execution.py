@@ -9,7 +9,7 @@ import asyncio
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +26,7 @@ from emulator.drivers.conclude import conclude, run_again
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
+from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.program_check import program_check
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.signals import first_interrupt_told, signals_ignored
@@ -55,6 +56,10 @@ class Request:
     asked: OutputOptions
     output: StandardOutput
 
+    def with_order_steps(self) -> Request:
+        """Return the request with what its order of events needs to know of the run."""
+        return replace(self, scenario=with_order_steps(self.scenario))
+
     def prepare(self, world: World) -> Emulation:
         """Return the run, with a folder that is not made yet. Raises VnetError for what cannot be done."""
         if self.sinks is not None and self.sinks.vehicle is not None and self.sinks.vehicle not in world.node_ids:
@@ -68,6 +73,7 @@ class Request:
 
 def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[str]) -> None:
     """Run the emulator, these hosts, if any, and a process a vehicle; exits with the verdict's status."""
+    request = request.with_order_steps()
     scenario = request.scenario
     with program_check(scenario) as check:
         world = build_world(scenario)
@@ -88,6 +94,7 @@ def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[
 
 def run_in_this_process(request: Request) -> None:
     """Run all programs in this process, without Zenoh; exits with the verdict's status."""
+    request = request.with_order_steps()
     emulation = request.prepare(build_world(request.scenario))
     search_programs_in(request.scenario.program.folders)
     for entry in entries_of(request.scenario):
@@ -125,6 +132,8 @@ def run_for_agents(
 ) -> None:
     """Run the emulator for hosts, or agents that are started by hand; exits with the verdict's status."""
     scenario = request.scenario
+    if scenario.run.order == "pct" and scenario.run.order_steps is None:
+        raise VnetError("run.order_steps: how many decisions a vehicle makes; needed where agents start by hand")
     world = build_world(scenario)
     emulation = request.prepare(world)
     folder = emulation.folder

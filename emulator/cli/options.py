@@ -34,6 +34,14 @@ def path_of(text: str | Path) -> Path:
     return Path(text)
 
 
+class Order(StrEnum):
+    """The orders of simultaneous events."""
+
+    FIFO = "fifo"
+    SHUFFLE = "shuffle"
+    PCT = "pct"
+
+
 class Pacing(StrEnum):
     """The pacings of a run."""
 
@@ -56,6 +64,15 @@ class OutputOptions:
     def only_the_result(self) -> bool:
         """True if standard output is for the result alone, and not for what programs print."""
         return self.quiet or self.log_format is LogFormat.JSON
+
+
+@dataclass(frozen=True)
+class OrderOptions:
+    """The order of simultaneous events that was asked for."""
+
+    order: Order | None = None
+    seed: int | None = None
+    tape: Path | None = None
 
 
 ScenarioArgument = Annotated[
@@ -85,6 +102,17 @@ PacingOption = Annotated[
     typer.Option(
         help="lockstep: virtual time, the same on every machine. realtime: the wall clock. Default: the scenario's."
     ),
+]
+OrderOption = Annotated[
+    Order | None,
+    typer.Option(
+        help="In which order a vehicle is shown what happens at one instant. Default: the scenario's, or fifo."
+    ),
+]
+OrderSeedOption = Annotated[int | None, typer.Option(metavar="N", help="Seed of the order: another, other orders.")]
+TapeOption = Annotated[
+    Path | None,
+    typer.Option(parser=path_of, metavar="FILE", help="Deviations from FIFO to follow: tape.jsonl of another run."),
 ]
 SeedOption = Annotated[int | None, typer.Option(metavar="N", help="Random seed: same seed, same run.")]
 DurationOption = Annotated[float | None, typer.Option(metavar="SECONDS", help="Emulated length of the run.")]
@@ -162,13 +190,18 @@ def load(
     duration: float | None = None,
     program_options: list[str] | None = None,
     checks: list[str] | None = None,
+    order: OrderOptions | None = None,
 ) -> Scenario:
     """Load a scenario as the options of a command change it. Raises VnetError."""
+    order = order or OrderOptions()
     options = {
         "program.entry": program and json.dumps(from_here(program)),
         "run.pacing": pacing and f'"{pacing.value}"',
         "run.seed": seed,
         "run.duration_s": duration,
+        "run.order": order.order and f'"{order.order.value}"',
+        "run.order_seed": order.seed,
+        "run.tape": order.tape and json.dumps(str(order.tape.absolute())),
     }
     given = [f"{key}={value}" for key, value in options.items() if value is not None]
     own = [_program_option(option) for option in program_options or ()]
@@ -190,6 +223,9 @@ _OPTIONS = {
     "run.pacing": "--pacing",
     "run.seed": "--seed",
     "run.duration_s": "--duration",
+    "run.order": "--order",
+    "run.order_seed": "--order-seed",
+    "run.tape": "--tape",
 }
 """Options that are short for a change of a key."""
 

@@ -20,6 +20,9 @@ from emulator.cli.options import (
     DurationOption,
     HostsOption,
     LogFormatOption,
+    OrderOption,
+    OrderOptions,
+    OrderSeedOption,
     OutOption,
     OutputOptions,
     Pacing,
@@ -35,6 +38,7 @@ from emulator.cli.options import (
     ScenarioArgument,
     SeedOption,
     SetOption,
+    TapeOption,
     VerboseOption,
     debug_target,
     host_names,
@@ -61,6 +65,9 @@ def run(
     pacing: PacingOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
+    order: OrderOption = None,
+    order_seed: OrderSeedOption = None,
+    tape: TapeOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
@@ -86,7 +93,8 @@ def run(
     """Run a scenario: start the emulator and one process a vehicle, and judge what happened."""
     asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks)
+        order_asked = OrderOptions(order, order_seed, tape)
+        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
         if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
@@ -109,6 +117,9 @@ def simulate(
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
+    order: OrderOption = None,
+    order_seed: OrderSeedOption = None,
+    tape: TapeOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
@@ -125,7 +136,8 @@ def simulate(
     """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
     asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
+        order_asked = OrderOptions(order, order_seed, tape)
+        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, order_asked)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
         asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
@@ -158,6 +170,9 @@ def emulator(
     pacing: PacingOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
+    order: OrderOption = None,
+    order_seed: OrderSeedOption = None,
+    tape: TapeOption = None,
     out: OutOption = None,
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
@@ -176,7 +191,8 @@ def emulator(
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         if listen is not None and connect is not None:
             raise VnetError("--listen and --connect exclude each other")
-        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks)
+        order_asked = OrderOptions(order, order_seed, tape)
+        loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
         _check_restarts(loaded, own_router=False)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
         _announce(loaded, asked)

@@ -43,6 +43,7 @@ from emulator.records.run_folder import (
     RunFolder,
     write_text,
 )
+from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised, unknown
 
 
@@ -77,6 +78,9 @@ def conclude(
     if emulation.payloads is not None:
         folder.put_table(PAYLOADS_FILE, emulation.payloads.to_table())
     folder.put(WORLD_FILE, world.write)
+    if emulation.orders.explores:
+        tape = dump_tape(emulation.orders.in_order())
+        folder.put(TAPE_FILE, lambda path: write_text(path, tape))
     recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
     judgement = judge(recorded, _own_findings(recorded, folder))
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
@@ -94,6 +98,7 @@ def conclude(
         "wall_s": round(wall_s, 3),
         "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,
         "seed": emulation.scenario.run.seed,
+        "order": _order(emulation),
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
@@ -108,6 +113,23 @@ def conclude(
     }
     folder.put_json(VERDICT_FILE, verdict)
     return judgement, verdict
+
+
+def _order(emulation: Emulation) -> dict[str, Any] | None:
+    """Return what a verdict says of the order of events: None in FIFO order, else the number of deviations.
+
+    `left` is the first entry of a given tape that the run could not follow, as a phrase.
+    """
+    orders, run = emulation.orders, emulation.scenario.run
+    if not orders.explores:
+        return None
+    left = orders.left()
+    return {
+        "kind": "tape" if run.tape is not None else run.order,
+        "seed": run.order_seed,
+        "deviations": len(orders.made),
+        "left": None if left is None else described(left),
+    }
 
 
 def _own_findings(recorded: RecordedRun, folder: RunFolder) -> list[Finding]:

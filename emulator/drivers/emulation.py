@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.drivers.log_book import LogBook
+from emulator.drivers.orders import Orders
 from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
@@ -98,6 +99,7 @@ class Emulation:
         self._arrived: list[Deliveries] = []
         self.costs = Costs()
         self.log_book = LogBook(folder, self.number)
+        self.orders = Orders(scenario)
 
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""
@@ -154,6 +156,7 @@ class Emulation:
             wire.boot_id(),
             not self.presence.has_ended(node),
             wire.VERSION,
+            self.orders.of_node(node, incarnation),
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -174,11 +177,12 @@ class Emulation:
             endings.extend(part.endings)
             unhandled.extend(part.unhandled)
             notes.extend(part.notes)
+            self.orders.take(part.deviations)
         if frames:
             self._place(time_ns // self.world.period_ns)
-        for node in sorted(frames, key=self.number.__getitem__):
-            if self.up[node]:
-                self.engine.transmit(time_ns, self.number[node], frames[node])
+        senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
+        for node in self.orders.to_medium(time_ns, senders):
+            self.engine.transmit(time_ns, self.number[node], frames[node])
         self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)

@@ -15,7 +15,7 @@ class ProtocolError(VnetError):
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes)
+    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations)
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
     for node in [part.node for parts in kinds for part in parts] + [*waiting]:
         if node not in own:

@@ -150,6 +150,7 @@ class _Simulation:
         """From the first grant to the last."""
         asyncio.set_event_loop(self.loop)
         try:
+            self._host.order_events(self.loop)
             self._host.start(self.loop, self._programs)
             self._before_horizon(self._lockstep)
             self.loop.start_at(self._take(self._lockstep.start()))
@@ -175,6 +176,8 @@ class _Simulation:
             self.loop.close()
             self._host.discard_killed()
             self._emulation.costs.take_programs(self._meter.cpu_ns, self._meter.wake_ups)
+            if (ordered := self._host.mail.ordered) is not None:
+                self._emulation.orders.steps = ordered.steps
 
     def _close(self, time_ns: int) -> None:
         self._host.close(self.loop)

@@ -57,6 +57,18 @@ class Run(Section):
     windows: bool = True
     """Lockstep: processes run alone for as long as no frame sent meanwhile can arrive (`radio.latency_ms`), and not
     for one instant. The run is the same; `false` is for agents that know no windows."""
+    order: Literal["fifo", "shuffle", "pct"] = "fifo"
+    """Lockstep: in which order a vehicle is shown what happens at one instant. `shuffle` draws it, `pct` too, with
+    priorities (docs/orders.md)."""
+    order_seed: int = Field(1, ge=0, lt=2**63)
+    """Draws the order, and nothing else."""
+    order_depth: int = Field(3, ge=1, le=100)
+    """`pct`: how many events, in the right order, show the bugs that are sought."""
+    order_steps: int | None = Field(None, ge=1, le=MANY)
+    """`pct`: decisions of a vehicle in a run; counted in a run in FIFO order if left out."""
+    tape: Path | None = None
+    """Deviations from FIFO to follow, as far as they fit: the `tape.jsonl` of another run, relative to the scenario
+    file. With `order = "fifo"`."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
     """A process that makes no progress for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
@@ -67,6 +79,16 @@ class Run(Section):
     """Megabytes of a vehicle's files (`node.folder`) that are kept in the run's folder, and 1000 files at most."""
     keep_payloads: bool = False
     """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
+
+    @model_validator(mode="after")
+    def _orders_are_of_lockstep(self) -> Run:
+        if self.order != "fifo" and self.pacing != "lockstep":
+            raise ValueError(
+                f'order = "{self.order}" goes with pacing = "lockstep": in real time nobody decides it'
+            )
+        if self.tape is not None and (self.order != "fifo" or self.pacing != "lockstep"):
+            raise ValueError('tape goes with order = "fifo" and pacing = "lockstep"')
+        return self
 
 
 OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
@@ -347,6 +369,7 @@ def input_digests(scenario: Scenario) -> dict[str, str]:
         scenario.radio.links,
         scenario.map and scenario.map.path,
         scenario.world.common_error.path,
+        scenario.run.tape,
     )
     paths = [path for path in read if isinstance(path, Path)]
     if scenario.network.kind == "sumo" and scenario.network.path is not None:
@@ -370,8 +393,12 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     roads = scenario.map
     if roads is not None:
         roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
+    run = scenario.run
+    if run.tape is not None:
+        run = run.model_copy(update={"tape": _absolute(run.tape, "run.tape", scenario_path)})
+    world = _world_of(scenario, scenario_path)
     return scenario.model_copy(
-        update={"network": network, "radio": radio, "map": roads, "world": _world_of(scenario, scenario_path)}
+        update={"run": run, "network": network, "radio": radio, "map": roads, "world": world}
     )
 
 

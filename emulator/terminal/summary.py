@@ -51,6 +51,8 @@ def print_summary(
         counts = verdict["frames_by_outcome"]
         _print_table("receptions: one for each frame and receiver in range", _frames(counts), console)
     _print_cost(read_cost(verdict["cost"]), console, verbose)
+    if (order := verdict["order"]) is not None:
+        console.print(f"order        {_order(order)}", highlight=False, soft_wrap=True)
     console.print(f"trace sha256 {verdict['trace_sha256']}", highlight=False)
     console.print(f"files        {folder}", highlight=False, soft_wrap=True)
     quoted = shlex.quote(str(folder))
@@ -63,6 +65,13 @@ def print_summary(
     for number, (command, why) in enumerate(following.items()):
         heading = "" if number else "next"
         console.print(f"{heading:13}{as_typed(command)}   ({why})", highlight=False, soft_wrap=True)
+
+
+def _order(order: Mapping[str, Any]) -> str:
+    """The order of a run that was not simply FIFO."""
+    drawn = "" if order["kind"] == "tape" else f", seed {order['seed']}"
+    text = f"{order['kind']}{drawn}; deviations from FIFO: {order['deviations']} (tape.jsonl)"
+    return text if order["left"] is None else f"{text}; the tape was left at: {order['left']}"
 
 
 def as_typed(command: str) -> str:

@@ -21,6 +21,7 @@ from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
+from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.scenario.scenario import Scenario
@@ -65,6 +66,7 @@ UNKNOWN = Trial({}, {})
 def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     """Simulate and judge a run in this process. Raises VnetError if it cannot be run."""
     started = time.monotonic()
+    scenario = with_order_steps(scenario)
     emulation = Emulation(scenario, build_world(scenario), folder)
     wall_s, _ = simulate(emulation)
     judgement, _ = conclude(emulation, wall_s, "simulate")

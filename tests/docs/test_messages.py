@@ -24,6 +24,7 @@ from tests.vnet.transport.test_wire import agent_messages, emulator_messages, na
 from vnet.errors import WireError
 from vnet.node import Report
 from vnet.transport import keys, wire
+from vnet.transport.orders import Deviation, Order
 
 PAGE = Layouts()
 OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}
@@ -37,6 +38,8 @@ PARTS = {
     "Ending": wire.Ending,
     "Unhandled": wire.Unhandled,
     "Note": wire.Note,
+    "Order": Order,
+    "Deviation": Deviation,
     "Lateness": wire.Lateness,
     "Packet": wire.WirePacket,
     "Fix": wire.WireFix,
@@ -145,7 +148,7 @@ def fields(kinds: dict[str, Any]) -> list[tuple[str, int, Field]]:
 
 def example(kind: str) -> list[Any]:
     """Values of a message that are as the page says, always the same."""
-    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[], [], [], [], []]}
+    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[]] * 6}
 
     def value(field: Field) -> Any:
         first = split(field.type, " or ")[0]

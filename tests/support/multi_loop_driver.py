@@ -161,6 +161,7 @@ class _Process:
         self._host = Host(self._welcomes, lambda: loop.now_ns, disks=self._disks)
         asyncio.set_event_loop(loop)
         try:
+            self._host.order_events(loop)
             loop.start_at(self._next_grant())
             self._host.start(loop, load_programs(self._welcomes))
             while True:

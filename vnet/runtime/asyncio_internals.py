@@ -25,7 +25,7 @@ import heapq
 import inspect
 import traceback
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context
 from types import CoroutineType
@@ -77,6 +77,11 @@ def default_executor(loop: asyncio.AbstractEventLoop, thread_name_prefix: str) -
 def context_of(handle: asyncio.Handle) -> Context:
     """Return the context in which a callback will run."""
     return cast("Context", _private(handle)._context)
+
+
+def callback_of(handle: asyncio.Handle) -> Callable[..., object] | None:
+    """Return what a callback that is ready will call; None if it has been cancelled."""
+    return cast("Callable[..., object] | None", _private(handle)._callback)
 
 
 def handle_that_raised(error: BaseException) -> asyncio.Handle | None:
@@ -155,10 +160,12 @@ def tell_of_failed_gatherings() -> None:
 class NumberedTimer(asyncio.TimerHandle):
     """A timer with a number: timers of one instant fire in the order in which they were set.
 
-    asyncio leaves that order to the shape of its heap, and so to how many other nodes share the loop.
+    asyncio leaves that order to the shape of its heap, and so to how many other nodes share the loop. Where other
+    orders are tried, `setter` has the name of what has set the timer, and its callback.
     """
 
-    __slots__ = ("_number",)
+    __slots__ = ("_number", "setter")
+    setter: tuple[str, object]
 
     def __init__(self, number: int, *rest: Any) -> None:
         super().__init__(*rest)

@@ -14,21 +14,24 @@ import traceback
 import weakref
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from vnet.node import Node, NoteDetail, Packet, Report
+from vnet.node import Node, NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
 from vnet.runtime.disks import Disks
+from vnet.runtime.event_order import Chooser, chooser_of
 from vnet.runtime.log_handler import NodeLogHandler
+from vnet.runtime.mail_delivery import MailDelivery
+from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
+from vnet.transport.orders import Deviation, Order
 from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:  # pdb, which few runs need
@@ -72,8 +75,10 @@ class Host:
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = {welcome.node: welcome.runs for welcome in welcomes}
-        self._clocks: dict[str, wire.ClockError] = {}
-        self._past_clocks: dict[str, list[wire.ClockError]] = {}
+        self._clocks = NodeClocks(clock)
+        self._orders = {welcome.node: welcome.order for welcome in welcomes}
+        self.mail = MailDelivery(self.nodes, self._clocks)
+        self._deviations: list[Deviation] = []
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
@@ -97,8 +102,7 @@ class Host:
 
     def now_ns(self, node: str) -> int:
         """Emulated time in nanoseconds, by the clock of `node`."""
-        clock_error = self._clocks.get(node)
-        return self._clock() if clock_error is None else max(clock_error.shown_ns(self._clock()), 0)
+        return self._clocks.now_of(node)
 
     def send_frame(self, node: str, payload: bytes) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
@@ -131,6 +135,11 @@ class Host:
 
     # What the transport asks of the host.
 
+    def order_events(self, loop: VirtualTimeLoop) -> None:
+        """Have events of one instant come in the order that the welcomes ask for; before the first grant."""
+        if any(order is not None for order in self._orders.values()):
+            self.mail.ordered = loop.order(self._chooser_of, self._deviated)
+
     def start(self, loop: SkewedLoop, programs: Programs) -> None:
         """Schedule every node's program on `loop`."""
         self._loop = loop
@@ -149,6 +158,10 @@ class Host:
         context.run(current_node.set, node)
         program = self._main(node, self._programs[node.id])
         self._loop.create_task(program, name=f"{node.id} main", context=context)
+
+    def _chooser_of(self, node: Node) -> Chooser:
+        order = self._orders[node.id]
+        return chooser_of(Order("tape") if order is None else order)
 
     def _is_debugged(self) -> bool:
         """Return whether code runs on behalf of the node that is debugged, and its program goes on."""
@@ -190,6 +203,7 @@ class Host:
     def restart(self, welcome: wire.Welcome) -> None:
         """Run a node's program again, as another incarnation (simulated)."""
         node = self.nodes[welcome.node] = self._node(welcome)
+        self._orders[welcome.node] = welcome.order
         self._active[node.id] = True
         self._start(node)
 
@@ -208,41 +222,17 @@ class Host:
 
     def apply_clock_error(self, clocks: Iterable[wire.ClockError], loop: SkewedLoop) -> None:
         """Take new clocks of nodes."""
-        for clock in clocks:
-            self._past_clocks.setdefault(clock.node, []).append(clock)
-            self._clocks.pop(clock.node, None)
-            if clock.is_wrong:
-                self._clocks[clock.node] = clock
-        loop.clock_error_of = self._clock_error_of_task if self._clocks else lambda: None
+        self._clocks.apply(clocks, loop)
 
-    def _clock_error_of_task(self) -> wire.ClockError | None:
-        node = current_node.get()
-        return None if node is None else self._clocks.get(node.id)
-
-    def _shown_ns(self, node: str, time_ns: int) -> int:
-        """Time that the clock of `node` showed at `time_ns`, as it went then."""
-        for clock_error in reversed(self._past_clocks.get(node, ())):
-            if clock_error.since_ns <= time_ns:
-                return max(clock_error.shown_ns(time_ns), 0)
-        return time_ns
-
-    def deliver(self, packets: Iterable[wire.WirePacket], fixes: Iterable[wire.WireFix]) -> None:
-        """Put packets, then fixes, into the mailboxes."""
-        arrived: dict[str, list[Packet]] = {}
-        for packet in packets:
-            received = packet.packet()
-            if packet.node in self._past_clocks:
-                received = replace(received, received_ns=self._shown_ns(packet.node, received.received_ns))
-            arrived.setdefault(packet.node, []).append(received)
-        for node, some in arrived.items():
-            self.nodes[node].radio.inbox.deliver(some)
-        for fix in fixes:
-            self.nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
+    def _deviated(self, node: Node, deviation: Deviation) -> None:
+        if self._runs(node):
+            self._deviations.append(deviation)
 
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
-        traffic = wire.Traffic(self._frames, self._reports, self._endings, self._unhandled.take(), self._notes)
-        self._frames, self._reports, self._endings, self._notes = [], [], [], []
+        unhandled = self._unhandled.take()
+        traffic = wire.Traffic(self._frames, self._reports, self._endings, unhandled, self._notes, self._deviations)
+        self._frames, self._reports, self._endings, self._notes, self._deviations = [], [], [], [], []
         return traffic
 
     def take_final(self) -> wire.Traffic:
@@ -255,7 +245,7 @@ class Host:
         """Take a grant; returns its first instant, with everything delivered that is due at it."""
         self._window.open(grant)
         self._deliver_due(grant.time_ns)
-        self.deliver((), grant.fixes)
+        self.mail.deliver((), grant.fixes, grant.time_ns)
         return grant.time_ns
 
     def next_instant(self, next_timer_ns: int | None) -> int | None:
@@ -275,8 +265,8 @@ class Host:
         return next_ns
 
     def _deliver_due(self, time_ns: int) -> None:
-        active = self._active
-        self.deliver([p for p in self._window.take_packets(time_ns, self._paused) if active[p.node]], ())
+        due = self._window.take_packets(time_ns, self._paused)
+        self.mail.deliver([packet for packet in due if self._active[packet.node]], (), time_ns)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""

@@ -16,20 +16,26 @@ import asyncio
 import os
 import selectors
 import sys
-from collections import deque
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor, Future
 from contextvars import Context, copy_context
+from functools import partial
 from itertools import count
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NumberedTimer
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.current_node import current_node
+from vnet.runtime.event_order import Chooser
+from vnet.runtime.ready_queue import OrderedQueue, ReadyQueue, nothing
+from vnet.transport.orders import Deviation
 from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from vnet.node import Node
 
 LATEST_S = 1e9
 """Timers after this, more than thirty years, are for never."""
@@ -142,6 +148,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
         self._timers = count()
         self._meter: CpuMeter | None = None
+        self._ordered: OrderedQueue | None = None
         super().__init__(_YieldingSelector(self._wait))
         asyncio_internals.set_clock_resolution(self, 0.5 / NS_PER_S)  # no timer fires before its nanosecond
 
@@ -156,21 +163,36 @@ class VirtualTimeLoop(SkewedLoop):
 
     def measure(self, meter: CpuMeter) -> None:
         """Let `meter` measure what the callbacks cost, from the next round on."""
-        ready = _HoldingQueue(asyncio_internals.ready_queue(self))
-        ready.on_taken = meter.begin
-        asyncio_internals.replace_ready_queue(self, ready)
+        self._ready_queue().on_taken = meter.begin
         self._meter = meter
+
+    def order(
+        self, chooser_of: Callable[[Node], Chooser], on_deviation: Callable[[Node, Deviation], None]
+    ) -> OrderedQueue:
+        """Have `chooser_of` a node decide in which order it is shown what happens at one instant.
+
+        Returns the queue in which events of this instant are put. `on_deviation` is told of choices that are not
+        FIFO's. To be called before anything runs.
+        """
+        ready = self._ready_queue()
+        self._ordered = OrderedQueue(ready, chooser_of, lambda: self._now_ns, on_deviation)
+        self._ordered.on_taken = ready.on_taken
+        asyncio_internals.replace_ready_queue(self, self._ordered)
+        return self._ordered
+
+    def _ready_queue(self) -> ReadyQueue:
+        ready = asyncio_internals.ready_queue(self)
+        if not isinstance(ready, ReadyQueue):
+            ready = ReadyQueue(ready)
+            asyncio_internals.replace_ready_queue(self, ready)
+        return ready
 
     def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
         """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
 
         Timers that became due meanwhile are due when they are released: after what has come in by then, in order.
         """
-        ready = asyncio_internals.ready_queue(self)
-        if not isinstance(ready, _HoldingQueue):
-            ready = _HoldingQueue(ready)
-            asyncio_internals.replace_ready_queue(self, ready)
-        for timer in ready.release(held):
+        for timer in self._ready_queue().release(held):
             asyncio_internals.push_timer(self, timer)
 
     def own_time(self) -> float:
@@ -186,12 +208,16 @@ class VirtualTimeLoop(SkewedLoop):
         if when < LATEST_S:
             when = round(when * NS_PER_S) / NS_PER_S
         timer = NumberedTimer(next(self._timers), when, callback, args, self, context)
+        if self._ordered is not None:
+            timer.setter = self._ordered.setter(current_node.get(), asyncio.current_task(self))
         asyncio_internals.push_timer(self, timer)
         return timer
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
         self._ending = True
+        if self._ordered is not None:
+            self._ordered.decides = False
         self._rounds = 0
         self.run_until_complete(main)
 
@@ -201,6 +227,11 @@ class VirtualTimeLoop(SkewedLoop):
             _end_fork()
         if self._meter is not None:
             self._meter.end()
+        if self._ordered is not None:
+            if self._ordered.compose():
+                timeout = 0
+            elif self._ordered.has_jobs:
+                return poll(None)
         if timeout is not None and timeout <= 0:
             self._count_round()
             return poll(0)
@@ -222,6 +253,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._rounds += 1
         if self._rounds > self._spin_limit:
             self._rounds = 0
+            if self._ordered is not None:
+                self._ordered.flatten()
             raise SpinError(f"more than {self._spin_limit} rounds of callbacks at {self._now_ns} ns")
 
     def _next_timer_ns(self) -> int | None:
@@ -244,8 +277,14 @@ class VirtualTimeLoop(SkewedLoop):
         job = context.run(executor.submit, func, *args)
         outer = _TellingFuture(loop=self)
         outer.job_context = copy_context()
-        self._jobs.append((job, outer))
-        job.add_done_callback(lambda _: self.call_soon_threadsafe(_nothing))
+        node = current_node.get()
+        if self._ordered is None or node is None:
+            self._jobs.append((job, outer))
+        else:
+            name = getattr(func, "__qualname__", "a job")
+            self._ordered.add_job(node, name, job, partial(_copy_result, job, outer))
+        # In nobody's context: a job that is done already calls back here, and it is no event of the node's.
+        job.add_done_callback(lambda _: self.call_soon_threadsafe(nothing, context=Context()))
         return outer
 
     def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
@@ -253,8 +292,7 @@ class VirtualTimeLoop(SkewedLoop):
             return poll(None)  # a finished job, or a call from a job's thread, wakes the self-pipe
         jobs, self._jobs = self._jobs, []
         for job, outer in jobs:
-            if not outer.done():
-                _copy_result(job, outer)
+            _copy_result(job, outer)
         return []
 
     # Sockets and subprocesses would wait on the real world, whose time has no place here.
@@ -276,47 +314,6 @@ class VirtualTimeLoop(SkewedLoop):
     sock_sendall = sock_sendto = sock_connect = sock_accept = sock_sendfile = _refuse
 
 
-class _HoldingQueue(deque[asyncio.Handle]):
-    """The loop's queue of callbacks that are ready, but for those of programs that are paused.
-
-    `on_taken` is called with each callback that is about to run.
-    """
-
-    on_taken: Callable[[asyncio.Handle], None] | None = None
-
-    def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
-        super().__init__(ready)
-        self._holds: Callable[[asyncio.Handle], bool] = lambda handle: False
-        self._held: list[asyncio.Handle] = []
-
-    def append(self, handle: asyncio.Handle) -> None:
-        if self._holds(handle):
-            self._held.append(handle)
-        else:
-            super().append(handle)
-
-    def popleft(self) -> asyncio.Handle:
-        handle = super().popleft()
-        if self.on_taken is not None:
-            self.on_taken(handle)
-        return handle
-
-    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
-        """Hold what `holds` says, and release the rest in the order in which it came; returns its timers."""
-        waiting, held = list(self), self._held
-        self.clear()
-        self._holds, self._held = holds, []
-        for handle in waiting:
-            self.append(handle)
-        timers = []
-        for handle in held:
-            if isinstance(handle, NumberedTimer) and not holds(handle):
-                timers.append(handle)
-            else:
-                self.append(handle)
-        return timers
-
-
 class _YieldingSelector(selectors.DefaultSelector):
     """The real selector for the loop's own self-pipe, with the waiting handed to `wait`."""
 
@@ -329,6 +326,8 @@ class _YieldingSelector(selectors.DefaultSelector):
 
 
 def _copy_result(job: Future[Any], outer: asyncio.Future[Any]) -> None:
+    if outer.done():
+        return
     if job.cancelled():
         outer.cancel()
     elif (error := job.exception()) is not None:
@@ -342,7 +341,3 @@ def _end_fork() -> NoReturn:
     sys.stderr.write("vnet: a process that a program forked came back to the event loop; it ends here\n")
     sys.stderr.flush()
     os._exit(70)  # nothing of the parent's is to be flushed or closed twice
-
-
-def _nothing() -> None:
-    """Scheduled only to wake the loop."""

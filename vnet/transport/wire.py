@@ -17,9 +17,7 @@ import numpy as np
 
 from vnet.errors import WireError, printable
 from vnet.node import Fix, Packet, Report
-
-TimeNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
-Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+from vnet.transport.orders import Count, Deviation, Order, TimeNs
 
 VERSION = 2
 """Version of the messages. 2: a grant is for a window, and a yield has steps."""
@@ -118,17 +116,19 @@ class Note(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Traffic(msgspec.Struct, frozen=True, array_like=True):
-    """Frames, reports, endings, exceptions and notes of the nodes of one process, in the order they were made."""
+    """Frames and all else that the nodes of one process made, in order; `deviations` where orders are tried."""
 
     frames: Sequence[Frame] = ()
     reports: Sequence[Report] = ()
     endings: Sequence[Ending] = ()
     unhandled: Sequence[Unhandled] = ()
     notes: Sequence[Note] = ()
+    deviations: Sequence[Deviation] = ()
 
     def __bool__(self) -> bool:
         """Return true if there is anything in it."""
-        return bool(self.frames or self.reports or self.endings or self.unhandled or self.notes)
+        told = self.frames or self.reports or self.endings or self.unhandled or self.notes
+        return bool(told or self.deviations)
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True):
@@ -226,6 +226,7 @@ class Welcome(Message, frozen=True):
     boot_id: str
     runs: bool = True
     version: Count = 1
+    order: Order | None = None
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):

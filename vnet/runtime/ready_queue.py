@@ -1,0 +1,311 @@
+"""The queues of callbacks that are ready to run, which take the place of the event loop's own.
+
+`ReadyQueue` puts aside what belongs to programs that are paused. `OrderedQueue` also puts the rounds of callbacks
+together: what happens at one instant comes in the order that a chooser decides (event_order.py).
+
+How an event loop of asyncio works, as far as it matters here: a round begins with what callbacks of the last round
+have registered, in that order; behind it come the events that the selector has found and the timers that are due;
+then all of these run. So an event that is shown a round later than it might have been is one that came a little
+later, and an order of events is one that a machine can show. What one callback registers keeps its order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
+
+from vnet.runtime import asyncio_internals
+from vnet.runtime.asyncio_internals import NumberedTimer
+from vnet.runtime.current_node import current_node
+from vnet.runtime.event_order import GO_ON, Chooser, Option
+from vnet.transport.orders import Deviation
+
+if TYPE_CHECKING:
+    from vnet.node import Node
+
+
+def nothing() -> None:
+    """Do nothing: scheduled only to wake the loop, when a job is done."""
+
+
+LONGEST_NAME = 100
+"""Characters of a task's or a job's name."""
+STARTED = "start"
+"""The source of what no callback has registered."""
+
+
+class ReadyQueue(deque[asyncio.Handle]):
+    """The loop's queue of callbacks that are ready, but for those of programs that are paused.
+
+    `on_taken` is called with each callback that is about to run.
+    """
+
+    on_taken: Callable[[asyncio.Handle], None] | None = None
+
+    def __init__(self, ready: Iterable[asyncio.Handle]) -> None:
+        super().__init__(ready)
+        self._holds: Callable[[asyncio.Handle], bool] = lambda handle: False
+        self._held: list[asyncio.Handle] = []
+
+    def append(self, handle: asyncio.Handle) -> None:
+        """Add a callback behind the others, unless it is held."""
+        if self._holds(handle):
+            self._held.append(handle)
+        else:
+            super().append(handle)
+
+    def popleft(self) -> asyncio.Handle:
+        """Remove and return the next callback, which is about to run."""
+        handle = super().popleft()
+        if self.on_taken is not None:
+            self.on_taken(handle)
+        return handle
+
+    def release(self, holds: Callable[[asyncio.Handle], bool]) -> list[NumberedTimer]:
+        """Hold what `holds` says, and release the rest in the order in which it came; returns its timers."""
+        waiting, held = list(self), self._held
+        self.clear()
+        self._holds, self._held = holds, []
+        for handle in waiting:
+            self.append(handle)
+        timers = []
+        for handle in held:
+            if isinstance(handle, NumberedTimer) and not holds(handle):
+                timers.append(handle)
+            else:
+                self.append(handle)
+        return timers
+
+
+@dataclass(slots=True, eq=False)
+class _Event:
+    """Something that is due: `show` makes it happen. Of one `group` only the oldest is an option.
+
+    `job` is that of the result that it is, which must be there first. An arrival that is not `awaited` wakes
+    nobody.
+    """
+
+    label: str
+    source: str
+    group: object
+    show: Callable[[], None]
+    job: Future[Any] | None = None
+    awaited: Callable[[], bool] = lambda: True
+
+
+@dataclass(slots=True, eq=False)
+class _NodeRounds:
+    """The events and callbacks of one node that are due or ready, and who decides what is next."""
+
+    chooser: Chooser
+    events: list[_Event] = field(default_factory=list)
+    jobs: list[_Event] = field(default_factory=list)
+    ready: deque[tuple[asyncio.Handle, str]] = field(default_factory=deque)
+    time_ns: int = -1
+    decisions: int = 0
+    awaited: _Event | None = None
+    """The result that comes next and is not there yet."""
+    takes_results: bool = False
+    """FIFO: nothing else was left, so all results come before anything runs."""
+    names: WeakKeyDictionary[asyncio.Task[Any], str] = field(default_factory=WeakKeyDictionary)
+    """The names of tasks that have set timers: their coroutines', with a number if others had the same."""
+    named: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def sleeps(self) -> bool:
+        """True if nothing of the node runs at this instant: it finds what has arrived when it wakes."""
+        return not self.ready and not any(event.awaited() for event in [*self.events, *self.jobs])
+
+    def options(self) -> list[_Event | None]:
+        """Return what may be next, FIFO's choice first; None is to go on."""
+        events = _oldest_of_groups(self.events)
+        go_on: list[_Event | None] = [None] if self.ready else []
+        if events or (self.ready and not self.takes_results):
+            return [*events, *go_on, *self.jobs]
+        return [*self.jobs, *go_on]
+
+    def described(self, event: _Event | None) -> Option:
+        """Return an event, or going on, as the chooser sees it."""
+        return Option(GO_ON, self.ready[0][1]) if event is None else Option(event.label, event.source)
+
+
+class OrderedQueue(ReadyQueue):
+    """See the module's text. `chooser_of` gives the chooser of a node; `now_ns` the time of the loop.
+
+    `on_deviation` is told of each choice that is not FIFO's.
+    """
+
+    def __init__(
+        self,
+        ready: Iterable[asyncio.Handle],
+        chooser_of: Callable[[Node], Chooser],
+        now_ns: Callable[[], int],
+        on_deviation: Callable[[Node, Deviation], None],
+    ) -> None:
+        super().__init__(())
+        self._chooser_of = chooser_of
+        self._now_ns = now_ns
+        self._on_deviation = on_deviation
+        self._nodes: dict[Node, _NodeRounds] = {}
+        self._running: tuple[Node | None, str, object] = (None, STARTED, object())
+        self._sources: dict[int, str] = {}
+        self.steps: Counter[str] = Counter()
+        """Decisions of each node so far."""
+        self._thread = threading.get_ident()
+        self._called_back = False
+        """True if a job has called into the loop from its thread: it may wait for an answer."""
+        self.decides = True
+        """False: as FIFO from now on, because the programs are ended."""
+        for handle in ready:
+            self.append(handle)
+
+    # What the loop, and nodes through it, put in.
+
+    def append(self, handle: asyncio.Handle) -> None:
+        """Take a callback that is ready, or a timer that is due."""
+        node = asyncio_internals.context_of(handle).get(current_node)
+        if threading.get_ident() != self._thread and not handle.cancelled():
+            self._called_back = self._called_back or asyncio_internals.callback_of(handle) is not nothing
+        if node is None or self._holds(handle):
+            super().append(handle)
+        elif isinstance(handle, NumberedTimer):
+            rounds = self._rounds(node)
+            source, group = handle.setter
+            rounds.events.append(
+                _Event(f"timer of {source}", source, group, lambda: self._ready(node, handle, source))
+            )
+        else:
+            running, source, _ = self._running
+            self._ready(node, handle, source if running is node else STARTED)
+
+    def _ready(self, node: Node, handle: asyncio.Handle, source: str) -> None:
+        self._rounds(node).ready.append((handle, source))
+
+    def add_event(
+        self, node: Node, label: str, source: str, show: Callable[[], None], awaited: Callable[[], bool]
+    ) -> None:
+        """Something arrives at `node` at this instant: events of one label come in this order."""
+        self._rounds(node).events.append(_Event(label, source, label, show, awaited=awaited))
+
+    def add_job(self, node: Node, name: str, job: Future[Any], show: Callable[[], None]) -> None:
+        """`node` has submitted a job to an executor, whose result `show` sets."""
+        label = f"result of {name[:LONGEST_NAME]}"
+        self._rounds(node).jobs.append(_Event(label, label, job, show, job))
+
+    def setter(self, node: Node | None, task: asyncio.Task[Any] | None) -> tuple[str, object]:
+        """Return the name of what sets a timer, and the callback that does, whose timers keep their order."""
+        running, source, callback = self._running
+        if node is None or running is not node:
+            return STARTED, callback
+        if task is None:
+            return source, callback
+        rounds = self._rounds(node)
+        if task not in rounds.names:
+            name = getattr(task.get_coro(), "__qualname__", "a task").rsplit("<locals>.", 1)[-1]
+            name = "main" if name == "Host._main" else name
+            name = name[:LONGEST_NAME]
+            rounds.named[name] += 1
+            rounds.names[task] = name if rounds.named[name] == 1 else f"{name}#{rounds.named[name]}"
+        return rounds.names[task], callback
+
+    def _rounds(self, node: Node) -> _NodeRounds:
+        if node not in self._nodes:
+            self._nodes[node] = _NodeRounds(self._chooser_of(node))
+        return self._nodes[node]
+
+    # What the loop takes out.
+
+    def popleft(self) -> asyncio.Handle:
+        """Remove and return the next callback, which is about to run."""
+        handle = super().popleft()
+        node = asyncio_internals.context_of(handle).get(current_node)
+        self._running = node, self._sources.pop(id(handle), STARTED), object()
+        return handle
+
+    def compose(self) -> bool:
+        """Put the next round together; returns whether there is anything in it."""
+        for node, rounds in list(self._nodes.items()):
+            self._compose(node, rounds)
+        return len(self) > 0
+
+    @property
+    def has_jobs(self) -> bool:
+        """True if there are jobs whose results have not come."""
+        return any(rounds.jobs for rounds in self._nodes.values())
+
+    def flatten(self) -> None:
+        """Put all that is ready into the queue itself, in order, where others look for it."""
+        for rounds in self._nodes.values():
+            self._run(rounds)
+
+    def _compose(self, node: Node, rounds: _NodeRounds) -> None:
+        if rounds.time_ns != (time_ns := self._now_ns()):
+            rounds.time_ns, rounds.decisions = time_ns, 0
+        if rounds.sleeps:
+            for arrival in rounds.events:
+                arrival.show()
+            rounds.events.clear()
+            return
+        while (event := rounds.awaited or self._next(node, rounds)) is not None:
+            if event.job is not None and not event.job.done() and not self._called_back:
+                rounds.awaited = event
+                return
+            rounds.awaited = None
+            if event.job is not None and not event.job.done():  # it may wait for what is ready
+                break
+            (rounds.events if event.job is None else rounds.jobs).remove(event)
+            self._running = node, event.source, event
+            event.show()
+        self._run(rounds)
+
+    def _run(self, rounds: _NodeRounds) -> None:
+        while rounds.ready:
+            handle, source = rounds.ready.popleft()
+            self._sources[id(handle)] = source
+            super().append(handle)
+
+    def _next(self, node: Node, rounds: _NodeRounds) -> _Event | None:
+        """Return the event that comes next, or None if the node goes on, or has nothing to do."""
+        if not (options := rounds.options()):
+            return None
+        number = 0
+        if len(options) > 1 and self.decides:
+            number = self._decide(node, rounds, options)
+        event = options[number]
+        rounds.takes_results = number == 0 and event is not None and event.job is not None
+        return event
+
+    def _decide(self, node: Node, rounds: _NodeRounds, options: list[_Event | None]) -> int:
+        described = _distinct([rounds.described(event) for event in options])
+        decision = rounds.decisions
+        rounds.decisions += 1
+        self.steps[node.id] += 1
+        number = rounds.chooser.choose(rounds.time_ns, decision, described)
+        if number != 0:
+            chosen, first = described[number].label, described[0].label
+            self._on_deviation(node, Deviation(node.id, node.incarnation, rounds.time_ns, decision, chosen, first))
+        return number
+
+
+def _oldest_of_groups(events: list[_Event]) -> list[_Event | None]:
+    """Return the events that no other of their group comes before, in order."""
+    oldest: dict[object, _Event | None] = {}
+    for event in events:
+        oldest.setdefault(event.group, event)
+    return list(oldest.values())
+
+
+def _distinct(options: list[Option]) -> list[Option]:
+    """Number the options that have the label of another."""
+    seen: dict[str, int] = {}
+    distinct = []
+    for option in options:
+        seen[option.label] = number = seen.get(option.label, 0) + 1
+        distinct.append(option if number == 1 else Option(f"{option.label} ({number})", option.source))
+    return distinct
