@@ -233,7 +233,8 @@ class InformationEstimator:
         if not self._options.defence:
             return priors, increments
         traces = (increments[:, 0] + increments[:, 2]).tolist()
-        self._largest_increment = INCREMENT_FACTOR * max(traces[0], sorted(traces)[len(traces) // 2])
+        usual = INCREMENT_FACTOR * max(traces[0], sorted(traces)[len(traces) // 2])
+        self._largest_increment = max(usual, self.own.largest_increment)
         largest = PRIOR_FACTOR * _trace(self._prior)
         return scaled_down(priors, largest), scaled_down(increments, self._largest_increment)
 

@@ -100,8 +100,11 @@ class InformationFrame:
 
     @cached_property
     def fingerprint(self) -> bytes:
-        """Bytes that no two senders share at one time: they come from the noise of a receiver."""
-        return _FINGERPRINT.pack(*self.increment)
+        """Bytes that no two senders share at one time: they come from the noise of a receiver.
+
+        An increment of 0, of an outlier, has no noise; to send it again under another name does no harm.
+        """
+        return _FINGERPRINT.pack(*self.increment) if any(self.increment) else self.name.encode()
 
 
 def encode(frame: InformationFrame) -> bytes:

@@ -22,6 +22,9 @@ from agents.cooperative.gnss_clock import GnssClock
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.options import Options
 from vnet import Fix, Node
+from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array
 from vnet.units import NS_PER_S
 
 SENDING_SHARE = 0.7
@@ -95,6 +98,12 @@ def listening_share(name: str, options: Options) -> float:
     return first_share + turn * (TURNS_SHARE - first_share)
 
 
+def map_shift_m2(lanes: LaneMap | RoadMap) -> Array:
+    """Return the covariance (2, 2) in m² of a shift of the whole map, which moves all that is found with it."""
+    sigma_m = lanes.datum_sigma_m if isinstance(lanes, RoadMap) else 0.0
+    return sigma_m**2 * np.eye(2)
+
+
 def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, counts: dict[str, int]) -> None:
     """Report the position, the common error, and `counts` of the period.
 
@@ -102,6 +111,9 @@ def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, c
     """
     position_m, covariance_m2 = estimator.position(fix)
     common_m, common_covariance_m2 = estimator.common_error
+    # Nobody can tell a shift of the map from the common error: it is stated, and not exchanged.
+    shift_m2 = map_shift_m2(node.map)
+    covariance_m2, common_covariance_m2 = covariance_m2 + shift_m2, common_covariance_m2 + shift_m2
     values: dict[str, Any] = {
         "common_error_m": common_m,
         "common_error_covariance_m2": common_covariance_m2,

@@ -14,6 +14,7 @@ from rich.markdown import Markdown
 
 from emulator.cells.cells import Cell, read_series, run_cells, write_results
 from emulator.cli.help import group
+from emulator.cli.options import pair
 from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
 from emulator.terminal.console import one_line_errors, tell
@@ -180,6 +181,12 @@ def city(
     map_aside: Annotated[
         float, typer.Option(metavar="METRES", help="How far right of the map's lanes vehicles drive.")
     ] = 0.0,
+    map_datum: Annotated[
+        str | None, typer.Option(metavar="EAST,NORTH", help="How far the map is moved, in metres: vnet map datum.")
+    ] = None,
+    map_datum_sigma: Annotated[
+        float, typer.Option(min=0, metavar="METRES", help="How far the whole map may still be shifted.")
+    ] = 0.0,
     refuse_impossible: Annotated[
         bool, typer.Option("--refuse-impossible", metavar="", help="Refuse trips that no vehicle can drive.")
     ] = False,
@@ -194,7 +201,10 @@ def city(
 
     with one_line_errors():
         folder = _folder(out, "city")
-        place = study.place(trips, roads, map_sigma, map_aside, "refuse" if refuse_impossible else "leave_out")
+        section: dict[str, Any] = {"sigma_m": map_sigma, "aside_m": map_aside, "datum_sigma_m": map_datum_sigma}
+        if map_datum is not None:
+            section["datum_m"] = pair("--map-datum", map_datum)
+        place = study.place(trips, roads, section, "refuse" if refuse_impossible else "leave_out")
         for note in study.notes(place, duration):
             tell(note)
         cells = study.city_cells(place, range(1, seeds + 1), duration)

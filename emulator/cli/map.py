@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
 from emulator.cli.help import group
+from emulator.cli.options import pair
 from emulator.terminal.console import one_line_errors
+from emulator.world.maps import datum as calibration
 from emulator.world.maps.city import SIZE_M, city_roads
+from emulator.world.maps.datum import PLACE_M, Calibration
 from emulator.world.maps.files import read_roads, write_roads, writer_of
 from emulator.world.maps.problems import MapReport, examine
 from emulator.world.maps.roads import Roads
 from emulator.world.projection import Frame
+from emulator.world.trips.clean import Rules
+from emulator.world.trips.drive import whole_motion
 from emulator.world.trips.files import check_trips_name, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
+from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError
 from vnet.types import Array
+
+RATE_HZ = 10.0
+"""Rate at which recorded trips are read for a calibration."""
+RULES = Rules(fastest_mps=70.0, longest_gap_s=10.0, hardest_mps2=10.0)
+"""Cleaning of recorded trips for a calibration: the defaults of [network], and no jump is driven."""
 
 
 class DriveOn(StrEnum):
@@ -50,8 +63,8 @@ def show(
 ) -> None:
     """Say how long a map's roads are and what is odd about it, and draw it."""
     with one_line_errors():
-        roads = read_roads(map_file, _pair("--origin", origin))
-        middle = _pair("--at", at)
+        roads = read_roads(map_file, pair("--origin", origin))
+        middle = pair("--at", at)
         if middle is not None:
             roads = _part(map_file, roads, middle, side_km)
         report = examine(roads)
@@ -66,7 +79,7 @@ def convert(map_file: MapArgument, out: OutArgument, origin: OriginOption = None
     """Write a map as GeoJSON or NPZ, by the name of OUT."""
     with one_line_errors():
         writer_of(out)  # before a large file is read
-        write_roads(read_roads(map_file, _pair("--origin", origin)), out)
+        write_roads(read_roads(map_file, pair("--origin", origin)), out)
         print(f"wrote {out}")
 
 
@@ -113,19 +126,64 @@ def trips(
         print(f"wrote {out}: {len(motion.node_ids)} vehicles, {count:,} samples")
 
 
-def _pair(option: str, text: str | None) -> tuple[float, float] | None:
-    """Two numbers, written with a comma."""
-    if text is None:
-        return None
-    try:
-        first, second = (float(part) for part in text.split(","))
-    except ValueError:
-        first = second = float("nan")
-    if not np.isfinite([first, second]).all():
-        raise ScenarioError(f"{option} {text}: two numbers with a comma between them are needed")
-    if option == "--origin" and not (abs(first) <= 90 and abs(second) <= 180):
-        raise ScenarioError(f"{option} {text}: latitudes are within ±90, longitudes within ±180")
-    return first, second
+@app.command()
+def datum(
+    map_file: MapArgument,
+    trips_file: Annotated[Path, typer.Argument(metavar="TRIPS", help="*.csv, *.parquet, *.npz or SUMO's FCD.")],
+    origin: OriginOption = None,
+    drive_on: Annotated[DriveOn, typer.Option(help="On which side people drive.")] = DriveOn.RIGHT,
+    others: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Use every other vehicle, and write the trips of the rest: *.csv, *.parquet."
+        ),
+    ] = None,
+) -> None:
+    """Find from true trips by how much a map is shifted: keys for [map]. Evaluate on other trips."""
+    with one_line_errors():
+        if others is not None:
+            check_trips_name(others)
+        motion = whole_motion(trips_file, pair("--origin", origin), RATE_HZ, RULES)
+        roads = read_roads(map_file, pair("--origin", origin) or motion.origin_deg)
+        lanes = roads.lane_map(drive_on.value)
+        used = np.ones(len(motion.node_ids), dtype=np.bool_)
+        if others is not None:
+            used[1::2] = False
+        found = calibration.residuals(lanes, motion)
+        try:
+            result = calibration.calibrate(found.of(used))
+        except ScenarioError as error:
+            raise ScenarioError(f"{map_file}: {error}") from None
+        _print_datum(result, int(used.sum()))
+        if others is not None:
+            rest = calibration.calibrate(found.of(~used))
+            print(f"# the other vehicles alone: datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}")
+            _others(others, motion, used, RATE_HZ)
+
+
+def _print_datum(result: Calibration, vehicles: int) -> None:
+    """Print what has been found as keys of `[map]`."""
+    print(f"# {vehicles} vehicles, {result.samples:,} residuals in {result.places} squares of {PLACE_M:g} m")
+    print(f"datum_m = {_metres(result.datum_m)}")
+    print(f"datum_sigma_m = {float(np.sqrt(np.mean(result.error_m**2))):.2f}")
+    print(f"aside_m = {result.aside_m:.2f}")
+    print(f"sigma_m = {result.sigma_m:.2f}")
+
+
+def _metres(pair_m: Array) -> str:
+    return f"[{pair_m[0]:.2f}, {pair_m[1]:.2f}]"
+
+
+def _others(path: Path, motion: Motion, used: NDArray[np.bool_], rate_hz: float) -> None:
+    """Write the trips of the vehicles that are not `used`, a mask."""
+    rest = replace(
+        motion,
+        node_ids=tuple(name for name, is_used in zip(motion.node_ids, used.tolist(), strict=True) if not is_used),
+        position_m=motion.position_m[:, ~used],
+        heading_rad=motion.heading_rad[:, ~used],
+    )
+    count = write_trips(rest, path, rate_hz)
+    print(f"wrote {path}: {len(rest.node_ids)} vehicles, {count:,} samples")
 
 
 def _part(path: Path, roads: Roads, middle_m: tuple[float, float], side_km: float) -> Roads:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import sys
 from dataclasses import dataclass
@@ -40,6 +41,21 @@ class Order(StrEnum):
     FIFO = "fifo"
     SHUFFLE = "shuffle"
     PCT = "pct"
+
+
+def pair(option: str, text: str | None) -> tuple[float, float] | None:
+    """Return two numbers that `option` gives, with a comma between them. Raises ScenarioError for anything else."""
+    if text is None:
+        return None
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        first = second = float("nan")
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise ScenarioError(f"{option} {text}: two numbers with a comma between them are needed")
+    if option == "--origin" and not (abs(first) <= 90 and abs(second) <= 180):
+        raise ScenarioError(f"{option} {text}: latitudes are within ±90, longitudes within ±180")
+    return first, second
 
 
 class Pacing(StrEnum):

@@ -33,13 +33,15 @@ from vnet.types import Array
 LOSS = 0.1
 CENTRALIZED_PARTICLES = 4000
 """Particles of the filter that hears all: fewer are sure of what they cannot know."""
+ESTIMATES = {"exchange": "estimates"}
 MECHANISMS: dict[str, dict[str, Any]] = {
-    "optimized": {"fusion": "optimized"},
-    "random": {"fusion": "random"},
-    "max-degree": {"fusion": "max-degree"},
-    "metropolis": {"fusion": "metropolis"},
-    "constant 0.5": {"fusion": "constant", "alpha": 0.5},
-    "none": {"fusion": "none"},
+    "information": {"exchange": "information", "particles": 1000},
+    "optimized": {"fusion": "optimized"} | ESTIMATES,
+    "random": {"fusion": "random"} | ESTIMATES,
+    "max-degree": {"fusion": "max-degree"} | ESTIMATES,
+    "metropolis": {"fusion": "metropolis"} | ESTIMATES,
+    "constant 0.5": {"fusion": "constant", "alpha": 0.5} | ESTIMATES,
+    "none": {"fusion": "none"} | ESTIMATES,
 }
 """Options of each mechanism that is not centralized."""
 KEPT = "optimized"
@@ -52,9 +54,11 @@ PLACE_M = 50.0
 
 
 def place(
-    trips: Path | None, roads: Path | None, sigma_m: float, aside_m: float, impossible_trips: str = "leave_out"
+    trips: Path | None, roads: Path | None, section: Mapping[str, Any], impossible_trips: str = "leave_out"
 ) -> dict[str, Any]:
     """The sections `network` and `map` of scenarios: of files, or of a generated city.
+
+    `section` are the other keys of `map`.
 
     Raises VnetError unless both trips and roads are given, and from files that are there.
     """
@@ -72,7 +76,7 @@ def place(
             "impossible_trips": impossible_trips,
             "max_acceleration_mps2": MAX_ACCELERATION_MPS2,
         },
-        "map": {"path": str(roads and roads.resolve()), "sigma_m": sigma_m, "aside_m": aside_m},
+        "map": {"path": str(roads and roads.resolve()), **section},
     }
 
 

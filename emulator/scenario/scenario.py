@@ -91,6 +91,7 @@ class Run(Section):
         return self
 
 
+Shift = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
 OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
 
 
@@ -158,6 +159,11 @@ class Map(Section):
     """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
     aside_m: float = Field(0.0, ge=-FAR_M, le=FAR_M)
     """Mean distance of the driven line to the right of the map's lanes; negative: to the left."""
+    datum_m: tuple[Shift, Shift] = (0.0, 0.0)
+    """Shift of the map, east and north, before programs get it; `vnet map datum` finds it from trips."""
+    datum_sigma_m: float = Field(0.0, ge=0, le=WILD_M)
+    """Standard deviation in each axis by which the whole map may still be shifted. Nobody can tell that from the
+    common error: programs add it to the covariances that they state, not to what they exchange."""
     margin_m: float = Field(300.0, ge=0, le=FAR_M)
     """Programs are given the roads within so much of the box in which vehicles drive."""
 

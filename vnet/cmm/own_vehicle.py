@@ -1,6 +1,6 @@
 """The filter of one vehicle, from its first fix on: itself and the common error (MODEL 10).
 
-On straight lanes that is `own_rbpf`, on the map of a city `rbpf` with one tracked vehicle. Both say to others what
+On straight lanes that is `own_rbpf`, on the map of a city `own_vehicle_on_map`. Both say to others what
 they knew before a fix, and what the fix says about the common error: the *increment*.
 """
 
@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.fusion import transport_cloud
-from vnet.cmm.information import Information, gained
-from vnet.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel, common_step
+from vnet.cmm.information import Information
+from vnet.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel
 from vnet.cmm.map_matching import candidate_lanes
 from vnet.cmm.own_rbpf import OwnRbpf
-from vnet.cmm.rbpf import Observation, Rbpf, RbpfConfig
+from vnet.cmm.own_vehicle_on_map import OwnVehicleOnMap
+from vnet.cmm.rbpf import Observation, RbpfConfig
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -32,8 +32,6 @@ SAME_LANE_RAD = 0.02
 """Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""
 MAX_LANES = 8
 """Number of lanes that compete, the nearest."""
-MIN_VARIANCE_M2 = 1e-6
-"""Variance (m²) added to that of a cloud, so that it stays positive."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,10 @@ class OwnConfig:
 class OwnVehicle:
     """The filter of one vehicle on straight lanes.
 
-    prior: what was known of c before the latest fix.
+    prior: what was known of c before the latest fix. largest_increment: 0, since all vehicles say alike much.
     """
+
+    largest_increment = 0.0
 
     def __init__(self, config: OwnConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
         self._lanes = lanes
@@ -154,66 +154,10 @@ class OwnVehicle:
         return expected_m - across_m[kept, None] * normal[kept], heading_rad[kept]
 
 
-class OwnVehicleOnMap:
-    """The filter of one vehicle on the map of a city; as `OwnVehicle`, the increment by moments."""
-
-    _NAME = "self"
-
-    def __init__(self, config: OwnConfig, roads: RoadMap, rng: np.random.Generator) -> None:
-        self._config = config.rbpf
-        self._rng = rng
-        self._filter = Rbpf(config.rbpf, roads, rng)
-        self.prior = self._belief()
-
-    def _belief(self) -> Information:
-        return Information.of(self.estimate_m, self.estimate_covariance_m2)
-
-    @property
-    def estimate_m(self) -> Array:
-        """Estimate (2,) of the common error."""
-        return self._filter.estimate_m
-
-    @property
-    def estimate_covariance_m2(self) -> Array:
-        """Covariance (2, 2) of the common error."""
-        return self._filter.estimate_covariance_m2 + MIN_VARIANCE_M2 * np.eye(2)
-
-    @property
-    def belief(self) -> tuple[Array, Array]:
-        """Estimate (2,) of the common error, and its covariance (2, 2)."""
-        return self.estimate_m, self.estimate_covariance_m2
-
-    def position_m(self) -> tuple[Array, Array] | None:
-        """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
-        return self._filter.position_m(self._NAME) if self._NAME in self._filter.vehicles else None
-
-    def sample(self, count: int) -> Array:
-        """Draw `count` equally likely hypotheses (count, 2) of the common error."""
-        return self._filter.sample(count)
-
-    def step(self, dt_s: float, fix: Observation | None) -> Information:
-        """Advance by `dt_s` and take the vehicle's own fix; returns the increment."""
-        keep, variance_m2 = common_step(
-            self._config.common_sigma_m, self._config.common_tau_s, self._config.common_walk_m, dt_s
-        )
-        covariance_m2 = keep**2 * self.estimate_covariance_m2 + variance_m2 * np.eye(2)
-        self.prior = Information.of(keep * self.estimate_m, covariance_m2)
-        self._filter.step(dt_s, {} if fix is None else {self._NAME: fix})
-        return gained(self.prior, self._belief())
-
-    def absorb(self, pooled: Information) -> None:
-        """Replace what is known of c by `pooled`."""
-        transport_cloud(self._filter, pooled)
-
-    def restart(self, belief: Information) -> None:
-        """Move the cloud to this belief about c."""
-        transport_cloud(self._filter, belief)
-
-
 def own_vehicle(
     config: OwnConfig, lanes: LaneMap | RoadMap, rng: np.random.Generator
 ) -> OwnVehicle | OwnVehicleOnMap:
     """Return the filter of a vehicle on a map of this kind."""
     if isinstance(lanes, RoadMap):
-        return OwnVehicleOnMap(config, lanes, rng)
+        return OwnVehicleOnMap(config.rbpf, lanes, rng)
     return OwnVehicle(config, lanes, rng)

@@ -6,7 +6,7 @@ A map does not tell where vehicles are. Programs get the part of it around the s
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -44,6 +44,8 @@ _COLUMNS = {
     "lane": "<i4",
 }
 """Number format of each column in a message."""
+_DEVIATIONS = ("sigma_m", "datum_sigma_m")
+"""Numbers of a whole map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class RoadMap:
     `half_width_m` (S,) is the largest distance of a vehicle's centre from the lane's centre line. `kind` (S,) is
     the road's class, an index into `classes`; `one_way` (S,) is true if the road has no lane the other way; `road`
     and `lane` (S,) number roads and lanes, each lane of a road by a number of its own. `sigma_m` is the standard
-    deviation of true lanes from the map's.
+    deviation of true lanes from the map's, and `datum_sigma_m` that of a shift of the whole map, in each axis.
     """
 
     point_m: Array
@@ -67,6 +69,7 @@ class RoadMap:
     lane: NDArray[np.int32]
     classes: tuple[str, ...]
     sigma_m: float = 0.0
+    datum_sigma_m: float = 0.0
 
     def __len__(self) -> int:
         return len(self.heading_rad)
@@ -136,30 +139,32 @@ class RoadMap:
         end_m = self.point_m + self.length_m[:, None] * self.direction
         kept = touch_box(self.point_m, end_m, low_m, high_m)
         columns: dict[str, Any] = {name: getattr(self, name)[kept] for name in _COLUMNS}
-        return RoadMap(**columns, classes=self.classes, sigma_m=self.sigma_m)
+        return replace(self, **columns)
 
     # Messages.
 
     def to_wire(self) -> dict[str, Any]:
         """Return a plain form for a message; `from_wire` restores it bit by bit."""
         columns = {name: getattr(self, name).astype(kind).tobytes() for name, kind in _COLUMNS.items()}
-        return {"tag": TAG, "classes": list(self.classes), "sigma_m": self.sigma_m, **columns}
+        deviations = {name: getattr(self, name) for name in _DEVIATIONS}
+        return {"tag": TAG, "classes": list(self.classes), **deviations, **columns}
 
     @classmethod
     def from_wire(cls, data: object) -> RoadMap:
         """Restore a map from `to_wire`; its arrays cannot be written to. Raises ValueError on anything else."""
         if not isinstance(data, dict) or data.keys() != {"tag", *(field.name for field in fields(cls))}:
             raise ValueError("no road map")
-        classes, sigma_m = data["classes"], data["sigma_m"]
+        classes = data["classes"]
         if data["tag"] != TAG or not isinstance(classes, list) or len(classes) > MAX_CLASSES:
             raise ValueError("a road map without its tag or classes")
         if not all(isinstance(name, str) and len(name) <= MAX_CLASS_LENGTH for name in classes):
             raise ValueError("a road map's classes are no names")
-        if type(sigma_m) is not float or not 0 <= sigma_m < np.inf:
-            raise ValueError(f"sigma_m = {sigma_m!r:.50}: a positive number is needed")
+        for name in _DEVIATIONS:
+            if type(data[name]) is not float or not 0 <= data[name] < np.inf:
+                raise ValueError(f"{name} = {data[name]!r:.50}: a positive number is needed")
         columns: dict[str, Any] = {name: _column(name, data[name]) for name in _COLUMNS}
         columns["point_m"] = columns["point_m"].reshape(-1, 2)
-        roads = cls(**columns, classes=tuple(classes), sigma_m=sigma_m)
+        roads = cls(**columns, classes=tuple(classes), **{name: data[name] for name in _DEVIATIONS})
         roads._check()
         return roads
 

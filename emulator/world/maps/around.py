@@ -29,8 +29,13 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
     low_m, high_m = position_m.min(axis=0) - section.margin_m, position_m.max(axis=0) + section.margin_m
     part = roads.within(low_m, high_m)
     lanes = part.lane_map(section.drive_on, section.sigma_m) if len(part) else None
-    if lanes is not None and section.aside_m:
-        lanes = replace(lanes, point_m=lanes.point_m + section.aside_m * lanes.normal)
+    if lanes is not None:
+        point_m = lanes.point_m
+        if section.aside_m:
+            point_m = point_m + section.aside_m * lanes.normal
+        if any(section.datum_m):
+            point_m = point_m + np.array(section.datum_m)
+        lanes = replace(lanes, point_m=point_m, datum_sigma_m=section.datum_sigma_m)
     if lanes is None or _far_share(lanes, position_m) > 0.5:
         (x, y), (left, low), (right, high) = np.median(position_m, axis=0), *_extent(roads)
         raise ScenarioError(

@@ -66,6 +66,23 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     return replace(motion, origin_deg=samples.origin_deg, notes=notes)
 
 
+def whole_motion(path: Path, origin_deg: tuple[float, float] | None, rate_hz: float, rules: Rules) -> Motion:
+    """Return all trips of a file, from the first sample to the last.
+
+    Raise ScenarioError, naming the file and the line or row, for a bad file.
+    """
+    samples = _read(path, None)
+    trips = samples.trips(origin_deg)
+    start_s = min(float(trip.time_s[0]) for trip in trips)
+    seconds = max(float(trip.time_s[-1]) for trip in trips) - start_s
+    selection = Selection(start_s, round(seconds * rate_hz) + 1, round(NS_PER_S / rate_hz))
+    try:
+        motion = motion_of(trips, selection, rules)
+    except ScenarioError as error:
+        raise ScenarioError(f"{path}: {error}") from None
+    return replace(motion, origin_deg=samples.origin_deg)
+
+
 def drive_through_city(
     network: Network, section: Map | None, periods: int, period_ns: int
 ) -> tuple[Motion, RoadMap]:

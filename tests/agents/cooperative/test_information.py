@@ -264,6 +264,19 @@ def test_a_frame_that_is_sent_again_by_another_is_rejected() -> None:
     assert estimator.rejected == {"replayed": 1}
 
 
+def test_vehicles_that_say_nothing_of_c_are_not_taken_for_one() -> None:
+    """The increments of all outliers are 0, and those of vehicles off the road nearly."""
+    network = Network(3)
+    network.run(20)
+    fixes = [network.fix(k) for k in range(3)]
+    far = [replace(fix, position_m=fix.position_m + 500.0) for fix in fixes]
+    payloads = [estimator.frame(fix, 1400) for estimator, fix in zip(network.estimators, far, strict=True)]
+    assert not np.any([decode(payload).increment for payload in payloads])
+    packets = [Packet(f"v{k}", 0, 0, payloads[k]) for k in (1, 2)]
+    network.estimators[0].read(packets, network.period * PERIOD_NS)
+    assert not network.estimators[0].rejected
+
+
 def test_a_receiver_that_fails_sends_and_counts_nothing() -> None:
     network = Network(3)
     network.run(20)

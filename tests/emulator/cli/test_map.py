@@ -1,5 +1,6 @@
 """`vnet map`: what it says of a map, its picture, and what it writes."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,40 @@ def test_what_cannot_be_is_said(
 def test_a_file_that_cannot_be_written_is_known_before_the_map_is_read(tmp_path: Path) -> None:
     status, text = vnet_map("convert", tmp_path / "none.npz", tmp_path / "town.shp")
     assert status == 2 and "town.shp: unknown map format; allowed are *.geojson" in text
+
+
+@pytest.fixture
+def driven(tmp_path: Path) -> tuple[Path, Path]:
+    """A city, and trips through it."""
+    city, trips = tmp_path / "city.npz", tmp_path / "trips.csv"
+    assert vnet_map("city", city, "--size-m", "4000")[0] == 0
+    assert vnet_map("trips", city, trips, "--vehicles", "12", "--duration", "90", "--rate-hz", "5")[0] == 0
+    return city, trips
+
+
+@pytest.mark.slow
+def test_datum_says_keys_for_the_map_and_keeps_trips_to_evaluate_with(driven: tuple[Path, Path]) -> None:
+    rest = driven[0].with_name("rest.csv")
+    status, text = vnet_map("datum", *driven, "--others", rest)
+    assert status == 0, text
+    keys = tomllib.loads(text.split("# the other")[0])
+    assert np.abs(keys["datum_m"]).max() < 0.5 and 0 < keys["datum_sigma_m"] < 0.5
+    assert abs(keys["aside_m"]) < 0.5 and 0 < keys["sigma_m"] < 1.5
+    first, second = (
+        {line.split(",")[0] for line in path.read_text().splitlines()[1:]} for path in (driven[1], rest)
+    )
+    assert len(second) == 6 and second < first
+
+
+@pytest.mark.slow
+def test_datum_without_enough_trips_is_refused(driven: tuple[Path, Path]) -> None:
+    lines = driven[1].read_text().splitlines()
+    only = driven[1].with_name("one.csv")
+    only.write_text("\n".join([lines[0], *(line for line in lines if line.startswith(lines[1].split(",")[0]))]))
+    status, text = vnet_map("datum", driven[0], only)
+    assert status == 2 and "at least 10 are needed" in text and text.count("\n") <= 3
+    assert "none.csv: cannot be read: No such file" in vnet_map("datum", driven[0], "none.csv")[1]
+    assert "*.csv or *.parquet" in vnet_map("datum", *driven, "--others", "rest.txt")[1]
 
 
 def test_problems_of_a_map_are_found() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from vnet.roads.road_map import HEADING_TOLERANCE_RAD, INDEX_STEP_M, RoadMap, touch_box
 
-COLUMNS = [field.name for field in fields(RoadMap) if field.name not in ("classes", "sigma_m")]
+COLUMNS = [field.name for field in fields(RoadMap) if field.name not in ("classes", "sigma_m", "datum_sigma_m")]
 
 
 def road_map(point_m: Any, heading_rad: Any, length_m: Any, sigma_m: float = 0.0) -> RoadMap:
@@ -186,6 +186,7 @@ WRONG = {
     "a class with a long name": changed(classes=["a" * 65, "b"]),
     "a deviation that is text": changed(sigma_m="1"),
     "a negative deviation": changed(sigma_m=-1.0),
+    "a negative deviation of the datum": changed(datum_sigma_m=-1.0),
     "a deviation that is no number": changed(sigma_m=float("nan")),
 }
 
@@ -202,7 +203,7 @@ def test_what_is_no_map_is_refused(name: str) -> None:
         lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from([*COLUMNS, "tag"]), inner),
         max_leaves=10,
     ),
-    st.sampled_from(["tag", "classes", "sigma_m", *COLUMNS]),
+    st.sampled_from(["tag", "classes", "sigma_m", "datum_sigma_m", *COLUMNS]),
 )
 def test_whatever_stands_in_a_message_is_a_map_or_refused(value: object, name: str) -> None:
     for data in (value, changed(**{name: value})):

@@ -76,6 +76,33 @@ def test_lanes_may_lie_aside(tmp_path: Path) -> None:
     assert moved == pytest.approx(1.5)
 
 
+def test_a_map_may_be_shifted(tmp_path: Path) -> None:
+    plain, shifted = (build_world(driving(tmp_path, datum_m=metres)).lane_map for metres in ([0, 0], [-0.6, 0.4]))
+    assert isinstance(plain, RoadMap) and isinstance(shifted, RoadMap)
+    assert shifted.point_m - plain.point_m == pytest.approx(np.tile([-0.6, 0.4], (len(plain), 1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exchange", ["information", "estimates"])
+def test_what_the_map_may_be_shifted_by_is_stated_and_not_exchanged(tmp_path: Path, exchange: str) -> None:
+    """The same packets and estimates, with larger covariances."""
+    anees, traces, errors = [], [], []
+    for sigma_m in (0.0, 2.0):
+        scenario = driving(tmp_path, seconds=4.0, sigma_m=1.0, datum_sigma_m=sigma_m)
+        options = {"exchange": exchange, "particles": 100}
+        scenario = scenario.model_copy(update={"program": scenario.program.model_copy(update={"options": options})})
+        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / f"{sigma_m}", scenario))
+        simulate(emulation)
+        last = emulation.metrics.rows[-1]
+        anees.append((last.common_error_anees, last.position_anees))
+        errors.append((last.common_error_rmse_m, last.position_rmse_m))
+        traces.append(emulation.engine.trace.to_table())
+    assert errors[0] == errors[1]
+    assert traces[0] == traces[1]
+    for without, with_shift in zip(*anees, strict=True):
+        assert without is not None and with_shift is not None and with_shift < 0.8 * without
+
+
 @pytest.mark.slow
 def test_vehicles_that_know_the_map_find_the_error_that_they_share(tmp_path: Path) -> None:
     """And without it they cannot."""

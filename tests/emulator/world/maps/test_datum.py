@@ -1,0 +1,49 @@
+"""Calibration of a map against trips: a shift that is known is found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from emulator.world.maps.city import city_roads
+from emulator.world.maps.datum import calibrate, moved, residuals
+from emulator.world.trips.generate import RIGHT, generate_motion
+from emulator.world.trips.motion import Motion
+from vnet.errors import ScenarioError
+from vnet.roads.road_map import RoadMap
+
+NS = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[RoadMap, Motion]:
+    roads = city_roads(1, 2000)
+    return roads.lane_map(), generate_motion("city", roads, 20, 1, 121, NS, RIGHT)
+
+
+@pytest.mark.slow
+def test_a_shift_is_found_and_how_sure_it_is(drive: tuple[RoadMap, Motion]) -> None:
+    lanes, motion = drive
+    found = calibrate(residuals(moved(lanes, (1.2, -0.7)), motion))
+    assert found.datum_m == pytest.approx([-1.2, 0.7], abs=0.25)
+    assert (np.abs(found.datum_m - [-1.2, 0.7]) < 4 * found.error_m + 0.05).all()
+    again = calibrate(residuals(moved(moved(lanes, (1.2, -0.7)), found.datum_m), motion))
+    assert np.abs(again.datum_m).max() < 0.15, "moved by it, nothing is left"
+
+
+@pytest.mark.slow
+def test_a_third_of_the_vehicles_on_roads_of_their_own_do_not_count(drive: tuple[RoadMap, Motion]) -> None:
+    lanes, motion = drive
+    position_m = motion.position_m.copy()
+    position_m[:, ::3] += 12.0
+    wrong = Motion(motion.node_ids, position_m, motion.heading_rad)
+    found = calibrate(residuals(moved(lanes, (1.2, -0.7)), wrong))
+    assert found.datum_m == pytest.approx([-1.2, 0.7], abs=0.6)
+
+
+@pytest.mark.slow
+def test_too_few_places_are_refused(drive: tuple[RoadMap, Motion]) -> None:
+    lanes, motion = drive
+    found = residuals(lanes, motion)
+    with pytest.raises(ScenarioError, match="squares of 500 m: at least 10 are needed"):
+        calibrate(found.of(np.arange(20) == 3))
