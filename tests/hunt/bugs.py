@@ -143,6 +143,7 @@ BUGS = (
         judged_by="own:one_token",
         needs_order=True,
         vehicles=4,
+        duration_s=3.0,
     ),
     Bug(
         name="endless_reckoning",

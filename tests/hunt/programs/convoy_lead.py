@@ -1,7 +1,8 @@
 """A convoy is led by the vehicle with the lowest id that is heard: it answers the others' reports with orders.
 
 v01 joins late and takes the lead from v02. The bug: the function that waits for a report with a time limit returns
-the report although the task has been cancelled, if both happen at one instant. So v02 goes on giving orders, beside v01.
+the report although the task has been cancelled, if both happen at one instant. So v02 goes on giving orders, beside
+v01.
 """
 
 from __future__ import annotations
