@@ -78,6 +78,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Time between two fusions."""
     particles: Annotated[int, Meta(ge=1, le=100_000)] = 200
     """Number of hypotheses of the common error that a vehicle keeps."""
+    least_particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    """With `exchange = "information"` on straight lanes: their number goes down to it as their spread does, by KLD
+    sampling (Fox 2003), `particles` being the largest; 0 keeps `particles` always."""
     common_sigma_m: Deviation = 3.0
     """Standard deviation of the common error, as the vehicle assumes it."""
     common_tau_s: Positive = 600.0
@@ -125,7 +128,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
     def own_config(self) -> OwnConfig:
         """Return the constants of the filter of a vehicle that exchanges information."""
-        return OwnConfig(self.filter_config(), self.lateral_sigma_m)
+        return OwnConfig(self.filter_config(), self.lateral_sigma_m, self.least_particles)
 
     def filter_config(self) -> RbpfConfig:
         """Return the constants of the vehicle's particle filter."""

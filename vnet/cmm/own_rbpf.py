@@ -18,12 +18,15 @@ from vnet.cmm.affine_cloud import AffineCloud
 from vnet.cmm.common_error import systematic
 from vnet.cmm.information import Information, inverse, square_root, transport
 from vnet.cmm.kalman_bound import LaneModel, lane_axes
+from vnet.cmm.sample_size import sample_size
 from vnet.types import Array
 
 DECIDED = 1e-4
 """Probability below which a lane is out of question."""
 COMPETING_FACTOR = 4
 """So many times the particles as long as lanes compete."""
+SIZE_STEP = 1.5
+"""Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
 _IDENTITY = np.eye(2)
 _NOWHERE = np.zeros(5)
 
@@ -42,17 +45,22 @@ class OwnRbpf:
         particles: int,
         rng: np.random.Generator,
         belief: tuple[Array, Array] | None = None,
+        least_particles: int = 0,
     ) -> None:
-        """Draw the first particles from `belief`, mean (2,) and covariance (2, 2), by default the model's of c."""
+        """Draw the first particles from `belief`, mean (2,) and covariance (2, 2), by default the model's of c.
+
+        With `least_particles` their number goes down to that as their spread does.
+        """
         point_m, heading_rad = lanes
-        self._particles = particles
+        self._particles, self._least = particles, least_particles or particles
         self._rng = rng
         self._model = model
         self._point_m = np.array(point_m, dtype=float)
         self._axes = lane_axes(np.asarray(heading_rad))
         self._dt_s = np.nan
         mean_m, covariance_m2 = belief or (np.zeros(2), model.common_sigma_m**2 * np.eye(2))
-        lanes_count, count = len(self._axes), self._wanted
+        lanes_count = len(self._axes)
+        count = self._most
         # Row 0 and 1 are c, then three rows a lane.
         cloud = np.zeros((2 + 3 * lanes_count, count))
         cloud[:2] = mean_m[:, None] + square_root(covariance_m2) @ rng.standard_normal((2, count))
@@ -84,9 +92,19 @@ class OwnRbpf:
         return self._cloud[2:].reshape(len(self._axes), 3, -1)
 
     @property
-    def _wanted(self) -> int:
+    def _most(self) -> int:
         """Number of particles: more as long as lanes compete, because then they are weighed and not moved."""
         return self._particles if len(self._axes) == 1 else COMPETING_FACTOR * self._particles
+
+    @property
+    def _wanted(self) -> int:
+        """Number of particles to go on with: for the spread, unless that is near the present one."""
+        most, count = self._most, len(self.weight)
+        if self._least >= self._particles:
+            return most
+        wanted = sample_size(self.estimate_covariance_m2, self._least, most)
+        is_near = count / SIZE_STEP < wanted < count * SIZE_STEP
+        return count if is_near and count <= most else wanted
 
     # The belief.
 

@@ -36,10 +36,14 @@ MAX_LANES = 8
 
 @dataclass(frozen=True)
 class OwnConfig:
-    """Constants of a vehicle's filter: `rbpf` those of the filter on a map, `lateral_sigma_m` 0 for the map's."""
+    """Constants of a vehicle's filter: `rbpf` those of the filter on a map, `lateral_sigma_m` 0 for the map's.
+
+    least_particles: number to which particles go down as their spread does; 0 for as many always.
+    """
 
     rbpf: RbpfConfig
     lateral_sigma_m: float = 0.0
+    least_particles: int = 0
 
 
 class OwnVehicle:
@@ -53,7 +57,7 @@ class OwnVehicle:
     def __init__(self, config: OwnConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
         self._lanes = lanes
         self._rng = rng
-        self._particles = config.rbpf.particles
+        self._particles, self._least = config.rbpf.particles, config.least_particles
         self._model = LaneModel(
             common_sigma_m=config.rbpf.common_sigma_m,
             common_tau_s=config.rbpf.common_tau_s,
@@ -67,7 +71,7 @@ class OwnVehicle:
         unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M)
         nowhere = np.zeros((1, 2)), np.zeros(1)
         self._unknown = unknown
-        self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start)
+        self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start, self._least)
         self._is_placed = False
         self._outliers_s = 0.0
         self.prior = self._filter.belief
@@ -122,7 +126,12 @@ class OwnVehicle:
     def restart(self, belief: Information) -> None:
         """Begin again with this belief about c, and seek the lane again."""
         self._filter = OwnRbpf(
-            (np.zeros((1, 2)), np.zeros(1)), self._unknown, self._particles, self._rng, belief.moments()
+            (np.zeros((1, 2)), np.zeros(1)),
+            self._unknown,
+            self._particles,
+            self._rng,
+            belief.moments(),
+            self._least,
         )
         self._is_placed = False
 
@@ -135,10 +144,10 @@ class OwnVehicle:
         self._is_placed = True
         if len(lanes):
             found = self._different(lanes, expected_m)
-            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief)
+            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief, self._least)
         else:
             nowhere = expected_m[None], np.zeros(1)
-            self._filter = OwnRbpf(nowhere, self._unknown, self._particles, self._rng, belief)
+            self._filter = OwnRbpf(nowhere, self._unknown, self._particles, self._rng, belief, self._least)
 
     def _different(self, lanes: NDArray[np.intp], expected_m: Array) -> tuple[Array, Array]:
         """Return point and direction of those lanes that differ, the nearest first: a map may have a lane often."""
