@@ -121,6 +121,7 @@ class Attachment:
                 ready=ready,
                 failure=failure,
                 version=wire.VERSION,
+                ahead=True,
             )
             publisher.put(wire.encode(hello))
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
+from vnet.runtime.ahead import RunAhead
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Programs, load_programs
@@ -77,10 +78,7 @@ def _run_lockstep(
     """Run the programs on a virtual-time loop until the emulator ends the run."""
     seq = 0
 
-    def exchange(next_timer_ns: int | None) -> int:
-        next_ns = host.next_instant(next_timer_ns)
-        if next_ns is not None:
-            return next_ns
+    def swap(next_timer_ns: int | None) -> int:
         message = host.make_yield(attachment.nonce, seq, next_timer_ns)
         attachment.say(message)
         for step in message.steps:
@@ -94,10 +92,12 @@ def _run_lockstep(
             message = attachment.next_message()
         seq = message.seq
         host.apply_clock_error(message.clocks, loop)
-        return host.open_window(message)
+        return ahead.open_window(message)
 
-    loop = VirtualTimeLoop(exchange, welcomes[0].spin_limit)
-    host = Host(welcomes, lambda: loop.now_ns, on_line=write_line, disks=disks, debugger=debugger)
+    loop = VirtualTimeLoop(lambda next_timer_ns: ahead.exchange(next_timer_ns), welcomes[0].spin_limit)
+    host = Host(welcomes, lambda: loop.now_ns, lambda: ahead.catch_up(), write_line, disks, debugger)
+    ahead = RunAhead(host, lambda: loop.now_ns, swap)
+    loop.before_job = ahead.catch_up
     attachment.time_ns = lambda: loop.now_ns
     asyncio.set_event_loop(loop)
     try:
@@ -112,6 +112,7 @@ def _run_lockstep(
             except SystemExit as leave:
                 host.end_exited(leave)
     except RunOverError:
+        ahead.close()
         host.close(loop)
         attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:

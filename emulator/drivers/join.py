@@ -33,6 +33,8 @@ class Membership:
         self._alone = alone
         self._members = {node: _Member(node, None, 0, "") for node in self.later}
         self.closed = False
+        self.ahead: set[str] = set()
+        """Processes that pass through quiet instants beyond their windows."""
 
     def hello(self, key_node: str, hello: wire.Hello) -> str | None:
         """Take a hello that came on the key of `key_node`; returns why it is refused, or None."""
@@ -50,6 +52,7 @@ class Membership:
             if first is not None and first.nonce not in (None, hello.nonce):
                 return f"{hello.process_id} belongs to another process"
             member = self._members[hello.node] = _Member(hello.process_id, hello.nonce, hello.pid, hello.host)
+            (self.ahead.add if hello.ahead else self.ahead.discard)(hello.process_id)
         member.ready = member.ready or hello.ready
         return None
 

@@ -8,17 +8,19 @@ No frame arrives sooner than L, `least_latency_ns`, after it was sent. So what a
 sent before T, the next instant at which anything happens: each process may pass through the window by itself.
 Arrivals are *shown* to processes before the window, and *decided* after it, in the order of time with what the
 processes did: a program that ends within the window does not receive what arrives later. A window ends with the
-period at the latest, and before faults and the horizon.
+period at the latest, and before faults and the horizon. A process that runs `ahead` may go on by itself where
+nobody could notice, and has the fixes of the next period for that (`vnet/runtime/ahead.py`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import ProtocolError, check_ownership
@@ -115,6 +117,10 @@ class Lockstep:
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
         self._end_ns = 0
+        self._quiet_ns = 0
+        """Instant before which processes that run ahead may pass through quiet instants."""
+        self.ahead: Collection[str] = ()
+        """Processes that run ahead."""
         radio = emulation.scenario.radio
         self._lookahead_ns = least_latency_ns(radio) if emulation.scenario.run.windows else 1
         self.owed: dict[str, int] = {}
@@ -130,7 +136,8 @@ class Lockstep:
     def decided_ns(self) -> int:
         """Emulated time up to which nothing can be changed any more: new faults act after it."""
         passed_ns = self.horizon_ns - 1 if self.held and self.horizon_ns is not None else 0
-        return max(self.now_ns, self._end_ns - 1, passed_ns)
+        quiet_ns = self._quiet_ns if self.ahead else 0
+        return max(self.now_ns, self._end_ns - 1, quiet_ns - 1, passed_ns)
 
     def start(self) -> dict[str, wire.Grant]:
         """The first grants, to all, at time 0."""
@@ -167,7 +174,7 @@ class Lockstep:
     def died(self, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from the beginning of the window on, and nothing is owed by it.
 
-        What it did within the window is lost with it.
+        What it did within the window is lost with it; at quiet instants since it has told nothing.
         """
         process = self._processes.get(process_id)
         if process is None:  # a fault was faster
@@ -246,6 +253,7 @@ class Lockstep:
         ends_ns = [time_ns + self._lookahead_ns, (time_ns // period_ns + 1) * period_ns, emulation.duration_ns]
         ends_ns += [end_ns for end_ns in (emulation.next_change_ns(), self.horizon_ns) if end_ns is not None]
         self.now_ns, self._end_ns = time_ns, min(ends_ns)
+        self._quiet_ns = min([(time_ns // period_ns + 2) * period_ns, *ends_ns[2:]])
         self._show(self._end_ns - 1)
         emulation.close_periods(time_ns)
 
@@ -384,6 +392,8 @@ class Lockstep:
         fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
         grant = wire.Grant(process.seq, time_ns, self._end_ns, packets, fixes, clocks)
+        if process.id in self.ahead and self._lookahead_ns > 1 and not process.paused:
+            grant = self._quiet_grant(process, grant)
         self.owed[process.id] = process.seq
         process.seq += 1
         return grant
@@ -393,9 +403,24 @@ class Lockstep:
         world = self._emulation.world
         last = self.now_ns // world.period_ns
         first = max(process.next_fix[node], last - INBOX_LIMIT + 1)
-        process.next_fix[node] = last + 1
+        process.next_fix[node] = max(process.next_fix[node], last + 1)
+        return self._fixes(node, range(first, last + 1))
+
+    def _fixes(self, node: str, periods: Iterable[int]) -> list[wire.WireFix]:
+        """Return the fixes of these periods; none if the node is down."""
         if not self._emulation.up[node]:
             return []
         number = self._emulation.number[node]
-        fixes = [self._emulation.gnss.fix(period, number) for period in range(first, last + 1)]
+        fixes = [self._emulation.gnss.fix(period, number) for period in periods]
         return [wire.WireFix.of(node, fix) for fix in fixes if fix is not None]
+
+    def _quiet_grant(self, process: _Process, grant: wire.Grant) -> wire.Grant:
+        """Return the grant with the bound of quiet instants, and the fixes of the next period if it lies before."""
+        period = self.now_ns // self._emulation.world.period_ns + 1
+        due_ns = period * self._emulation.world.period_ns
+        nodes = [node for node in process.nodes if process.next_fix[node] == period]
+        if due_ns >= self._quiet_ns or not nodes:
+            return replace(grant, quiet_ns=self._quiet_ns)
+        process.next_fix.update(dict.fromkeys(nodes, period + 1))
+        fixes = [fix for node in nodes for fix in self._fixes(node, [period])]
+        return replace(grant, quiet_ns=self._quiet_ns, next_fixes=fixes, next_fixes_ns=due_ns)

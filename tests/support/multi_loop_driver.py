@@ -21,6 +21,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
+from vnet.runtime.ahead import RunAhead
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
 from vnet.runtime.programs import load_programs
@@ -75,6 +76,7 @@ def run_apart(scenario: Scenario) -> Emulation:
         nodes[0]: nodes for nodes in split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
     }
     lockstep = Lockstep(emulation, list(groups.values()))
+    lockstep.ahead = () if emulation.orders.explores else set(groups)
     processes = {
         process_id: _Process(emulation, nodes) for process_id, nodes in groups.items() if emulation.up[process_id]
     }
@@ -147,18 +149,19 @@ class _Process:
         assert isinstance(grant, wire.Grant)
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self._loop)
-        return self._host.open_window(grant)
+        return self._ahead.open_window(grant)
 
-    def _exchange(self, next_timer_ns: int | None) -> int:
-        next_ns = self._host.next_instant(next_timer_ns)
-        if next_ns is not None:
-            return next_ns
+    def _swap(self, next_timer_ns: int | None) -> int:
         self.yields.put(wire.encode(self._host.make_yield(b"n", self._seq, next_timer_ns)))
         return self._next_grant()
 
     def _host_programs(self) -> None:
-        loop = self._loop = VirtualTimeLoop(self._exchange, self._welcomes[0].spin_limit)
-        self._host = Host(self._welcomes, lambda: loop.now_ns, disks=self._disks)
+        loop = self._loop = VirtualTimeLoop(
+            lambda timer_ns: self._ahead.exchange(timer_ns), self._welcomes[0].spin_limit
+        )
+        self._host = Host(self._welcomes, lambda: loop.now_ns, lambda: self._ahead.catch_up(), disks=self._disks)
+        self._ahead = RunAhead(self._host, lambda: loop.now_ns, self._swap)
+        loop.before_job = self._ahead.catch_up
         asyncio.set_event_loop(loop)
         try:
             self._host.order_events(loop)
@@ -172,6 +175,7 @@ class _Process:
                 except SystemExit as leave:
                     self._host.end_exited(leave)
         except Over:
+            self._ahead.close()
             self._host.close(loop)
             final = wire.decode_tx(wire.encode(wire.Final(b"n", self._host.take_final())))
             assert isinstance(final, wire.Final)

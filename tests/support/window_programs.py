@@ -110,3 +110,42 @@ async def tells_of_its_mail(node: Node) -> None:
     finally:
         newest_ns = [packet.received_ns for packet in node.radio.drain()]
         node.log(f"{len(newest_ns)} packets at {node.now_ns / NS_PER_S:.6f} s, up to {max(newest_ns, default=0)}")
+
+
+async def ticks(node: Node) -> None:
+    """Neither send nor look for packets, but for v01, which sends; when ended, tell of the packets by then."""
+    if node.id == "v01":
+        await tells_of_its_mail(node)
+    try:
+        while True:
+            await asyncio.sleep(0.013)
+    finally:
+        newest_ns = [packet.received_ns for packet in node.radio.drain()]
+        node.log(f"{len(newest_ns)} packets at {node.now_ns / NS_PER_S:.6f} s, up to {max(newest_ns, default=0)}")
+
+
+async def looks_once_a_period(node: Node) -> None:
+    """Sleep some times after each fix, then look for packets and send."""
+    diary = Diary(node)
+    async for fix in node.gnss:
+        for _ in range(3):
+            await asyncio.sleep(0.02)
+        diary.note([(packet.sender, packet.received_ns) for packet in node.radio.drain()])
+        await node.radio.broadcast(fix.position_m.tobytes())
+        node.report(fix.position_m, digest=diary.number)
+
+
+async def fails_unheard(node: Node) -> None:
+    """Neither send nor look for packets; callbacks and programs fail or end between fixes."""
+
+    def fails() -> None:
+        raise LookupError(f"{node.id} in a callback")
+
+    async for fix in node.gnss:
+        await asyncio.sleep(0.03)
+        asyncio.get_running_loop().call_later(0.005, fails)
+        await asyncio.sleep(0.03)
+        if fix.time_ns > 2 * NS_PER_S and node.id == "v01":
+            raise KeyError("the end of a program")
+        if fix.time_ns > 2 * NS_PER_S and node.id == "v02":
+            raise SystemExit(0)

@@ -46,8 +46,8 @@ MOST_LINES = 100_000
 class Host:
     """The nodes of one process and their programs; see the module's text.
 
-    `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic (real time
-    puts it at once; lockstep takes it at the next yield). `on_line` is called with a node and a line of its log.
+    `clock` gives emulated nanoseconds. `on_traffic`, if given, is called when there is new traffic: real time puts
+    it at once, lockstep has a quiet instant granted. `on_line` is called with a node and a line of its log.
     `disks` has the nodes' folders, by default temporary ones. `debugger` stops in the program of one of them.
     """
 
@@ -120,9 +120,8 @@ class Host:
         """Take a line of a log or an event of a program; the line is written at once."""
         self._notes.append(wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details))  # type: ignore[arg-type]
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
-        self._line(
-            node, level, f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
-        )
+        line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip()
+        self._line(node, level, line.replace("\n", "\n    "))
         self._on_traffic()
 
     def _line(self, node: str, level: str, text: str) -> None:
@@ -156,8 +155,7 @@ class Host:
     def _start(self, node: Node) -> None:
         context = contextvars.copy_context()
         context.run(current_node.set, node)
-        program = self._main(node, self._programs[node.id])
-        self._loop.create_task(program, name=f"{node.id} main", context=context)
+        self._loop.create_task(self._main(node, self._programs[node.id]), name=f"{node.id} main", context=context)
 
     def _chooser_of(self, node: Node) -> Chooser:
         order = self._orders[node.id]
@@ -228,6 +226,11 @@ class Host:
         if self._runs(node):
             self._deviations.append(deviation)
 
+    @property
+    def has_traffic(self) -> bool:
+        """True if nodes have enqueued anything since `take_traffic`."""
+        return bool(self._frames or self._reports or self._endings or self._notes or self._unhandled.has_any)
+
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
         unhandled = self._unhandled.take()
@@ -244,8 +247,7 @@ class Host:
     def open_window(self, grant: wire.Grant) -> int:
         """Take a grant; returns its first instant, with everything delivered that is due at it."""
         self._window.open(grant)
-        self._deliver_due(grant.time_ns)
-        self.mail.deliver((), grant.fixes, grant.time_ns)
+        self._deliver_due(grant.time_ns, grant.fixes)
         return grant.time_ns
 
     def next_instant(self, next_timer_ns: int | None) -> int | None:
@@ -264,15 +266,14 @@ class Host:
         self._deliver_due(next_ns)
         return next_ns
 
-    def _deliver_due(self, time_ns: int) -> None:
+    def _deliver_due(self, time_ns: int, fixes: Sequence[wire.WireFix] = ()) -> None:
         due = self._window.take_packets(time_ns, self._paused)
-        self.mail.deliver([packet for packet in due if self._active[packet.node]], (), time_ns)
+        self.mail.deliver([packet for packet in due if self._active[packet.node]], fixes, time_ns)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""
-        nodes = self.nodes.values()
-        radio = [node.id for node in nodes if node.radio.inbox.waiting]
-        gnss = [node.id for node in nodes if node.gnss.inbox.waiting]
+        radio = [node.id for node in self.nodes.values() if node.radio.inbox.waiting]
+        gnss = [node.id for node in self.nodes.values() if node.gnss.inbox.waiting]
         return wire.Yield(nonce, seq, next_timer_ns, radio, gnss, *self._window.take_steps())
 
     def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
@@ -282,9 +283,8 @@ class Host:
         self._active[node] = False
         self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
-        running = asyncio.current_task(self._loop)
         for task in self._tasks_of(self.nodes[node]):
-            if task is not running:
+            if task is not asyncio.current_task(self._loop):
                 task.cancel()
         self._on_traffic()
 

@@ -100,6 +100,11 @@ class UnhandledExceptions:
         """Take an exception that has just been caught outside asyncio."""
         self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
 
+    @property
+    def has_any(self) -> bool:
+        """True if `take` would return any."""
+        return bool(self._ready)
+
     def take(self) -> list[Unhandled]:
         """Return the exceptions that are told by now, in the order of their instants."""
         with self._lock:

@@ -136,6 +136,7 @@ class VirtualTimeLoop(SkewedLoop):
     """An event loop in virtual time; see the module's text.
 
     `spin_limit` is how many rounds of callbacks one instant may take before the loop raises `SpinError`.
+    `before_job` is called before a job is given to an executor, whose threads may look for packets.
     """
 
     def __init__(self, exchange: Exchange, spin_limit: int = 100_000) -> None:
@@ -149,6 +150,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._timers = count()
         self._meter: CpuMeter | None = None
         self._ordered: OrderedQueue | None = None
+        self.before_job: Callable[[], None] = nothing
         super().__init__(_YieldingSelector(self._wait))
         asyncio_internals.set_clock_resolution(self, 0.5 / NS_PER_S)  # no timer fires before its nanosecond
 
@@ -270,6 +272,7 @@ class VirtualTimeLoop(SkewedLoop):
         self, executor: Executor | None, func: Callable[..., Any], *args: Any
     ) -> asyncio.Future[Any]:
         """As asyncio's, but deterministic; jobs that never end keep the whole emulation waiting."""
+        self.before_job()
         if executor is None:
             executor, context = asyncio_internals.default_executor(self, "vnet"), Context()  # as above
         else:

@@ -143,7 +143,8 @@ class Hello(Message, frozen=True):
 
     `nonce` is a secret of the process; later messages contain it, so that no other process can impersonate the
     node. The message is sent again with `ready` after the welcome, once the program is loaded, or with the
-    `failure` to load it. An agent that knows no `version` speaks the first.
+    `failure` to load it. An agent that knows no `version` speaks the first. With `ahead` the process passes
+    through quiet instants beyond its windows.
     """
 
     node: str
@@ -154,6 +155,7 @@ class Hello(Message, frozen=True):
     ready: bool = False
     failure: str | None = None
     version: Count = 1
+    ahead: bool = False
 
 
 class Yield(Message, frozen=True):
@@ -257,6 +259,9 @@ class Grant(Message, frozen=True):
     `time_ns` is the first instant at which the process has something to do. `packets` are those that arrive before
     the end, each at its `received_ns`; `fixes` are due at the first instant. `clocks` are the clock errors that
     have changed.
+
+    Instants before `quiet_ns` may be passed beyond the window as long as they are quiet; `next_fixes`, at
+    `next_fixes_ns`, belong to such an instant. They are given only to processes that have said `ahead`.
     """
 
     seq: Count
@@ -265,6 +270,9 @@ class Grant(Message, frozen=True):
     packets: Sequence[WirePacket] = ()
     fixes: Sequence[WireFix] = ()
     clocks: Sequence[ClockError] = ()
+    quiet_ns: TimeNs = 0
+    next_fixes: Sequence[WireFix] = ()
+    next_fixes_ns: TimeNs | None = None
 
 
 class Batch(Message, frozen=True):

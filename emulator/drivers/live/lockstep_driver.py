@@ -40,6 +40,8 @@ class LockstepDriver(Driver):
     ) -> None:
         super().__init__(parts, processes)
         self._lockstep = Lockstep(parts.emulation, processes)
+        if not parts.emulation.orders.explores:  # where an order is tried, no instant is quiet
+            self._lockstep.ahead = parts.members.ahead
         self._before_horizon = before_horizon
         self._finals: dict[str, wire.Traffic] = {}
         self._reached_ns: dict[str, int] = {}

@@ -18,6 +18,7 @@ from emulator.testing.strategies import faults as schedules
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_together, scenario_of
 from tests.support.paths import ROOT
+from vnet.transport import wire
 
 pytestmark = pytest.mark.slow
 
@@ -171,9 +172,45 @@ def test_a_program_that_is_started_again_has_no_packets_of_the_one_before(
 def test_a_program_that_is_ended_has_the_packets_of_its_own_last_instant(
     run: Callable[[Scenario], Emulation],
 ) -> None:
-    restart = {"kind": "restart", "at_s": 1.001, "duration_s": 0.4, "nodes": {"ids": ["v02"]}}
+    restart = {"kind": "restart", "at_s": 1.005, "duration_s": 0.4, "nodes": {"ids": ["v02"]}}
     scenario = scenario_of([restart], "tests.support.window_programs:tells_of_its_mail", radio=STILL_AIR)
     assert same(fingerprint(run(scenario)), fingerprint(run(with_windows(scenario, False))))
+
+
+# Quiet instants beyond the window.
+
+
+@pytest.mark.parametrize("program", ["ticks", "looks_once_a_period", "fails_unheard"])
+def test_quiet_instants_change_nothing(program: str) -> None:
+    """Programs that are ended find what had come by their own last instant; fixes fail and clocks are wrong."""
+    faults = [
+        {"kind": "restart", "at_s": 1.005, "duration_s": 0.4, "nodes": {"ids": ["v02"]}},
+        {"kind": "kill", "at_s": 1.21, "duration_s": 0.5, "nodes": {"ids": ["v03"]}},
+        {"kind": "gnss_outage", "at_s": 0.7, "duration_s": 0.9, "nodes": {"ids": ["v04"]}},
+        {"kind": "skew", "at_s": 0.9, "duration_s": 0.6, "nodes": {"ids": ["v04"]}, "offset_ms": 30.0},
+    ]
+    scenario = scenario_of(faults, f"tests.support.window_programs:{program}")
+    apart = run_apart(scenario)
+    assert same(fingerprint(apart)[:3], fingerprint(simulated(scenario, False))[:3])
+    reference = run_apart(with_windows(scenario, False))
+    assert same(fingerprint(apart), fingerprint(reference))
+    assert apart.costs.wake_ups == reference.costs.wake_ups
+
+
+def test_a_program_that_looks_once_a_period_is_granted_once_a_period(monkeypatch: pytest.MonkeyPatch) -> None:
+    grants: list[int] = []
+    receive = Lockstep.receive
+
+    def counts(lockstep: Lockstep, process_id: str, message: wire.Yield) -> None:
+        grants.append(message.instants)
+        receive(lockstep, process_id, message)
+
+    monkeypatch.setattr(Lockstep, "receive", counts)
+    scenario = scenario_of([], "tests.support.window_programs:looks_once_a_period", vehicles=2)
+    emulation = run_apart(scenario)
+    periods = emulation.duration_ns // emulation.world.period_ns
+    assert len(grants) == 2 * (1 + periods), "one more when the run begins"
+    assert sum(grants) == 2 * 4 * periods, "a fix and three timers"
 
 
 # Stepped, with faults that are injected while the run is held.
