@@ -11,6 +11,8 @@ from rich.console import Console
 from emulator.cli.options import (
     ChecksOption,
     DurationOption,
+    OrderOption,
+    OrderOptions,
     Pacing,
     ProgramOption,
     ProgramOptionsOption,
@@ -54,6 +56,7 @@ def campaign(
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
+    order: OrderOption = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="For the campaign's files.")] = None,
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
@@ -78,7 +81,9 @@ def campaign(
     from emulator.testing.campaign_plan import Plan
 
     with one_line_errors(), result_only(True):
-        loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks)
+        loaded = load(
+            scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, OrderOptions(order)
+        )
         jobs = jobs or (RUNS_ON_DASK if executor else None)
         limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
         plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)

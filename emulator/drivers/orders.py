@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import random
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
-from emulator.records.tape import MediumOrder, TapeEntry, first_left, read_tape
+from emulator.records.tape import MediumOrder, TapeEntry, first_left, parse_tape, read_tape
 from emulator.scenario.scenario import Scenario
 from vnet.transport.orders import Deviation, Order
 
@@ -21,7 +22,7 @@ class Orders:
     def __init__(self, scenario: Scenario) -> None:
         run = scenario.run
         self._run = run
-        self.tape: Sequence[TapeEntry] = () if run.tape is None else read_tape(run.tape)
+        self.tape: Sequence[TapeEntry] = _tape_of(run.tape)
         self.explores = run.order != "fifo" or run.tape is not None
         """True if another order than FIFO is possible."""
         self._at_medium = {entry.time_ns: entry.medium for entry in self.tape if isinstance(entry, MediumOrder)}
@@ -77,6 +78,12 @@ class Orders:
     def left(self) -> TapeEntry | None:
         """Return the first entry of the given tape that the run could not follow."""
         return first_left(self.tape, self.made)
+
+
+def _tape_of(tape: Path | Sequence[str] | None) -> Sequence[TapeEntry]:
+    if tape is None:
+        return ()
+    return read_tape(tape) if isinstance(tape, Path) else parse_tape(tape, "run.tape")
 
 
 def _sort_key(entry: TapeEntry) -> tuple[int, str, int]:

@@ -53,7 +53,12 @@ def described(entry: TapeEntry) -> str:
 
 def dump_tape(entries: Iterable[TapeEntry]) -> str:
     """Return the text of a tape."""
-    return "".join(json.dumps(_plain(entry)) + "\n" for entry in entries)
+    return "".join(line + "\n" for line in tape_lines(entries))
+
+
+def tape_lines(entries: Iterable[TapeEntry]) -> list[str]:
+    """Return the lines of a tape."""
+    return [json.dumps(_plain(entry)) for entry in entries]
 
 
 def _plain(entry: TapeEntry) -> dict[str, object]:
@@ -66,13 +71,18 @@ def read_tape(path: Path) -> list[TapeEntry]:
         lines = path.read_text().splitlines()
     except (OSError, ValueError) as error:
         raise VnetError(f"{path}: cannot be read: {error}") from None
+    return parse_tape(lines, str(path))
+
+
+def parse_tape(lines: Iterable[str], name: str) -> list[TapeEntry]:
+    """Return the entries of the lines of a tape, which messages call `name`. Raises VnetError for a bad line."""
     entries = []
     for number, line in enumerate(lines, start=1):
         try:
             entries.append(_entry(line))
         except msgspec.MsgspecError as error:
             raise VnetError(
-                f"{path}: line {number}: {printable(str(error))}: a line of tape.jsonl is needed"
+                f"{name}: line {number}: {printable(str(error))}: a line of tape.jsonl is needed"
             ) from None
     return entries
 

@@ -66,9 +66,9 @@ class Run(Section):
     """`pct`: how many events, in the right order, show the bugs that are sought."""
     order_steps: int | None = Field(None, ge=1, le=MANY)
     """`pct`: decisions of a vehicle in a run; counted in a run in FIFO order if left out."""
-    tape: Path | None = None
+    tape: Path | tuple[str, ...] | None = None
     """Deviations from FIFO to follow, as far as they fit: the `tape.jsonl` of another run, relative to the scenario
-    file. With `order = "fifo"`."""
+    file, or a list of its lines. With `order = "fifo"`."""
     stall_timeout_s: float = Field(30.0, gt=0, le=DAY_S)
     """A process that makes no progress for so long (wall clock) ends the run as unknown; lockstep, live."""
     orphan_timeout_s: float = Field(5.0, gt=0, le=DAY_S)
@@ -400,7 +400,7 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     if roads is not None:
         roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})
     run = scenario.run
-    if run.tape is not None:
+    if isinstance(run.tape, Path):
         run = run.model_copy(update={"tape": _absolute(run.tape, "run.tape", scenario_path)})
     world = _world_of(scenario, scenario_path)
     return scenario.model_copy(

@@ -10,7 +10,8 @@ import json
 import shlex
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,8 +34,9 @@ from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.matrix import column_of, count_verdicts, page
-from emulator.testing.scenarios import make_scenario
+from emulator.testing.regression_test import TEST_FILE, regression_test
 from emulator.testing.shrinking import Schedule, shrink
+from emulator.testing.shrinking_runs import order_text, shrink_order, shrink_run, with_faults
 from emulator.testing.trial import Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError
@@ -75,6 +77,13 @@ class Outcome:
         """The smallest schedule found that still fails, as TOML."""
         return schedule_toml((self.shrunk or self.scenario).fault)
 
+    def order(self) -> str:
+        """The order of events of the smallest case, as a phrase; "" if it is FIFO."""
+        run = (self.shrunk or self.scenario).run
+        if run.order != "fifo":
+            return f"{run.order}, seed {run.order_seed}"
+        return "" if run.tape is None or isinstance(run.tape, Path) else order_text(run.tape)
+
     def texts(self) -> dict[str, str]:
         """Return the texts of the failed checks, of the shrunk run if there is one."""
         trial = self.again if self.again is not None and self.again.failed else self.trial
@@ -96,6 +105,7 @@ class Outcome:
             row |= {
                 "failed": self.texts(),
                 "shrunk": self.schedule(),
+                "order": self.order(),
                 "steps": self.steps,
                 "folder": str(self.folder),
             }
@@ -190,21 +200,32 @@ class Campaign:
     def _shrink(self, outcome: Outcome) -> Outcome:
         """Shrink a failure, and run the smallest once more where it is kept."""
         wanted = {column_of(name) for name in outcome.trial.failed}
+        until_s = time.monotonic() + self._plan.limit_s
 
-        def still_fails(schedule: Schedule) -> bool:
-            if self._workshop.closed:
+        def still_fails(smaller: Scenario) -> bool:
+            if self._workshop.closed or time.monotonic() > until_s:
                 return False
-            smaller = make_scenario(outcome.scenario, {"faults": schedule})
             return bool(wanted & {column_of(name) for name in self._workshop.run_anywhere(smaller).failed})
 
-        smallest, steps = shrink(outcome.scenario.fault, still_fails, self._plan.shrink_steps)
-        shrunk = make_scenario(outcome.scenario, {"faults": smallest})
+        shrunk, steps = self._smallest(outcome, still_fails) if self._plan.shrink_steps else (outcome.scenario, 0)
         folder = self._folder / "failures" / outcome.label
         again = self._workshop.run(shrunk, folder)
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
         (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
+        (folder / TEST_FILE).write_text(regression_test(folder.name, sorted(outcome.trial.failed)))
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
+
+    def _smallest(self, outcome: Outcome, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
+        """Return the least run found that still fails, and how many were tried: order, faults, vehicles, time."""
+        base, of_order = outcome.scenario, 0
+        if base.run.order != "fifo":
+            base, of_order = shrink_order(base, outcome.trial.tape, still_fails)
+        schedule, of_faults = shrink(
+            base.fault, lambda schedule: still_fails(with_faults(base, schedule)), self._plan.shrink_steps
+        )
+        shrunk, of_run = shrink_run(with_faults(base, schedule), still_fails)
+        return shrunk, of_order + of_faults + of_run
 
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""
@@ -232,6 +253,7 @@ class Campaign:
             "seed": outcome.seed,
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
+            "order": outcome.order(),
             "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
             "folder": f"failures/{outcome.folder.name}",
         }
@@ -249,7 +271,8 @@ class Campaign:
         for outcome in (outcome for outcome in self.failures if outcome.label in first):
             told = self._described(outcome)
             texts = "\n".join(f"{name}: {text}" for name, text in told["checks"].items())
-            table.add_row(told["number"], str(outcome.seed), Text(texts), Text(told["schedule"] or "none"))
+            least = "\n".join(filter(None, [told["schedule"] or "no faults", told["order"]]))
+            table.add_row(told["number"], str(outcome.seed), Text(texts), Text(least))
         yield table
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from emulator.checks.own import load_checks
+from emulator.drivers.order_length import with_order_steps
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
@@ -57,6 +58,7 @@ class Plan:
         search_programs_in(plain.program.folders)
         load_program(plain.program.entry)
         load_checks(plain.program)
+        plain = with_order_steps(plain)
         return cls(plain, runs, seed, kinds, note=note, **options)
 
     def draw(self, number: int) -> Scenario:
@@ -65,6 +67,8 @@ class Plan:
         changes: dict[str, Any] = {"seed": seed}
         if self.scenario.network.kind == "generated":
             changes["network.seed"] = seed
+        if self.scenario.run.order != "fifo":
+            changes["run.order_seed"] = seed
         scenario = make_scenario(self.scenario, changes)
         if not self.kinds:
             return scenario

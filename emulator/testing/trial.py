@@ -24,6 +24,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
+from emulator.records.tape import TapeEntry
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from vnet.errors import VnetError
@@ -47,6 +48,8 @@ class Trial:
     texts: dict[str, str]
     trace_sha256: str = ""
     wall_s: float = 0.0
+    tape: tuple[TapeEntry, ...] = ()
+    """Deviations from FIFO of a run that has failed."""
 
     @property
     def failed(self) -> list[str]:
@@ -76,7 +79,9 @@ def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     verdicts[GROWTH] = Verdict.INVALID if greatest > GREATEST else Verdict.VALID
     if greatest > GREATEST:
         texts[GROWTH] = f"a report holds {greatest:.3g}"
-    return Trial(verdicts, texts, judgement.trace_sha256, time.monotonic() - started)
+    failed = Verdict.INVALID in verdicts.values()
+    tape = tuple(emulation.orders.in_order()) if failed else ()
+    return Trial(verdicts, texts, judgement.trace_sha256, time.monotonic() - started, tape)
 
 
 def _greatest(emulation: Emulation) -> float:

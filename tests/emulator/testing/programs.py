@@ -44,3 +44,26 @@ async def growing(node: Node) -> None:
         await node.radio.broadcast(b"here")
         estimate_m *= 4
         node.report((estimate_m, 0.0), fix.covariance_m2)
+
+
+async def tells_before_it_measures(node: Node) -> None:
+    """Measure and tell with the same period, and rely on measuring first: true in FIFO order alone."""
+    measured = 0
+
+    async def measure() -> None:
+        nonlocal measured
+        while True:
+            await asyncio.sleep(0.1)
+            measured += 1
+
+    async def tell() -> None:
+        told = 0
+        while True:
+            await asyncio.sleep(0.1)
+            told += 1
+            assert measured >= told, "nothing new was measured"
+            await node.radio.broadcast(bytes([told]))
+
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(measure())
+        tasks.create_task(tell())

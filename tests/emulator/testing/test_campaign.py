@@ -259,6 +259,7 @@ def test_the_page_needs_nothing_else_and_escapes_what_programs_say() -> None:
         "seed": 3,
         "checks": {"finite": "<script>alert(1)</script>"},
         "schedule": '[[fault]]\nkind = "loss"',
+        "order": "FIFO, except <b>",
         "command": "vnet simulate 'a & b'",
         "folder": "failures/001",
     }

@@ -1,0 +1,74 @@
+"""Orders that fail are shrunk to their fewest deviations; a campaign keeps the least case as a test."""
+
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from emulator.records.tape import tape_lines
+from emulator.scenario.scenario import Scenario
+from emulator.testing.campaign import run_campaign
+from emulator.testing.campaign_plan import Plan
+from emulator.testing.regression_test import TEST_FILE
+from emulator.testing.shrinking_runs import fewest, order_text
+from vnet.transport.orders import Deviation
+
+
+@given(st.sets(st.integers(0, 199), min_size=1, max_size=4))
+def test_what_fails_together_is_left(needed: set[int]) -> None:
+    def fails(items: Sequence[int]) -> bool:
+        return needed <= set(items)
+
+    least, tried = fewest(range(200), fails, most=1000)
+    assert set(least) == needed and len(least) == len(needed)
+    assert tried < 300
+
+
+def test_no_more_is_tried_than_is_allowed() -> None:
+    tried: list[int] = []
+
+    def fails(items: Sequence[int]) -> bool:
+        tried.append(len(items))
+        return False
+
+    _, steps = fewest(range(1000), fails, most=7)
+    assert len(tried) == steps == 7
+
+
+def test_an_order_is_a_phrase() -> None:
+    (line,) = tape_lines([Deviation("v03", 0, 4_200_000_000, 0, "timer of tell", "fix")])
+    assert order_text([line]) == "FIFO, except v03: timer of tell before fix, at 4.2 s"
+    assert order_text([line] * 7).endswith("; and 2 more")
+
+
+@pytest.mark.slow
+def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(tmp_path: Path) -> None:
+    """One deviation of hundreds is left; FIFO does not fail; the test that was written fails, and says why."""
+    scenario = Scenario.model_validate(
+        {
+            "run": {"name": "planted", "duration_s": 2.0, "settle_s": 0.0, "order": "shuffle"},
+            "network": {"vehicles": 3},
+            "program": {"entry": "tests.emulator.testing.programs:tells_before_it_measures"},
+        }
+    )
+    folder = tmp_path / "campaign"
+    status = run_campaign(Plan.of(scenario, "none", 2, 1), folder, Console(file=io.StringIO(), width=200))
+    assert status == 1
+    rows = json.loads((folder / "campaign.json").read_text())["results"]
+    failed = [row for row in rows if "order" in row]
+    assert failed and all(
+        row["order"].startswith("FIFO, except ") and row["order"].count("timer of tell") == 1 for row in failed
+    )
+    assert "The order of events: FIFO, except" in (folder / "campaign.html").read_text()
+    test = folder / "failures" / "001" / TEST_FILE
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)], capture_output=True, text=True
+    )
+    assert done.returncode == 1 and "agents_alive" in done.stdout, done.stdout
