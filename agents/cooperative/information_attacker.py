@@ -11,7 +11,7 @@ from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_su
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.information_frame import InformationFrame, encode
 from vnet import Fix
-from vnet.cmm.plausibility import INCREMENT_GATE, MEMORY_S, PRIOR_GATE, matrices
+from vnet.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, matrices
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
@@ -101,5 +101,5 @@ def _undetected(frame: InformationFrame, direction: Array, period_s: float, limi
     variance_m2 = float(unit @ np.linalg.inv(matrices(np.array([frame.prior]))[0]) @ unit)
     prior_m = min(limit_m, math.sqrt(PRIOR_GATE * 2 * variance_m2))
     said = float(unit @ matrices(np.array([frame.increment]))[0] @ unit) * MEMORY_S / period_s
-    increment_m = math.sqrt(INCREMENT_GATE * (1 + said * variance_m2) / max(said, 1e-6))
+    increment_m = math.sqrt(SUM_GATE * (0.5 / max(said, 1e-6) + variance_m2))
     return BELOW_GATE * prior_m * unit, BELOW_GATE * min(increment_m, 10.0) * unit

@@ -36,7 +36,10 @@ from vnet.cmm.own_vehicle import own_vehicle
 from vnet.cmm.plausibility import (
     INCREMENT_FACTOR,
     PRIOR_FACTOR,
+    SELF_SHARE,
+    SPREAD_GATE,
     Origins,
+    cut_to,
     matrices,
     median_belief,
     prior_moments,
@@ -76,7 +79,7 @@ class InformationEstimator:
     fused_m: (2,), the estimate of the common error right after the latest fusion.
     weights: the latest fusion weights by node id, the vehicle's own included.
     mean_m: (2,), the network's mean as far as it is known, None before the first.
-    limit_m: distance from the median of what is heard beyond which the latest period's priors were not used.
+    limit_m: distance from the median of what is heard to which the latest period's priors were moved.
     imported: number of increments that the latest period took from others.
     """
 
@@ -169,11 +172,12 @@ class InformationEstimator:
             table = table[believed]
             said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
         names = list(frames)
+        priors, means_m = self._moderated(names, said[:, :5], means_m, table[:, 12:])
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
-            self.mean_m = tracked_mean(means_m.sum(axis=0) / len(means_m), self.mean_m)
-        priors, increments = self._limited(said)
+            self.mean_m = tracked_mean(means_m.sum(axis=0) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE)
+        priors, increments = self._limited(priors, said[:, 5:])
         weights = self._weigh(frames, means_m, covariances_m2)
         pooled = weights @ priors + increments.sum(axis=0)
         passed = self._passed_on(frames, weights)
@@ -200,13 +204,9 @@ class InformationEstimator:
             return believed
         own = means_m[0], covariances_m2[0]
         near = priors_agree(means_m[1:], covariances_m2[1:], *own)
-        median_m, self.limit_m = spread_limit_m(means_m)
-        off_m = means_m[1:] - median_m
-        usual = off_m[:, 0] ** 2 + off_m[:, 1] ** 2 < self.limit_m**2
         agrees = self._origins.agree([_code(name) for name in names], said[1:, 5:], own, self._now_ns / NS_PER_S)
         agrees = unless_most_disagree(agrees)
         self._notice_being_lost(near, said[1:, :5])
-        near &= usual
         self._reject("prior", ~near)
         self._reject("increment", near & ~agrees)
         believed[1:] = near & agrees
@@ -223,13 +223,41 @@ class InformationEstimator:
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted >= LOST_PERIODS:
             self._contradicted = 0
+            self._origins = Origins()
             self.own.restart(median_belief(priors))
             self._prior = np.array(as_sent(self.own.prior))
             self._increment = np.zeros(5)
 
-    def _limited(self, said: Array) -> tuple[Array, Array]:
-        """Return priors and increments (1 + n, 5) each of all rows, none much more certain than one's own."""
-        priors, increments = said[:, :5], said[:, 5:]
+    def _moderated(
+        self, names: list[str], priors: Array, means_m: Array, variances_m2: Array
+    ) -> tuple[Array, Array]:
+        """Return the priors (1 + n, 5) of the vehicle and of `names`, and their means, none far from their median.
+
+        `variances_m2` (1 + n, 3) are those of the means (1 + n, 2). No prior is dropped: where a few vehicles hear
+        what the others cannot know, they are always off, and right.
+        """
+        if not self._options.defence or not names:
+            self.limit_m = np.inf
+            return priors, means_m
+        median_m, self.limit_m = spread_limit_m(means_m)
+        if self.limit_m == np.inf:
+            median_m = means_m[0]
+        off_m = means_m[1:] - median_m
+        codes = [_code(name) for name in names]
+        now_s = self._now_ns / NS_PER_S
+        less_m = self._origins.without_lean(codes, off_m, variances_m2[1:] + variances_m2[0], now_s)
+        less_m = cut_to(less_m, self.limit_m)
+        if less_m is off_m:
+            return priors, means_m
+        moved_m = np.zeros_like(means_m)
+        moved_m[1:] = less_m - off_m
+        priors = priors.copy()
+        priors[:, 3] += priors[:, 0] * moved_m[:, 0] + priors[:, 1] * moved_m[:, 1]
+        priors[:, 4] += priors[:, 1] * moved_m[:, 0] + priors[:, 2] * moved_m[:, 1]
+        return priors, means_m + moved_m
+
+    def _limited(self, priors: Array, increments: Array) -> tuple[Array, Array]:
+        """Return priors and increments (1 + n, 5) of all rows, none much more certain than one's own."""
         if not self._options.defence:
             return priors, increments
         traces = (increments[:, 0] + increments[:, 2]).tolist()
@@ -243,6 +271,9 @@ class InformationEstimator:
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
         weights = self._rule.weights(means_m, covariances_m2, self.mean_m, degrees)
+        if self._options.defence:
+            weights = (1 - SELF_SHARE) * weights
+            weights[0] += SELF_SHARE
         ids = [self._node_id, *(self._admission.ids[name] for name in frames)]
         self.weights = dict(zip(ids, weights.tolist(), strict=True))
         return weights

@@ -398,12 +398,15 @@ CONSENSUS_SHARE = 0.2
 0.070 m, of consensus alone 0.147 m, and the estimates themselves are 0.086 m from the mean."""
 
 
-def tracked_mean(neighbours_mean_m: Array, mean_m: Array | None) -> Array:
+def tracked_mean(neighbours_mean_m: Array, mean_m: Array | None, limit_m: float = math.inf) -> Array:
     """Return the network's mean (2,) from the neighbours' of this instant and what consensus says, if anything.
 
     Consensus takes dozens of rounds, in which the inputs move by more than they differ; what neighbours say is of
-    this instant, but of few.
+    this instant, but of few. What consensus says counts for at most `limit_m` from them: false sums would else
+    choose the weights.
     """
     if mean_m is None:
         return neighbours_mean_m
-    return np.asarray(neighbours_mean_m + CONSENSUS_SHARE * (mean_m - neighbours_mean_m))
+    x, y = (mean_m - neighbours_mean_m).tolist()
+    share = CONSENSUS_SHARE * min(1.0, limit_m / max(math.hypot(x, y), 1e-300))
+    return np.asarray(neighbours_mean_m + share * np.array([x, y]))

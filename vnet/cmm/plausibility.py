@@ -20,17 +20,28 @@ INCREMENT_FACTOR = 1.5
 PRIOR_FACTOR = 2.0
 """Largest trace of a prior's matrix, relative to one's own."""
 INCREMENT_GATE = 16.0
-"""Largest squared deviation of an increment, or of an origin's sum, from what is believed."""
+"""Largest squared deviation of an increment from what is believed."""
+SUM_GATE = 4.0
+"""Largest squared deviation of an origin's sum of many increments: the errors of what was believed partly cancel,
+and one honest sum in ten thousand deviates by 3.5 (N2) to 4.5 (N1)."""
 PRIOR_GATE = 4.0
 """Largest squared deviation of a prior's mean from one's own."""
 SPREAD_GATE = 3.5
 """Largest distance of a prior's mean from the median of all, in deviations of their spread."""
+MANY = 90.0
+"""Number of increments in a sum, less what has decayed, from which on `SUM_GATE` applies; for one it is
+`INCREMENT_GATE`."""
+LEAN_LIMIT = 0.1
+"""Largest mean distance of an origin's priors from the median of all, in deviations that both claim: in honest runs
+one in a hundred has 0.07 (N1), 0.10 (N2), 0.18 (N3), where a few pass on what the others cannot know."""
+SELF_SHARE = 0.3
+"""Weight that a vehicle gives to its own prior before the others': what draws all along draws more slowly."""
 SPREAD_FLOOR_M = 0.05
 """Distance (m) from the median that is always allowed."""
 MAJORITY = 4
 """Least number of priors or increments of which a majority can be told."""
-MEMORY_S = 5.0
-"""Time (s) in which an origin's sum decays."""
+MEMORY_S = 10.0
+"""Time (s) in which an origin's sums decay."""
 RAYLEIGH_MEDIAN = 1.1774
 """Median length of a normal vector in the plane, in deviations an axis."""
 MAX_ORIGINS = 1024
@@ -70,13 +81,17 @@ def scaled_down(information: Array, largest_trace: float) -> Array:
     return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
 
 
-def deviation(information: Array, mean_m: Array, covariance_m2: Array, noise: Array) -> Array:
-    """Return rᵀ (D + Λ P Λ)⁻¹ r with r = η − Λ x for information (n, 5) about c ~ N(x, P): (n,).
+def deviation(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
+    """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for information (n, 5) about c ~ N(x, P): (n,)."""
+    return _squared(_compared(information, mean_m, covariance_m2))
 
-    `noise` (n, 3) is the covariance D of η given c, (xx, xy, yy); that of one increment is its Λ.
+
+def _compared(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
+    """Return the terms (9, n) of the deviation of information (n, 5) from c ~ N(x, P), which may be summed up.
+
+    With P = C Cᵀ these are Λ C by columns, r = η − Λ x, and Λ (xx, xy, yy), the covariance of r given c.
     """
     (mean_x, mean_y), ((p, q), (_, r)) = mean_m.tolist(), covariance_m2.tolist()
-    # With P = C Cᵀ, one product for Λ C, with entries (u_x, v_x; u_y, v_y), and r: Λ P Λ = (Λ C)(Λ C)ᵀ.
     c_xx = math.sqrt(p)
     c_yx = q / c_xx
     c_yy = math.sqrt(max(r - c_yx * c_yx, 0.0))
@@ -88,13 +103,20 @@ def deviation(information: Array, mean_m: Array, covariance_m2: Array, noise: Ar
             [0.0, 0.0, c_yy, 0.0, 0.0],
             [-mean_x, -mean_y, 0.0, 1.0, 0.0],
             [0.0, -mean_x, -mean_y, 0.0, 1.0],
+            [1.0, 0.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0, 0.0],
         ]
     )
-    numbers = factors.dot(information.T)
-    squares = numbers * numbers
-    u_x, u_y, v_x, v_y, off_x, off_y = numbers
-    total = squares[:2] + squares[2:4] + noise.T[::2]
-    total_xy = noise[:, 1] + u_x * u_y + v_x * v_y
+    return np.asarray(factors.dot(information.T))
+
+
+def _squared(compared: Array) -> Array:
+    """Return the squared deviations (n,) of terms (9, n)."""
+    squares = compared[:6] * compared[:6]
+    u_x, u_y, v_x, v_y, off_x, off_y, _, noise_xy, _ = compared
+    total = squares[:2] + squares[2:4] + compared[6::2]
+    total_xy = noise_xy + u_x * u_y + v_x * v_y
     # A lane says nothing along itself: rounding there is not counted.
     total += 1e-4 * (total[0] + total[1]) + 1e-9
     total_x, total_y = total
@@ -112,7 +134,7 @@ def priors_agree(
 
 
 def spread_limit_m(means_m: Array) -> tuple[Array, float]:
-    """Return the median (2,) of means (n, 2), and the distance from it beyond which one of them is an outlier.
+    """Return the median (2,) of means (n, 2), and the distance from it within which they are taken as they are.
 
     Estimates that are pooled in each period differ by less than each is uncertain, because they err together: who
     stays within its uncertainty, but always on one side, would draw all others along.
@@ -123,6 +145,14 @@ def spread_limit_m(means_m: Array) -> tuple[Array, float]:
     off_m = means_m - median_m
     distance_m = float(_median(np.hypot(off_m[:, 0], off_m[:, 1])))
     return median_m, SPREAD_FLOOR_M + SPREAD_GATE * distance_m / RAYLEIGH_MEDIAN
+
+
+def cut_to(off_m: Array, limit_m: float) -> Array:
+    """Return offsets (n, 2) with lengths of at most `limit_m`."""
+    squared = off_m[:, 0] ** 2 + off_m[:, 1] ** 2
+    if squared.max() <= limit_m**2:
+        return off_m
+    return np.asarray(off_m * np.minimum(1.0, limit_m / np.sqrt(np.maximum(squared, 1e-300)))[:, None])
 
 
 def _median(values: Array) -> Array:
@@ -138,13 +168,52 @@ def unless_most_disagree(agrees: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return agrees
 
 
+class Memory:
+    """Numbers of each origin, `size` of them, with the time at which they were stored."""
+
+    def __init__(self, size: int) -> None:
+        self._row: dict[int, int] = {}
+        self._numbers = np.zeros((size, 0))
+        self._time_s = np.zeros(0)
+
+    def __len__(self) -> int:
+        """Number of origins."""
+        return len(self._row)
+
+    def recall(self, codes: Sequence[int], now_s: float) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return the rows (n,) of origins, their numbers (size, n), and e^(−age / `MEMORY_S`) of these (n,).
+
+        New origins are added with zeros, and old ones forgotten when there are too many.
+        """
+        new = [code for code in codes if code not in self._row]
+        if new:
+            self._add(new, now_s)
+        rows = np.array([self._row[code] for code in codes], dtype=np.intp)
+        return rows, self._numbers.take(rows, axis=1), np.exp((self._time_s.take(rows) - now_s) / MEMORY_S)
+
+    def store(self, rows: NDArray[np.intp], numbers: Array, now_s: float) -> None:
+        """Replace the numbers (size, n) of the rows (n,)."""
+        self._numbers[:, rows], self._time_s[rows] = numbers, now_s
+
+    def _add(self, new: list[int], now_s: float) -> None:
+        if len(self._row) + len(new) > MAX_ORIGINS:
+            kept = [code for code, row in self._row.items() if now_s - self._time_s[row] < MEMORY_S]
+            kept = kept[-(MAX_ORIGINS // 2) :]
+            rows = [self._row[code] for code in kept]
+            self._row = {code: row for row, code in enumerate(kept)}
+            self._numbers, self._time_s = self._numbers[:, rows], self._time_s[rows]
+        first = self._numbers.shape[1]
+        self._row |= {code: first + index for index, code in enumerate(new)}
+        self._numbers = np.hstack([self._numbers, np.zeros((len(self._numbers), len(new)))])
+        self._time_s = np.append(self._time_s, np.full(len(new), now_s))
+
+
 class Origins:
-    """The decaying sums of what each origin has said: increments, and the covariance of their noise."""
+    """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
     def __init__(self) -> None:
-        self._row: dict[int, int] = {}
-        self._sums = np.zeros((0, 8))
-        self._time_s = np.zeros(0)
+        self._increments = Memory(10)
+        self._priors = Memory(2)
 
     def agree(
         self, codes: Sequence[int], increments: Array, belief: tuple[Array, Array], now_s: float
@@ -152,37 +221,42 @@ class Origins:
         """Tell which increments (n, 5) of the origins `codes` agree with the belief (x, P), singly and in sum.
 
         An increment that does not is summed up all the same: who has lied is believed again when it has decayed.
-        What was said of an earlier c is compared with the present one, because it moves little in seconds.
+        Each is compared with what was believed when it came: c itself moves by half a metre in the sum's memory.
         """
         if not codes:
             return np.zeros(0, dtype=np.bool_)
-        rows, count = self._rows(codes, now_s), len(codes)
-        keep = np.exp((self._time_s.take(rows) - now_s) / MEMORY_S)[:, None]
-        sums = self._sums.take(rows, axis=0)
+        count = len(codes)
+        rows, sums, keep = self._increments.recall(codes, now_s)
         sums *= keep
-        sums[:, 5:] *= keep
-        said = np.empty((2 * count, 8))  # each increment with its noise, then each sum
-        said[:count, :5], said[:count, 5:] = increments, increments[:, :3]
-        np.add(sums, said[:count], out=said[count:])
-        self._sums[rows], self._time_s[rows] = said[count:], now_s
-        near = deviation(said[:, :5], *belief, said[:, 5:]) < INCREMENT_GATE
-        return np.asarray(near[:count] & near[count:])
+        sums[6:9] *= keep
+        said = np.ones((10, 2 * count))  # each by itself, then the sums; the last row counts
+        said[:9, :count] = _compared(increments, *belief)
+        np.add(sums, said[:, :count], out=said[:, count:])
+        self._increments.store(rows, said[:, count:], now_s)
+        squared = _squared(said[:9])
+        of_many = np.minimum(1.0, said[9, count:] / MANY)
+        limit = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * of_many
+        return np.asarray((squared[:count] < INCREMENT_GATE) & (squared[count:] < limit))
 
-    def _rows(self, codes: Sequence[int], now_s: float) -> NDArray[np.intp]:
-        """Return the rows of origins; new ones are added, and old ones forgotten when there are too many."""
-        new = [code for code in codes if code not in self._row]
-        if new:
-            if len(self._row) + len(new) > MAX_ORIGINS:
-                kept = [code for code, row in self._row.items() if now_s - self._time_s[row] < MEMORY_S]
-                kept = kept[-(MAX_ORIGINS // 2) :]
-                rows = [self._row[code] for code in kept]
-                self._row = {code: row for row, code in enumerate(kept)}
-                self._sums, self._time_s = self._sums[rows], self._time_s[rows]
-                new = [code for code in codes if code not in self._row]
-            self._row |= {code: len(self._row) + place for place, code in enumerate(new)}
-            self._sums = np.vstack([self._sums, np.zeros((len(new), 8))])
-            self._time_s = np.append(self._time_s, np.full(len(new), now_s))
-        return np.array([self._row[code] for code in codes], dtype=np.intp)
+    def without_lean(self, codes: Sequence[int], off_m: Array, variance_m2: Array, now_s: float) -> Array:
+        """Return the deviations (n, 2) of the priors of `codes` from the median, less what is always to one side.
+
+        `variance_m2` (n, 3), entries (xx, xy, yy), is how far each may be off. Deviations of the honest change
+        sides in a second; a mean of more than `LEAN_LIMIT` deviations is taken off.
+        """
+        root_xx = np.sqrt(variance_m2[:, 0])
+        root_yx = variance_m2[:, 1] / root_xx
+        root_yy = np.sqrt(variance_m2[:, 2] - root_yx * root_yx)
+        rows, lean, keep = self._priors.recall(codes, now_s)
+        x = off_m[:, 0] / root_xx
+        now = np.array([x, (off_m[:, 1] - root_yx * x) / root_yy])
+        lean = now + keep * (lean - now)
+        self._priors.store(rows, lean, now_s)
+        squared = lean[0] * lean[0] + lean[1] * lean[1]
+        if squared.max() <= LEAN_LIMIT**2:
+            return off_m
+        x, y = lean * np.maximum(0.0, 1 - LEAN_LIMIT / np.sqrt(np.maximum(squared, 1e-300)))
+        return np.asarray(off_m - np.stack([root_xx * x, root_yx * x + root_yy * y], axis=1))
 
 
 def median_belief(priors: Array) -> Information:

@@ -328,3 +328,4 @@ def test_a_moving_mean_is_mostly_what_neighbours_say_now() -> None:
     neighbours, consensus = np.array([1.0, 2.0]), np.array([2.0, 2.0])
     assert tracked_mean(neighbours, None).tolist() == [1.0, 2.0]
     assert tracked_mean(neighbours, consensus).tolist() == [1.2, 2.0]
+    assert tracked_mean(neighbours, consensus, 0.5).tolist() == [1.1, 2.0]
