@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # What `make test-all` tests with, each in a virtual environment of its own, if it is installed.
 PYTHONS ?= 3.11 3.12 3.13
 
-.PHONY: demo test test-all quick lint docs site bench soak fuzz setup clean
+.PHONY: demo test test-all quick lint docs site bench soak fuzz hunt setup clean
 
 setup: $(READY)
 
@@ -81,6 +81,9 @@ bench: $(READY)
 fuzz: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz --runs 1000000
+
+hunt: $(READY)
+	$(BIN)/python -m tests.hunt
 
 soak: $(READY)
 	$(BIN)/python -m benchmarks.soak
