@@ -59,6 +59,7 @@ COMMANDS = (
     Command(
         "compare", Panel.LOOK, "report", "compare", "Set two runs side by side, and show where they first differ."
     ),
+    Command("diff", Panel.LOOK, "diff", "diff", "Show where two runs part for the first time."),
     Command(
         "radio", Panel.LOOK, "export", "radio", "Show delivery by distance, latency, age, and the worst links."
     ),

@@ -18,7 +18,7 @@ import emulator.cli.commands
 from tests.support.paths import ROOT
 
 APPS = {"vnet": emulator.cli.commands.app, "vnet-agent": agents.cli.app}
-HERE = ("simulate", "check", "analyze", "access", "radio", "export", "report", "compare", "map", "trace")
+HERE = ("simulate", "check", "analyze", "access", "radio", "export", "report", "compare", "diff", "map", "trace")
 """Commands of vnet that are run in this process."""
 APART = (
     *("run", "emulator", "host", "campaign", "sweep", "conformance"),  # they start processes

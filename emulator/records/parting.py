@@ -1,0 +1,151 @@
+"""The parting of two runs: the first decision, frame, reception, event and reported value in which they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any
+
+import pyarrow as pa
+
+from emulator.records.recorded_run import OpenedRun
+from emulator.records.reported import value_columns
+from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
+from vnet.transport.orders import Deviation
+from vnet.units import NS_PER_S
+
+FRAME = ("sent_ns", "sender", "seq", "size_bytes", "payload_digest")
+RECEPTION = ("sent_ns", "sender", "seq", "copy", "receiver", "outcome", "cause", "arrival_ns")
+REPORT = ("estimate_m", "covariance_m2", "common_error_estimate_m", "mean_m")
+"""Columns of states that programs report, beside those of their own names."""
+OF_THE_MACHINE = ("started", "ended", "memory", "code_changed")
+"""Kinds of events that differ from run to run, or tell of no node."""
+MOST_BEFORE = 8
+"""Events and frames that are told of before a parting."""
+
+
+@dataclass(frozen=True)
+class Parting:
+    """The first difference of one kind: when, of which node, and what each run has there; "" for nothing."""
+
+    time_ns: int
+    kind: str
+    node: str
+    first: str
+    second: str
+
+
+def partings(first: OpenedRun, second: OpenedRun) -> list[Parting]:
+    """Return the first difference of each kind, the earliest first; none if the runs agree.
+
+    At one instant a decision comes before the frames that follow from it, and these before what becomes of them.
+    Raises VnetError if a file cannot be read.
+    """
+    found = [
+        _first_entry("decision", _decisions(first), _decisions(second)),
+        _first_entry("frame", _frames(first), _frames(second)),
+        _first_entry("reception", _receptions(first), _receptions(second)),
+        _first_entry("event", _events(first), _events(second)),
+        _first_value(first.states, second.states),
+    ]
+    return sorted((each for each in found if each is not None), key=lambda each: each.time_ns)
+
+
+def before(run: OpenedRun, parting: Parting) -> list[str]:
+    """Return what happened to the node of a parting until then, the latest last: receptions, own frames, events."""
+    end_ns, node = parting.time_ns, parting.node
+    lines = [
+        (event.time_ns, f"event {event.kind} {event.details.get('name', event.details.get('text', ''))}".rstrip())
+        for event in run.events
+        if event.node == node and event.time_ns < end_ns
+    ]
+    for row in run.trace.select(RECEPTION).to_pylist():
+        if row["receiver"] == node and row["arrival_ns"] is not None and row["arrival_ns"] <= end_ns:
+            lines.append((row["arrival_ns"], f"heard frame {row['seq']} of {row['sender']}"))
+        elif row["sender"] == node and row["sent_ns"] < end_ns:
+            lines.append((row["sent_ns"], f"sent frame {row['seq']}"))
+    latest = sorted(set(lines))[-MOST_BEFORE:]
+    return [f"{time_ns / NS_PER_S:.6f} s  {text}" for time_ns, text in latest]
+
+
+Entry = tuple[int, str, str]
+"""Time in ns, node and text of something that happened."""
+
+
+def _first_entry(kind: str, first: Sequence[Entry], second: Sequence[Entry]) -> Parting | None:
+    for ours, theirs in zip_longest(first, second):
+        if ours != theirs:
+            time_ns = min(each[0] for each in (ours, theirs) if each is not None)
+            shown = [each[2] if each is not None and each[0] == time_ns else "" for each in (ours, theirs)]
+            node = next(each[1] for each in (ours, theirs) if each is not None and each[0] == time_ns)
+            return Parting(time_ns, kind, node, shown[0], shown[1])
+    return None
+
+
+def _decisions(run: OpenedRun) -> list[Entry]:
+    path = run.folder / TAPE_FILE
+    return [(entry.time_ns, _node(entry), described(entry)) for entry in (read_tape(path) if path.exists() else ())]
+
+
+def _node(entry: TapeEntry) -> str:
+    return entry.node if isinstance(entry, Deviation) else entry.medium[0]
+
+
+def _events(run: OpenedRun) -> list[Entry]:
+    entries = []
+    for event in run.events:
+        if event.node is not None and event.kind not in OF_THE_MACHINE:
+            details = ", ".join(f"{key} = {value}" for key, value in event.details.items() if key != "where")
+            entries.append((event.time_ns, event.node, f"{event.kind} {details}".rstrip() + _line(event.details)))
+    return sorted(entries)
+
+
+def _line(details: dict[str, Any]) -> str:
+    """Return the innermost line of the program in the traceback of an event, if it has one."""
+    lines = [line.strip(" |") for line in str(details.get("where", "")).splitlines() if 'File "' in line]
+    return f" ({lines[-1]})" if lines else ""
+
+
+Row = dict[str, Any]
+
+
+def _frames(run: OpenedRun) -> list[Entry]:
+    return sorted({_frame(row) for row in run.trace.select(FRAME).to_pylist()})
+
+
+def _receptions(run: OpenedRun) -> list[Entry]:
+    return sorted(_reception(row) for row in run.trace.select(RECEPTION).to_pylist())
+
+
+def _frame(row: Row) -> Entry:
+    text = f"frame {row['seq']} of {row['sender']}, {row['size_bytes']} bytes, digest {row['payload_digest']:016x}"
+    return row["sent_ns"], row["sender"], text
+
+
+def _reception(row: Row) -> Entry:
+    time_ns = row["sent_ns"] if row["arrival_ns"] is None else row["arrival_ns"]
+    cause = f" ({row['cause']})" if row["cause"] else ""
+    copy = f".{row['copy']}" if row["copy"] else ""
+    text = f"frame {row['seq']}{copy} of {row['sender']} at {row['receiver']}: {row['outcome']}{cause}"
+    return time_ns, row["receiver"], text
+
+
+def _first_value(first: pa.Table, second: pa.Table) -> Parting | None:
+    """Return the first value that two runs' programs report otherwise, at the beginning of its period."""
+    columns = list(dict.fromkeys([*REPORT, *value_columns(first.schema), *value_columns(second.schema)]))
+    for ours, theirs in zip_longest(_values(first, columns), _values(second, columns)):
+        if ours != theirs:
+            row = ours or theirs
+            assert row is not None
+            name = next((name for name in columns if (ours or {}).get(name) != (theirs or {}).get(name)), "")
+            shown = [f"{name} = {each[name]}" if each else "" for each in (ours, theirs)]
+            return Parting(row["time_ns"], "value", row["node"], shown[0], shown[1])
+    return None
+
+
+def _values(states: pa.Table, columns: Sequence[str]) -> Iterator[Row]:
+    there = [name for name in columns if name in states.column_names]
+    for row in states.select(["time_ns", "node", *there]).to_pylist():
+        shown = {name: str(row.get(name)) for name in columns}
+        yield {"time_ns": row["time_ns"], "node": row["node"], **shown}

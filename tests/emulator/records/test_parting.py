@@ -1,0 +1,62 @@
+"""Two runs are set side by side to the first decision, frame, reception, event and value in which they differ."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from emulator.api import simulate_into
+from emulator.cli.commands import app
+from emulator.records.parting import before, partings
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.scenario.scenario import Scenario
+
+
+def simulated(folder: Path, **sections: Any) -> OpenedRun:
+    data: dict[str, Any] = {
+        "run": {"duration_s": 1.0, "settle_s": 0.0},
+        "network": {"vehicles": 3},
+        "program": {"entry": "tests.emulator.testing.programs:tells_before_it_measures"},
+    }
+    for name, section in sections.items():
+        data[name] = {**data.get(name, {}), **section}
+    return RecordedRun.open(simulate_into(Scenario.model_validate(data), folder))
+
+
+def test_runs_that_are_alike_do_not_part(tmp_path: Path) -> None:
+    assert partings(simulated(tmp_path / "a"), simulated(tmp_path / "b")) == []
+
+
+def test_another_order_parts_from_fifo_at_a_decision_and_the_crash_names_its_line(tmp_path: Path) -> None:
+    fifo = simulated(tmp_path / "a")
+    shuffled = simulated(tmp_path / "b", run={"order": "shuffle", "duration_s": 1.0})
+    found = partings(fifo, shuffled)
+    assert found[0].kind == "decision" and found[0].first == "" and " before " in found[0].second
+    event = next(each for each in found if each.kind == "event")
+    assert event.first == "" and event.second.startswith("crashed error = ")
+    assert "programs.py" in event.second and "in tell" in event.second
+    frame = next(each for each in found if each.kind == "frame")
+    assert frame.first.startswith("frame ") and before(fifo, frame) == sorted(before(fifo, frame))
+
+
+def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) -> None:
+    """A block keeps v02 from hearing v01 for a while: no frame and no event differs before that."""
+    run: dict[str, Any] = {"program": {"entry": "agents.beacon:main"}, "run": {"duration_s": 2.0, "settle_s": 0.5}}
+    fault = {"kind": "block", "at_s": 0.95, "duration_s": 0.2, "senders": {"ids": ["v01"]}}
+    plain = simulated(tmp_path / "a", **run)
+    data = plain.scenario.model_dump(mode="json", exclude_none=True) | {"fault": [fault]}
+    blocked = RecordedRun.open(simulate_into(Scenario.model_validate(data), tmp_path / "b"))
+    reception = next(each for each in partings(plain, blocked) if each.kind == "reception")
+    assert (reception.first.endswith("delivered") and reception.second == "") or "fault" in reception.second
+    assert 0.95 < reception.time_ns / 1e9 < 1.2
+    assert any(line.endswith("heard frame 0 of v01") for line in before(plain, reception)) is False
+    assert len(before(plain, reception)) == 8
+
+
+@pytest.mark.parametrize("other, status", [("a", 0), ("nothing", 2)])
+def test_the_command_tells_it(other: str, status: int, tmp_path: Path) -> None:
+    simulated(tmp_path / "a")
+    done = CliRunner().invoke(app, ["diff", str(tmp_path / "a"), str(tmp_path / other)])
+    assert done.exit_code == status
+    assert status or "the runs agree" in done.output
