@@ -151,7 +151,7 @@ def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
         if count > MOST_RESULTS:
             raise _NonsenseError(f"yields more than {MOST_RESULTS} results")
         try:
-            finding = _finding(result)
+            finding = finding_of(result)
         except _NonsenseError as error:  # the results after it count all the same
             nonsense = nonsense or error
             continue
@@ -162,8 +162,8 @@ def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
         raise _NonsenseError("yields no result")
 
 
-def _finding(answer: Any) -> Finding:
-    """Return a result as a finding. Raises _NonsenseError."""
+def finding_of(answer: Any) -> Finding:
+    """Return a result as a finding. Raises VnetError for one that is none."""
     if not isinstance(answer, (tuple, list)) or not 3 <= len(answer) <= 4:
         raise _NonsenseError(f"yields {shown(answer)}: a result is (name, verdict, text) or has figures besides")
     result = Result(*answer)

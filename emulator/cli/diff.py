@@ -37,7 +37,7 @@ def diff(
         first = found[0]
         console.print(f"the runs part at {first.time_ns / NS_PER_S:.6f} s: a {first.kind} of {first.node}")
         console.print(_table(found, str(run), str(other)))
-        if told := before(ours, first):
+        if told := before(ours.trace, ours.events, first.node, first.time_ns):
             console.print(f"{first.node} until then:", highlight=False)
             for line in told:
                 console.print(Text(f"  {line}"))

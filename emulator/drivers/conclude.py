@@ -161,6 +161,17 @@ def _judged(judgement: Judgement) -> dict[str, Any]:
     }
 
 
+def judge_further(
+    emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], findings: Sequence[Finding]
+) -> dict[str, Any]:
+    """Add findings to a concluded run; returns the new contents of verdict.json."""
+    for finding in findings:
+        judgement.put(finding)
+    verdict = {**verdict, **_judged(judgement)}
+    emulation.folder.put_json(VERDICT_FILE, verdict)
+    return verdict
+
+
 def run_again(
     emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str, options: Sequence[str] = ()
 ) -> dict[str, Any]:
@@ -175,7 +186,5 @@ def run_again(
     finding: Finding = check_replay(path)
     if done.returncode not in {each.exit_status for each in Verdict}:
         finding = unknown("replay", f"the second run ended with status {done.returncode}")
-    judgement.put(finding)
-    verdict = {**verdict, **_judged(judgement), "reproduce": f"{verdict['reproduce']} --check-determinism"}
-    emulation.folder.put_json(VERDICT_FILE, verdict)
-    return verdict
+    verdict = {**verdict, "reproduce": f"{verdict['reproduce']} --check-determinism"}
+    return judge_further(emulation, judgement, verdict, [finding])

@@ -11,6 +11,7 @@ import pyarrow as pa
 
 from emulator.records.recorded_run import OpenedRun
 from emulator.records.reported import value_columns
+from emulator.records.run_folder import Event
 from emulator.records.tape import TAPE_FILE, TapeEntry, described, read_tape
 from vnet.transport.orders import Deviation
 from vnet.units import NS_PER_S
@@ -52,15 +53,14 @@ def partings(first: OpenedRun, second: OpenedRun) -> list[Parting]:
     return sorted((each for each in found if each is not None), key=lambda each: each.time_ns)
 
 
-def before(run: OpenedRun, parting: Parting) -> list[str]:
-    """Return what happened to the node of a parting until then, the latest last: receptions, own frames, events."""
-    end_ns, node = parting.time_ns, parting.node
+def before(trace: pa.Table, events: Sequence[Event], node: str, end_ns: int) -> list[str]:
+    """Return what happened to a node until then, as lines, the latest last: receptions, own frames, events."""
     lines = [
         (event.time_ns, f"event {event.kind} {event.details.get('name', event.details.get('text', ''))}".rstrip())
-        for event in run.events
+        for event in events
         if event.node == node and event.time_ns < end_ns
     ]
-    for row in run.trace.select(RECEPTION).to_pylist():
+    for row in trace.select(RECEPTION).to_pylist():
         if row["receiver"] == node and row["arrival_ns"] is not None and row["arrival_ns"] <= end_ns:
             lines.append((row["arrival_ns"], f"heard frame {row['seq']} of {row['sender']}"))
         elif row["sender"] == node and row["sent_ns"] < end_ns:

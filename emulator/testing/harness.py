@@ -7,11 +7,13 @@ run's scenario, so that `vnet simulate FOLDER/scenario.toml` gives the same trac
 from __future__ import annotations
 
 import asyncio
+import math
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,13 +22,15 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.checks.judge import CheckResult, Judgement, Verdict
-from emulator.checks.own import load_checks
+from emulator.checks.own import Result, finding_of, load_checks
+from emulator.checks.properties import PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude
+from emulator.drivers.conclude import conclude, judge_further
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
 from emulator.records.metrics import PeriodFigures
+from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
 from emulator.scenario.fault_families import LONGEST_S
 from emulator.scenario.faults import parse_fault
@@ -59,6 +63,7 @@ class RunHarness:
         self._wall_s = 0.0
         self._open: list[str] = []
         self._judgement: Judgement | None = None
+        self._promises: list[Callable[[Run], Result]] = []
 
     def _live_run(self) -> SteppedRun:
         quiet_zenoh()
@@ -203,14 +208,41 @@ class RunHarness:
             # A fault lasts a nanosecond at least: what never acted would act in the replay.
             self._emulation.heal(planned.label, max(self._now_ns - 1, planned.start_ns))
 
+    # Promises, judged at its end as checks of one's own: `own:NAME`, by default the predicate's name.
+
+    def always(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
+        """Promise that a predicate is true at every moment (`emulator.checks.properties.always`)."""
+        self._promises.append(partial(always, name=name or _name_of(predicate), predicate=predicate, at=at))
+
+    def never(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
+        """Promise that a predicate is true at no moment."""
+        self._promises.append(partial(never, name=name or _name_of(predicate), predicate=predicate, at=at))
+
+    def eventually(
+        self, predicate: Predicate, *, within_s: float = math.inf, name: str | None = None, at: str = PERIOD
+    ) -> None:
+        """Promise that a predicate becomes true of each vehicle, within so many seconds."""
+        name = name or _name_of(predicate)
+        self._promises.append(partial(eventually, name=name, predicate=predicate, within_s=within_s, at=at))
+
+    def leads_to(
+        self, cause: Predicate, effect: Effect, *, within_s: float, name: str | None = None, at: str = PERIOD
+    ) -> None:
+        """Promise that each cause is followed by an effect within so many seconds; see `properties.leads_to`."""
+        name = name or _name_of(effect)
+        self._promises.append(partial(leads_to, name=name, cause=cause, effect=effect, within_s=within_s, at=at))
+
     # Its end.
 
     def end(self) -> Judgement:
         """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same."""
         if self._judgement is None:
             self._finish()
-            command = self._run.command
-            self._judgement, _ = conclude(self._emulation, self._wall_s, command)
+            self._judgement, verdict = conclude(self._emulation, self._wall_s, self._run.command)
+            if self._promises:
+                run = Run.open(self.folder)
+                findings = [finding_of(judge(run)) for judge in self._promises]
+                judge_further(self._emulation, self._judgement, verdict, findings)
         return self._judgement
 
     def close(self) -> None:
@@ -268,6 +300,14 @@ class RunHarness:
         lines = [f"{check.name} is {check.verdict}: {check.text}" for check in failed]
         where = f"{len(self.nodes)} vehicles, {self.now_s:g} s, seed {self.scenario.run.seed}"
         return "\n  ".join([f"failed after {where}:", *lines, f"files: {self.folder}", f"again: {self.reproduce}"])
+
+
+def _name_of(predicate: Callable[..., object]) -> str:
+    """Return the name of a function; a lambda has none, and is then given one."""
+    name = getattr(predicate, "__name__", "")
+    if not name.isidentifier():
+        raise VnetError("a promise by a lambda needs a name=")
+    return name
 
 
 def _fails(check: CheckResult, allow_unknown: bool) -> bool:

@@ -106,6 +106,8 @@ class Page:
         elif "(node: Node)" in block.text:
             self._write(found.group(1) if found else f"program_{number}.py", block, self._programs)
         else:
+            if found:
+                (self._folder / found.group(1)).write_text(block.text)
             with contextlib.redirect_stdout(io.StringIO()) as printed:
                 exec(code, self._namespace)
             return printed.getvalue()

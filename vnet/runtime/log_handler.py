@@ -19,6 +19,10 @@ class NodeLogHandler(logging.Handler):
         super().__init__()
         self._its_own = its_own
 
+    def createLock(self) -> None:
+        """Make no lock: `Node.log` needs none, and may wait for the emulator while others log."""
+        self.lock = None
+
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record."""
         node = current_node.get()

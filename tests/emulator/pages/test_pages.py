@@ -48,7 +48,9 @@ class Elements(HTMLParser):
 
 def campaign(text: str) -> str:
     """A campaign's page with a text wherever others may have written it."""
-    failure = dict.fromkeys(("number", "seed", "schedule", "command", "folder"), text) | {"checks": {text: text}}
+    failure = dict.fromkeys(("number", "seed", "schedule", "order", "command", "folder"), text) | {
+        "checks": {text: text}
+    }
     return campaign_page(text, [text], {text: {text: Counter({Verdict.INVALID: 1})}}, [failure])
 
 

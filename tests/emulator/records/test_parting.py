@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from emulator.api import simulate_into
 from emulator.cli.commands import app
-from emulator.records.parting import before, partings
+from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 
@@ -24,6 +24,10 @@ def simulated(folder: Path, **sections: Any) -> OpenedRun:
     return RecordedRun.open(simulate_into(Scenario.model_validate(data), folder))
 
 
+def told(run: OpenedRun, parting: Parting) -> list[str]:
+    return before(run.trace, run.events, parting.node, parting.time_ns)
+
+
 def test_runs_that_are_alike_do_not_part(tmp_path: Path) -> None:
     assert partings(simulated(tmp_path / "a"), simulated(tmp_path / "b")) == []
 
@@ -37,7 +41,7 @@ def test_another_order_parts_from_fifo_at_a_decision_and_the_crash_names_its_lin
     assert event.first == "" and event.second.startswith("crashed error = ")
     assert "programs.py" in event.second and "in tell" in event.second
     frame = next(each for each in found if each.kind == "frame")
-    assert frame.first.startswith("frame ") and before(fifo, frame) == sorted(before(fifo, frame))
+    assert frame.first.startswith("frame ") and told(fifo, frame) == sorted(told(fifo, frame))
 
 
 def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) -> None:
@@ -50,8 +54,8 @@ def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) ->
     reception = next(each for each in partings(plain, blocked) if each.kind == "reception")
     assert (reception.first.endswith("delivered") and reception.second == "") or "fault" in reception.second
     assert 0.95 < reception.time_ns / 1e9 < 1.2
-    assert any(line.endswith("heard frame 0 of v01") for line in before(plain, reception)) is False
-    assert len(before(plain, reception)) == 8
+    assert any(line.endswith("heard frame 0 of v01") for line in told(plain, reception)) is False
+    assert len(told(plain, reception)) == 8
 
 
 @pytest.mark.parametrize("other, status", [("a", 0), ("nothing", 2)])

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from vnet.errors import WireError
 from vnet.node import Fix, Report
 from vnet.transport import wire
+from vnet.transport.orders import Deviation
 
 times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)
@@ -44,6 +45,7 @@ notes = st.builds(
     names,
     st.dictionaries(names, st.booleans() | times | reals | names, max_size=2),
 )
+deviations = st.builds(Deviation, names, times, times, times, names, names)
 traffic = st.builds(
     wire.Traffic,
     st.lists(frames, max_size=3),
@@ -51,6 +53,7 @@ traffic = st.builds(
     st.lists(endings, max_size=2),
     st.lists(unhandled, max_size=2),
     st.lists(notes, max_size=2),
+    st.lists(deviations, max_size=2),
 )
 steps = st.builds(wire.Step, times, traffic)
 histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
@@ -75,7 +78,18 @@ agent_messages = st.one_of(
     st.builds(wire.StackDump, st.binary(), names, st.none() | times),
 )
 emulator_messages = st.one_of(
-    st.builds(wire.Grant, times, times, times, st.lists(packets, max_size=3), st.lists(fixes, max_size=3), clocks),
+    st.builds(
+        wire.Grant,
+        times,
+        times,
+        times,
+        st.lists(packets, max_size=3),
+        st.lists(fixes, max_size=3),
+        clocks,
+        times,
+        st.lists(fixes, max_size=2),
+        st.none() | times,
+    ),
     st.builds(
         wire.Batch,
         st.lists(fixes, max_size=3),

@@ -1,0 +1,170 @@
+"""Properties over time of a finished run: what is always, never or finally true, and what follows what.
+
+A predicate is asked at each *moment*: once for each vehicle and period in which it is in the network, and at each
+event. It answers True, False, or None where it has nothing to say. Each function returns a `Result`, for a check of
+one's own; a failure says when, who, and what had happened to the vehicle before.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from emulator.checks.own import Result
+from emulator.records.parting import before
+from emulator.records.run import Run
+from vnet.errors import VnetError
+from vnet.units import NS_PER_S
+
+MOST_TOLD = 10
+"""Failures whose time and vehicle are told."""
+PERIOD, EVENT = "period", "event"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One vehicle at one time: at a period's start, or at an event of it.
+
+    `values` has, by name, what it reported (`m["speed_m_s"]`; None if it did not) and, of a period, the columns of
+    states, with the truth: `position_m`, `common_error_m` …; of an event its details.
+    """
+
+    time_ns: int
+    node: str
+    event: str = ""
+    """Name of the event of the program, or vnet's kind of event, as "crashed"; "" at a period."""
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def time_s(self) -> float:
+        """Emulated seconds."""
+        return self.time_ns / NS_PER_S
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a value, or None where there is none."""
+        value = self.values.get(name)
+        return None if isinstance(value, float) and math.isnan(value) else value
+
+
+Predicate = Callable[[Moment], bool | None]
+Effect = Callable[[Moment, Moment], bool | None]
+"""Predicate of an effect, which is given the moment of its cause, too."""
+
+
+def moments(run: Run, at: str = PERIOD) -> list[Moment]:
+    """Return the moments of a run in the order of time: `at` each "period", or each "event".
+
+    Raises VnetError for another `at`.
+    """
+    if at == EVENT:
+        return sorted(_events(run), key=lambda moment: moment.time_ns)
+    if at != PERIOD:
+        raise VnetError(f"at = {at!r}: must be {PERIOD!r} or {EVENT!r}")
+    rows = run.states.to_pylist()
+    there = (row for row in rows if not np.isnan(row["position_m"]).any())
+    return [Moment(row["time_ns"], row["node"], values=row) for row in there]
+
+
+def _events(run: Run) -> Iterator[Moment]:
+    for event in run.events:
+        if event.node is not None:
+            own = event.kind == "event"
+            name = str(event.details.get("name", "")) if own else event.kind
+            yield Moment(
+                event.time_ns, event.node, name, event.details.get("details", {}) if own else event.details
+            )
+
+
+def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
+    """Judge that a predicate is true at every moment; unknown if it has nothing to say at any."""
+    return _held(run, name, ((m, predicate(m)) for m in moments(run, at)), "does not hold")
+
+
+def never(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
+    """Judge that a predicate is true at no moment; unknown if it has nothing to say at any."""
+    asked = ((m, predicate(m)) for m in moments(run, at))
+    return _held(run, name, ((m, None if held is None else not held) for m, held in asked), "holds")
+
+
+def eventually(run: Run, name: str, predicate: Predicate, within_s: float = math.inf, at: str = PERIOD) -> Result:
+    """Judge that a predicate becomes true of each vehicle, within so many seconds of its first moment."""
+    first: dict[str, Moment] = {}
+    reached: dict[str, float] = {}
+    for moment in moments(run, at):
+        begun = first.setdefault(moment.node, moment)
+        waited_s = moment.time_s - begun.time_s
+        if moment.node not in reached and waited_s <= within_s + 1e-9 and predicate(moment):
+            reached[moment.node] = waited_s
+    late = [moment for node, moment in first.items() if node not in reached]
+    if not first:
+        return Result(name, "unknown", f"no {at} of any vehicle")
+    if late:
+        limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
+        return _failed(run, name, late, f"never came true{limit}")
+    slowest_s = max(reached.values())
+    return Result(
+        name, "valid", f"true of all {len(first)} vehicles within {slowest_s:g} s", {"slowest_s": slowest_s}
+    )
+
+
+def leads_to(
+    run: Run,
+    name: str,
+    cause: Predicate,
+    effect: Effect,
+    within_s: float,
+    *,
+    at: str = PERIOD,
+    effect_at: str | None = None,
+) -> Result:
+    """Judge that each moment at which `cause` is true is followed, within so many seconds, by one of `effect`.
+
+    `effect(moment, cause)` is given both moments: it says whether they belong together, for example
+    `moment.node == cause.node`. A cause less than `within_s` before the end of the run counts only if its effect
+    came. `effect_at` says at what moments effects are looked for, by default those of causes.
+    """
+    causes = [moment for moment in moments(run, at) if cause(moment)]
+    effects = moments(run, effect_at or at)
+    times_ns = np.array([moment.time_ns for moment in effects], dtype=np.int64)
+    within_ns = round(within_s * NS_PER_S)
+    end_ns = round(len(run.times_s) * run.period_s * NS_PER_S)
+    failed, delays_s = [], []
+    for moment in causes:
+        first, last = np.searchsorted(times_ns, [moment.time_ns, moment.time_ns + within_ns + 1])
+        found = next((each for each in effects[first:last] if effect(each, moment)), None)
+        if found is not None:
+            delays_s.append(found.time_s - moment.time_s)
+        elif moment.time_ns + within_ns < end_ns:
+            failed.append(moment)
+    if failed:
+        return _failed(run, name, failed, f"was not followed within {within_s:g} s", of=len(causes))
+    if not delays_s:
+        return Result(name, "unknown", "the cause never came true")
+    slowest_s = max(delays_s)
+    text = f"each of {len(delays_s)} causes was followed within {slowest_s:g} s"
+    return Result(name, "valid", text, {"slowest_s": slowest_s})
+
+
+def _held(run: Run, name: str, answers: Iterable[tuple[Moment, bool | None]], problem: str) -> Result:
+    asked = [(moment, held) for moment, held in answers if held is not None]
+    failed = [moment for moment, held in asked if not held]
+    if failed:
+        return _failed(run, name, failed, problem, of=len(asked))
+    if not asked:
+        return Result(name, "unknown", "the predicate had nothing to say at any moment")
+    return Result(name, "valid", f"true at {len(asked)} moments", {"moments": len(asked)})
+
+
+def _failed(run: Run, name: str, failed: list[Moment], problem: str, of: int | None = None) -> Result:
+    """Return an invalid result that names the first failure, and what led there."""
+    first = failed[0]
+    many = f" ({len(failed)}{'' if of is None else f' of {of}'} in all)" if len(failed) > 1 else ""
+    event = f", event {first.event}" if first.event else ""
+    text = f"{problem}: first of {first.node} at {first.time_s:g} s{event}{many}"
+    rows = [{"node": moment.node, "time_s": moment.time_s} for moment in failed[:MOST_TOLD]]
+    led = before(run.trace, run.events, first.node, first.time_ns)
+    return Result(name, "invalid", text, {"rows": rows, "before": led})

@@ -1,0 +1,142 @@
+"""Properties over time: always, never, eventually, leads to, over reported values, events and truth."""
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.api import simulate
+from emulator.checks.properties import Moment, always, eventually, leads_to, moments, never
+from emulator.records.run import Run
+from emulator.testing.harness import RunHarness
+from emulator.testing.scenarios import make_scenario
+from vnet import Node
+from vnet.errors import VnetError
+
+
+async def brakes(node: Node) -> None:
+    """v01 brakes at 0.5 s and says so; who hears it shows a warning after 0.1 s, but v03 only after 0.4 s."""
+    heard_s: float | None = None
+    async for fix in node.gnss:
+        now_s = fix.time_ns / 1e9
+        if node.id == "v01" and now_s == 0.5:
+            node.event("braked", force=0.8)
+            await node.radio.broadcast(b"brake")
+        if node.radio.drain() and heard_s is None:
+            heard_s = now_s
+        if heard_s is not None and abs(now_s - heard_s - (0.3 if node.id == "v03" else 0.0)) < 1e-6:
+            node.event("warned")
+        node.report(fix.position_m, warned=heard_s is not None, count=now_s)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    scenario = {
+        "run": {"duration_s": 2.0, "settle_s": 0.0},
+        "network": {"vehicles": 4},
+        "radio": {"range_m": 1e6},
+    }
+    return simulate(
+        scenario, program="tests.emulator.checks.test_properties:brakes", out=tmp_path_factory.mktemp("run") / "run"
+    )
+
+
+def braked(moment: Moment) -> bool:
+    return moment.event == "braked"
+
+
+def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
+    assert always(run, "counts", lambda m: m["count"] >= 0).verdict == "valid"
+    assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).verdict == "valid"
+    failed = always(run, "early", lambda m: m["count"] < 1.0)
+    assert failed.verdict == "invalid"
+    assert failed.text == "does not hold: first of v01 at 1 s (40 of 80 in all)"
+    assert failed.figures["rows"][0] == {"node": "v01", "time_s": 1.0}
+    assert any("sent frame 0" in line for line in failed.figures["before"])
+    assert never(run, "early", lambda m: m["count"] >= 1.0).text.startswith("holds: first of v01 at 1 s")
+
+
+def test_a_predicate_that_has_nothing_to_say_is_unknown(run: Run) -> None:
+    assert always(run, "nothing", lambda m: None).verdict == "unknown"
+    assert always(run, "missing", lambda m: None if m["no_such"] is None else False).verdict == "unknown"
+
+
+def test_eventually_is_of_each_vehicle_and_within_a_time(run: Run) -> None:
+    assert eventually(run, "late", lambda m: m["count"] >= 1.9).figures == {"slowest_s": 1.9}
+    short = eventually(run, "late", lambda m: m["count"] >= 1.9, within_s=1.0)
+    assert short.verdict == "invalid" and short.text.startswith("never came true within 1 s: first of v01")
+    others = eventually(run, "warned", lambda m: m["warned"])
+    assert others.verdict == "invalid" and others.figures["rows"] == [{"node": "v01", "time_s": 0.0}]
+
+
+def test_what_leads_to_what_by_events_of_other_vehicles(run: Run) -> None:
+    def warned_by(node: str, within_s: float) -> str:
+        result = leads_to(
+            run, "warned", braked, lambda m, cause: (m.node, m.event) == (node, "warned"), within_s, at="event"
+        )
+        return f"{result.verdict}: {result.text}"
+
+    assert warned_by("v02", 0.2).startswith("valid: each of 1 causes was followed within 0.1 s")
+    assert warned_by("v03", 0.5).startswith("valid")
+    assert warned_by("v03", 0.2) == "invalid: was not followed within 0.2 s: first of v01 at 0.5 s, event braked"
+    never_caused = leads_to(run, "x", lambda m: False, lambda m, cause: True, 1.0)
+    assert never_caused.verdict == "unknown"
+
+
+def test_a_cause_near_the_end_counts_only_if_its_effect_came(run: Run) -> None:
+    last = leads_to(run, "x", lambda m: m["count"] >= 1.8, lambda m, cause: False, 1.0)
+    assert last.verdict == "unknown", last
+
+
+def test_moments_are_periods_or_events(run: Run) -> None:
+    assert len(moments(run)) == 80
+    events = moments(run, "event")
+    assert [moment.event for moment in events if moment.node == "v01"] == ["braked"]
+    assert next(m for m in events if m.event == "braked")["force"] == 0.8
+    with pytest.raises(VnetError, match="at = 'second': must be 'period' or 'event'"):
+        moments(run, "second")
+
+
+def test_the_result_is_one_of_a_check_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checks = tmp_path / "promises.py"
+    checks.write_text(
+        "from emulator.checks.properties import always\n\n\n"
+        "def check(run):\n    yield always(run, 'small', lambda m: m['count'] < 0.5)\n"
+    )
+    judged = simulate(
+        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
+        program="tests.emulator.checks.test_properties:brakes",
+        checks=[str(checks) + ":check"],
+        out=tmp_path / "run",
+    )
+    (check,) = [check for check in judged.checks if check.name == "own:small"]
+    assert judged.verdict == "invalid" and check.text.startswith("does not hold: first of v01 at 0.5 s")
+
+
+def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
+    scenario = make_scenario(
+        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
+        {"program": "tests.emulator.checks.test_properties:brakes"},
+    )
+
+    def counts(moment: Moment) -> bool:
+        return bool(moment["count"] >= 0)
+
+    async def story() -> None:
+        async with RunHarness(scenario, tmp_path / "run") as emu:
+            emu.always(counts)
+            emu.never(lambda moment: moment["count"] > 0.5, name="long")
+            emu.eventually(lambda moment: moment["count"] > 0.3, within_s=0.5, name="soon")
+            emu.leads_to(
+                braked, lambda moment, cause: moment.event == "warned", within_s=0.4, at="event", name="warns"
+            )
+            with pytest.raises(VnetError, match="needs a name="):
+                emu.always(lambda moment: True)
+            await emu.run_until(1.0)
+            emu.check("own:counts", "own:soon", "own:warns")
+            with pytest.raises(AssertionError, match=r"own:long is invalid: holds: first of v01 at 0.6 s"):
+                emu.check("own:long")
+
+    asyncio.run(story())
+    assert Run.open(tmp_path / "run").verdict == "invalid"
