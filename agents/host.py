@@ -18,6 +18,7 @@ from agents.attachment import Attachment, Found, RunOverError, no_wake, write_li
 from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime.ahead import RunAhead
 from vnet.runtime.disks import Disks
+from vnet.runtime.forced_end import end_within
 from vnet.runtime.host import Host
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
@@ -53,6 +54,7 @@ def run_agent(
         session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
         attachment = Attachment(session, run, nodes, stack)
         stack.callback(attachment.write_total)
+        stack.callback(end_within)
         set_time_slice(COMPUTING_SLICE_NS)
         welcomes = attachment.join(join_timeout_s)
         try:

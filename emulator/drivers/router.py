@@ -18,6 +18,7 @@ import zenoh
 from emulator.drivers.launch import Launcher
 from vnet.errors import TransportError
 from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.forced_end import end_within
 from vnet.transport.access import Access
 
 ROUTER = "router"
@@ -54,6 +55,7 @@ def main(config: str) -> None:
     signal_at_parent_death(signal.SIGTERM)
     with zenoh.open(zenoh.Config.from_file(config)):
         over.wait()
+        end_within()
 
 
 if __name__ == "__main__":
