@@ -17,6 +17,7 @@ import numpy as np
 from emulator.checks.own import Result
 from emulator.records.parting import before
 from emulator.records.run import Run
+from vnet.counted import counted
 from vnet.errors import VnetError
 from vnet.units import NS_PER_S
 
@@ -107,7 +108,7 @@ def eventually(run: Run, name: str, predicate: Predicate, within_s: float = math
         return _failed(run, name, late, f"never came true{limit}")
     slowest_s = max(reached.values())
     return Result(
-        name, "valid", f"true of all {len(first)} vehicles within {slowest_s:g} s", {"slowest_s": slowest_s}
+        name, "valid", f"true of {counted(len(first), 'vehicle')} within {slowest_s:g} s", {"slowest_s": slowest_s}
     )
 
 
@@ -145,7 +146,7 @@ def leads_to(
     if not delays_s:
         return Result(name, "unknown", "the cause never came true")
     slowest_s = max(delays_s)
-    text = f"each of {len(delays_s)} causes was followed within {slowest_s:g} s"
+    text = f"{counted(len(delays_s), 'cause')} followed by an effect within {slowest_s:g} s"
     return Result(name, "valid", text, {"slowest_s": slowest_s})
 
 
@@ -156,7 +157,7 @@ def _held(run: Run, name: str, answers: Iterable[tuple[Moment, bool | None]], pr
         return _failed(run, name, failed, problem, of=len(asked))
     if not asked:
         return Result(name, "unknown", "the predicate had nothing to say at any moment")
-    return Result(name, "valid", f"true at {len(asked)} moments", {"moments": len(asked)})
+    return Result(name, "valid", f"true at {counted(len(asked), 'moment')}", {"moments": len(asked)})
 
 
 def _failed(run: Run, name: str, failed: list[Moment], problem: str, of: int | None = None) -> Result:

@@ -77,7 +77,7 @@ def test_what_leads_to_what_by_events_of_other_vehicles(run: Run) -> None:
         )
         return f"{result.verdict}: {result.text}"
 
-    assert warned_by("v02", 0.2).startswith("valid: each of 1 causes was followed within 0.1 s")
+    assert warned_by("v02", 0.2).startswith("valid: 1 cause followed by an effect within 0.1 s")
     assert warned_by("v03", 0.5).startswith("valid")
     assert warned_by("v03", 0.2) == "invalid: was not followed within 0.2 s: first of v01 at 0.5 s, event braked"
     never_caused = leads_to(run, "x", lambda m: False, lambda m, cause: True, 1.0)
