@@ -25,6 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.own import is_broken
+from emulator.pages.page import table as page_table
 from emulator.records.atomic import write_atomically
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
@@ -32,6 +33,7 @@ from emulator.records.verdicts import Verdict
 from emulator.report.index import write_index
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.campaign_plan import Plan
+from emulator.testing.explanation import PARTING_FILE, Explanation, explain
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, regression_test
@@ -57,6 +59,13 @@ class Outcome:
     again: Trial | None = None
     steps: int = 0
     folder: Path | None = None
+    explanation: Explanation | None = None
+    """Comparison of the shrunk run with one that passes; None before it is made."""
+
+    @property
+    def passed(self) -> bool:
+        """True if the run was judged, and nothing failed."""
+        return bool(self.trial.verdicts) and not self.trial.failed
 
     @property
     def seed(self) -> int:
@@ -109,6 +118,8 @@ class Outcome:
                 "steps": self.steps,
                 "folder": str(self.folder),
             }
+        if self.explanation is not None:
+            row["parting"] = self.explanation.as_json()
         return row
 
 
@@ -165,6 +176,7 @@ class Campaign:
             try:
                 for future in as_completed(futures):
                     self._take(future.result())
+                self.outcomes = list(pool.map(self._explained, self.outcomes))
             except KeyboardInterrupt:
                 self.interrupted = True
                 self._workshop.close()
@@ -216,6 +228,17 @@ class Campaign:
         (folder / TEST_FILE).write_text(regression_test(folder.name, sorted(outcome.trial.failed)))
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
 
+    def _explained(self, outcome: Outcome) -> Outcome:
+        """Return a run that has failed with what tells it from one that passes, which is also put in its folder."""
+        if outcome.folder is None or outcome.shrunk is None or self._workshop.closed:
+            return outcome
+        passed = [other for other in self.outcomes if other.passed]
+        nearest = min(passed, key=lambda other: _distance(outcome, other), default=None)
+        other = nearest.scenario if nearest else None
+        explanation = explain(outcome.shrunk, outcome.folder, other, self._workshop)
+        (outcome.folder / PARTING_FILE).write_text(explanation.text())
+        return replace(outcome, explanation=explanation)
+
     def _smallest(self, outcome: Outcome, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
         """Return the least run found that still fails, and how many were tried: order, faults, vehicles, time."""
         base, of_order = outcome.scenario, 0
@@ -256,6 +279,7 @@ class Campaign:
             "order": outcome.order(),
             "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
             "folder": f"failures/{outcome.folder.name}",
+            "parting": _parting(outcome.explanation),
         }
 
     def summary(self) -> Iterator[Table | Text]:
@@ -274,6 +298,23 @@ class Campaign:
             least = "\n".join(filter(None, [told["schedule"] or "no faults", told["order"]]))
             table.add_row(told["number"], str(outcome.seed), Text(texts), Text(least))
         yield table
+        for outcome in self.failures:
+            if outcome.label in first and outcome.explanation is not None:
+                yield Text(f"{outcome.label} {outcome.explanation.line()}")
+
+
+def _distance(outcome: Outcome, other: Outcome) -> tuple[bool, int]:
+    """Return by what to choose among runs to compare a run with: the last one before it, else the next."""
+    return other.number > outcome.number, abs(other.number - outcome.number)
+
+
+def _parting(explanation: Explanation | None) -> dict[str, Any] | None:
+    """Return what a page shows of an explanation: its line, its table, and what came before."""
+    if explanation is None:
+        return None
+    rows = page_table(explanation.rows()) if explanation.partings else None
+    node = explanation.partings[0].node if explanation.partings else ""
+    return {"line": explanation.line(), "rows": rows, "node": node, "until": explanation.until}
 
 
 def runs_of(kind: FailureKind) -> str:

@@ -64,18 +64,23 @@ class Plan:
     def draw(self, number: int) -> Scenario:
         """Run `number`: a network, a seed and one to four faults, if there are to be any."""
         seed = (self.seed + number) % SEEDS
-        changes: dict[str, Any] = {"seed": seed}
-        if self.scenario.network.kind == "generated":
-            changes["network.seed"] = seed
-        if self.scenario.run.order != "fifo":
-            changes["run.order_seed"] = seed
-        scenario = make_scenario(self.scenario, changes)
+        scenario = with_seed(self.scenario, seed)
         if not self.kinds:
             return scenario
         choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
         weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
         faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
         return make_scenario(scenario, {"faults": faults})
+
+
+def with_seed(scenario: Scenario, seed: int) -> Scenario:
+    """Return the scenario with another seed, which also draws the network, if it is generated, and the order."""
+    changes: dict[str, Any] = {"seed": seed}
+    if scenario.network.kind == "generated":
+        changes["network.seed"] = seed
+    if scenario.run.order != "fifo":
+        changes["run.order_seed"] = seed
+    return make_scenario(scenario, changes)
 
 
 def _with_time_for_faults(scenario: Scenario) -> tuple[Scenario, str]:

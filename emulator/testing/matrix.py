@@ -44,8 +44,9 @@ def page(
 ) -> str:
     """Return the whole page.
 
-    A failure has `number`, `seed`, `checks` (texts by name), `schedule` (TOML), `order` (a phrase), `command` and
-    `folder`; a kind of failures `check`, `text`, `first` (a number) and `runs`.
+    A failure has `number`, `seed`, `checks` (texts by name), `schedule` (TOML), `order` (a phrase), `command`,
+    `folder` and `parting` (where it parts from a run that passes, or None); a kind of failures `check`, `text`,
+    `first` (a number) and `runs`.
     """
     columns = list(dict.fromkeys(column for row in matrix.values() for column in row))
     kinds = {kind: [_cell(row.get(column, Counter())) for column in columns] for kind, row in matrix.items()}

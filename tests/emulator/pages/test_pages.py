@@ -49,7 +49,8 @@ class Elements(HTMLParser):
 def campaign(text: str) -> str:
     """A campaign's page with a text wherever others may have written it."""
     failure = dict.fromkeys(("number", "seed", "schedule", "order", "command", "folder"), text) | {
-        "checks": {text: text}
+        "checks": {text: text},
+        "parting": {"line": text, "rows": table([{text: text}]), "node": text, "until": [text, text]},
     }
     return campaign_page(text, [text], {text: {text: Counter({Verdict.INVALID: 1})}}, [failure])
 

@@ -67,3 +67,10 @@ async def tells_before_it_measures(node: Node) -> None:
     async with asyncio.TaskGroup() as tasks:
         tasks.create_task(measure())
         tasks.create_task(tell())
+
+
+async def northerner(node: Node) -> None:
+    """A beacon that crashes south-east of a diagonal: whether it does depends on the seed of the network alone."""
+    async for fix in node.gnss:
+        assert fix.position_m[1] > fix.position_m[0], "too far south-east"
+        await node.radio.broadcast(b"here")

@@ -73,6 +73,7 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
         assert again["verdict"] == "invalid"
         assert row["folder"] in again["reproduce"]
         assert 'kind = "pause"' in said
+        assert row["parting"]["passing"] == "the same run without faults"
     spared = [row for row in results if "failed" not in row]
     assert all("pause" not in {fault["kind"] for fault in row["faults"]} for row in spared)
     text = (folder / "campaign.html").read_text()
@@ -262,6 +263,7 @@ def test_the_page_needs_nothing_else_and_escapes_what_programs_say() -> None:
         "order": "FIFO, except <b>",
         "command": "vnet simulate 'a & b'",
         "folder": "failures/001",
+        "parting": None,
     }
     text = page("Campaign <b>", ["2 of 2 runs"], matrix, [failure])
     reader = Reader(text)

@@ -16,6 +16,7 @@ from emulator.records.tape import tape_lines
 from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan
+from emulator.testing.explanation import PARTING_FILE
 from emulator.testing.regression_test import TEST_FILE
 from emulator.testing.shrinking_runs import fewest, order_text
 from vnet.transport.orders import Deviation
@@ -59,14 +60,20 @@ def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(tmp_path
         }
     )
     folder = tmp_path / "campaign"
-    status = run_campaign(Plan.of(scenario, "none", 2, 1), folder, Console(file=io.StringIO(), width=200))
+    said = io.StringIO()
+    status = run_campaign(Plan.of(scenario, "none", 2, 1), folder, Console(file=said, width=200))
     assert status == 1
     rows = json.loads((folder / "campaign.json").read_text())["results"]
     failed = [row for row in rows if "order" in row]
     assert failed and all(
         row["order"].startswith("FIFO, except ") and row["order"].count("timer of tell") == 1 for row in failed
     )
-    assert "The order of events: FIFO, except" in (folder / "campaign.html").read_text()
+    page = (folder / "campaign.html").read_text()
+    assert "The order of events: FIFO, except" in page
+    parts = "parts from the same run in FIFO order at "
+    assert f"\n001 {parts}" in said.getvalue() and page.count(f"This run {parts}") == len(failed)
+    assert (folder / "failures" / "001" / PARTING_FILE).read_text().startswith(parts)
+    assert [row["parting"]["differences"][0]["first"] for row in failed] == ["decision"] * len(failed)
     test = folder / "failures" / "001" / TEST_FILE
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)], capture_output=True, text=True
