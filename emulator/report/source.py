@@ -25,7 +25,7 @@ from vnet.errors import VnetError, printable
 from vnet.types import Array
 
 COLUMNS = {
-    TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "outcome", "cause", "arrival_ns", "copy"),
+    TRACE_FILE: ("sent_ns", "sender", "seq", "receiver", "size_bytes", "outcome", "cause", "arrival_ns", "copy"),
     STATES_FILE: ("period", "time_ns", "node", "position_m", "values"),
     METRICS_FILE: (
         "time_ns",

@@ -23,6 +23,7 @@ from emulator.report.figures import draw
 from emulator.report.index import write_index
 from emulator.report.radio import radio_section
 from emulator.report.source import Source, maybe, why_not
+from emulator.report.timeline import timeline
 from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
@@ -76,6 +77,7 @@ def report_page(source: Source) -> str:
         has_errors=bool(record and shown_figures(record.figures)),
         reported=_reported(record) if record else None,
         charts=draw(source),
+        timeline=maybe(lambda: timeline(source)),
         radio=radio_section(source),
         cost=_cost(record) if record else None,
         events=_events(source),
