@@ -7,14 +7,11 @@ nothing else.
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import json
 import re
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,8 +19,9 @@ import numpy as np
 from emulator.records.run import Run
 from emulator.records.verdict_file import Record
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, unknown
+from emulator.scenario.own_functions import in_words, line_of, load_function, outside
 from emulator.scenario.program import Program
-from vnet.errors import ScenarioError, VnetError, printable, shown
+from vnet.errors import VnetError, printable, shown
 from vnet.runtime.program_path import search_programs_in
 
 PREFIX = "own:"
@@ -62,25 +60,8 @@ class _NonsenseError(VnetError):
 def load_checks(program: Program) -> dict[str, CheckFunction]:
     """Import a scenario's own checks, by entry. Raises VnetError for one that cannot be imported."""
     search_programs_in(program.folders)
-    return {entry: _load(entry, program) for entry in program.checks}
-
-
-def _load(entry: str, program: Program) -> CheckFunction:
-    name, _, function = entry.partition(":")
-    problem = f"program.checks = {entry!r}"
-    if name in {each.entry.partition(":")[0] for each in (program, *program.exceptions)}:
-        raise ScenarioError(f"{problem}: is in the program's module: put it into a module of its own")
-    try:
-        module = importlib.import_module(name)
-    except (Exception, SystemExit) as error:
-        raise ScenarioError(f"{problem}: cannot import: {_in_words(error)}") from error
-    check = getattr(module, function, None)
-    if check is None:
-        file = getattr(module, "__file__", None) or "built in"
-        raise ScenarioError(f"{problem}: module {name} ({file}) has no {function!r}")
-    if not callable(check) or inspect.iscoroutinefunction(check):
-        raise ScenarioError(f"{problem}: is not a function of a run: def {function}(run)")
-    return check  # type: ignore[no-any-return]
+    usage = "of a run: def {}(run)"
+    return {entry: load_function("program.checks", entry, program, usage) for entry in program.checks}
 
 
 def own_findings(program: Program, run: Run) -> list[Finding]:
@@ -118,25 +99,12 @@ def _unknown(entry: str, error: BaseException) -> CheckResult:
     if isinstance(error, VnetError) and not isinstance(error, _NonsenseError):
         said = str(error)
     else:
-        said = str(error) if isinstance(error, _NonsenseError) else f"raises {_in_words(error)}"
-    outside = traceback.extract_tb(_outside(error))
-    if not outside or isinstance(error, _NonsenseError):
+        said = str(error) if isinstance(error, _NonsenseError) else f"raises {in_words(error)}"
+    frames = outside(error, __file__)
+    if frames is None or isinstance(error, _NonsenseError):
         return unknown(_broken(entry), said)
-    last = [frame for frame in outside if frame.filename == outside[0].filename][-1]
-    where = "".join(traceback.format_exception(error.with_traceback(_outside(error))))
-    return unknown(_broken(entry), f"{said} ({Path(last.filename).name}:{last.lineno})", where=where)
-
-
-def _outside(error: BaseException) -> Any:
-    """The traceback from the first line that is not of this module."""
-    frames = error.__traceback__
-    while frames is not None and frames.tb_frame.f_code.co_filename == __file__:
-        frames = frames.tb_next
-    return frames
-
-
-def _in_words(error: BaseException) -> str:
-    return printable(" ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":"), 300)
+    where = "".join(traceback.format_exception(error.with_traceback(frames)))
+    return unknown(_broken(entry), f"{said} ({line_of(frames)})", where=where)
 
 
 def _findings_of(entry: str, program: Program, run: Run) -> Iterator[Finding]:
