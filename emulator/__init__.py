@@ -13,11 +13,15 @@ if TYPE_CHECKING:
     from emulator.api import run, simulate
     from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
+    from emulator.radio.own_rules import RadioFrame
+    from emulator.radio.rule_answers import Answer
     from emulator.report.notebook import Run
 
-__all__ = ["Result", "Run", "run", "simulate", "sweep"]
+__all__ = ["Answer", "RadioFrame", "Result", "Run", "run", "simulate", "sweep"]
 
 _PUBLIC = {
+    "Answer": "emulator.radio.rule_answers",
+    "RadioFrame": "emulator.radio.own_rules",
     "Result": "emulator.checks.own",
     "Run": "emulator.report.notebook",
     "run": "emulator.api",

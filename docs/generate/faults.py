@@ -41,7 +41,11 @@ payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, f
 INFRASTRUCTURE = """
 Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
 """
-NOTES = {"Misbehaviour": MISBEHAVIOUR, "Infrastructure": INFRASTRUCTURE}
+RULES = """
+[faults.md](../faults.md#rules-of-your-own) shows how rules are written. They stand in a scenario, or in a test as
+`emu.rule(…)`; a running emulator accepts none.
+"""
+NOTES = {"Misbehaviour": MISBEHAVIOUR, "Infrastructure": INFRASTRUCTURE, "Rules of your own": RULES}
 """Notes below the titles of chapters."""
 SHARED = ("nodes", "senders", "receivers")
 """Selectors, which the introduction describes."""

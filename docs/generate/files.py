@@ -166,6 +166,11 @@ EVENTS = {
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
     "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
     "left": ("vehicle", "", "it is not in the network any more"),
+    "rule_failed": (
+        "",
+        "`fault`, `rule`, `sender`, `error`, `where`",
+        "a rule of your own raised, did not answer, or answered nonsense: it lets everything pass from then on",
+    ),
     "fault_started": ("", "`fault`, `nodes`", "a fault begins to act, and on whom"),
     "fault_ended": ("", "`fault`", "it has healed"),
     "emulator_restarted": ("", "`down_s`", "the emulator's connection is back"),

@@ -42,7 +42,7 @@ from vnet.transport.access import Access
 from vnet.transport.session import quiet_zenoh
 
 FORMAT = 2
-BROKEN = ("died", "crashed", "exception", "spun", "stalled")
+BROKEN = ("died", "crashed", "exception", "spun", "stalled", "rule_failed")
 """Events after which a run says nothing about its program's figures."""
 _code_digests = cache(digests_of)
 

@@ -25,7 +25,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, Any, TypeVar
 
-from emulator.records.code_digest import digests_of, entries_of
+from emulator.records.code_digest import digests_of, entries_of, rules_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.runtime.environment import ONE_BLAS_THREAD
@@ -76,8 +76,8 @@ class Place:
 
 
 def modules_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the entries of the programs and own checks of a scenario."""
-    return (*entries_of(scenario), *scenario.program.checks)
+    """Return the entries of the programs, own checks and own rules of a scenario."""
+    return (*entries_of(scenario), *scenario.program.checks, *rules_of(scenario))
 
 
 def is_fit() -> bool:

@@ -12,7 +12,7 @@ from emulator.records.distributions import binomial_interval
 from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
-from emulator.scenario.faults import StaleMessages
+from emulator.scenario.faults import Custom, CustomSender, StaleMessages
 from emulator.world.neighbours import Links
 from vnet.counted import counted
 from vnet.types import IntArray, Mask
@@ -78,8 +78,7 @@ def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
     ]
     in_range = recorded.places.receivers_in_range(recorded.sender[first], recorded.sent_ns[first])
     wrong = recorded.placed[first] & (rows != in_range)
-    received_twice = recorded.caused_by("duplicate") & (recorded.copy > 0)
-    sent = np.bincount(inverse, weights=~received_twice, minlength=len(first)) > 0
+    sent = np.bincount(inverse, weights=~received_twice(recorded), minlength=len(first)) > 0
     return np.asarray((wrong & sent)[inverse])
 
 
@@ -228,7 +227,8 @@ def drew_for_loss(recorded: RecordedRun) -> Mask:
 
 def received_twice(recorded: RecordedRun) -> Mask:
     """Return the rows that are no transmission of their own: duplicates of a reception."""
-    return np.asarray(recorded.caused_by("duplicate") & (recorded.copy > 0))
+    by_rule = recorded.caused_by("custom") & ~recorded.outcome_is("fault")
+    return np.asarray((recorded.caused_by("duplicate") | by_rule) & (recorded.copy > 0))
 
 
 def binomial_band(drawn: int, probability: float, share: float) -> tuple[float, float]:
@@ -259,7 +259,7 @@ def check_isolation(recorded: RecordedRun) -> Finding:
 
 def _foreign(recorded: RecordedRun) -> Mask:
     """Arrivals with other bytes than their frame's that no fault changed."""
-    differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded)
+    differs = recorded.arrived & ~recorded.caused_by("corrupt") & changed_bytes(recorded) & ~_ruled(recorded)
     replaced = _replaced(recorded)
     differs |= recorded.arrived & _not_of_that_age(recorded, replaced)
     # A frame that a stale one replaced is in no row of its own.
@@ -273,10 +273,20 @@ def _foreign(recorded: RecordedRun) -> Mask:
     return np.asarray(differs)
 
 
+def _ruled(recorded: RecordedRun) -> Mask:
+    """Rows whose bytes a rule of the user's own may have chosen, on the link or at the sender."""
+    ruled = np.zeros(len(recorded.trace), dtype=bool)
+    for planned in recorded.plan:
+        if isinstance(planned.fault, Custom | CustomSender):
+            ruled |= recorded.reached(planned, recorded.guard_ns)
+    return ruled
+
+
 def changed_bytes(recorded: RecordedRun) -> Mask:
     """Return the rows with other bytes than their frame's, as far as an uncorrupted original shows them."""
     frame, index = np.unique(recorded.frame, return_inverse=True)
-    plain = np.flatnonzero((recorded.copy == 0) & ~recorded.caused_by("corrupt"))[::-1]
+    altered = recorded.caused_by("corrupt", "custom", "custom_sender")
+    plain = np.flatnonzero((recorded.copy == 0) & ~altered)[::-1]
     said = np.zeros(len(frame), dtype=np.uint64)
     known = np.zeros(len(frame), dtype=bool)
     said[index[plain]], known[index[plain]] = recorded.digest[plain], True
@@ -284,7 +294,7 @@ def changed_bytes(recorded: RecordedRun) -> Mask:
 
 
 def _replaced(recorded: RecordedRun) -> Mask:
-    """Originals that a stale frame may have replaced. (If a fault cut them, they name that fault.)
+    """Originals that a stale frame, or a rule's, may have replaced. (If a fault cut them, they name that fault.)
 
     A sender's frames are remembered from when a fault first makes it misbehave.
     """
@@ -294,6 +304,8 @@ def _replaced(recorded: RecordedRun) -> Mask:
         if isinstance(planned.fault, SenderFault):
             remembered_ns[planned.nodes] = np.minimum(remembered_ns[planned.nodes], planned.start_ns)
     for planned in recorded.plan:
+        if isinstance(planned.fault, CustomSender):
+            replaced |= recorded.reached(planned, recorded.guard_ns) & (recorded.copy == 0)
         if isinstance(planned.fault, StaleMessages):
             old_ns = recorded.sent_ns - round(planned.fault.age_s * NS_PER_S) + recorded.guard_ns
             acts = recorded.reached(planned, recorded.guard_ns) & (recorded.copy == 0)

@@ -14,7 +14,7 @@ from emulator.faults.plan import PlannedFault
 from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import Fault, LossFault, ProcessFault, SenderFault
-from emulator.scenario.faults import BurstLoss, Corrupt, Duplicate, GnssOutage, StaleMessages
+from emulator.scenario.faults import BurstLoss, Corrupt, Custom, CustomSender, Duplicate, GnssOutage, StaleMessages
 from vnet.counted import counted
 from vnet.types import Array, Mask
 
@@ -89,6 +89,16 @@ def _(fault: SenderFault, recorded: RecordedRun) -> Mask:
 @can_cause.register
 def _(fault: StaleMessages, recorded: RecordedRun) -> Mask:
     return np.asarray((recorded.copy == 0) & ~recorded.outcome_is("fault"))
+
+
+@can_cause.register
+def _(fault: Custom, recorded: RecordedRun) -> Mask:
+    return recorded.outcome_is("fault") | recorded.arrived
+
+
+@can_cause.register
+def _(fault: CustomSender, recorded: RecordedRun) -> Mask:
+    return ~recorded.outcome_is("fault")
 
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:

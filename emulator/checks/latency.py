@@ -10,13 +10,14 @@ import numpy as np
 
 from emulator.checks.channel import nothing_seen, received_twice
 from emulator.faults.plan import PlannedFault
+from emulator.radio.rule_answers import LONGEST_DELAY_S, MOST_COPIES
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Finding, result
 from emulator.scenario.fault_families import DelayFault
-from emulator.scenario.faults import Duplicate, Throttle
+from emulator.scenario.faults import Custom, Duplicate, Throttle
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
-from vnet.units import NS_PER_MS
+from vnet.units import NS_PER_MS, NS_PER_S
 
 BAND_SIGMAS = 4.9
 """Half-width of the band of a mean, in standard deviations: one sound mean in a million is further off."""
@@ -150,6 +151,9 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
                 if least_ms:
                     least += np.where(recorded.reached(planned, -guard_ns), least_ms, 0)
                 most += np.where(recorded.reached(planned, guard_ns), most_ms, 0)
+            case Custom():
+                later = np.where(recorded.reached(planned, guard_ns), LONGEST_DELAY_S * NS_PER_S / NS_PER_MS, 0)
+                most += later * np.where(received_twice(recorded), 1 + MOST_COPIES, 1)
             case Duplicate(delay_ms=delay_ms, copies=copies):
                 mine = (recorded.cause == planned.number) & (recorded.copy > 0)
                 least += np.where(mine, delay_ms, 0)

@@ -28,6 +28,7 @@ from emulator.checks.faults import (
     check_pause_respected,
 )
 from emulator.checks.latency import check_latency
+from emulator.checks.own_rules import check_own_rules
 from emulator.checks.radio import check_fading, check_medium
 from emulator.checks.run import (
     check_agents_alive,
@@ -231,6 +232,15 @@ CHECKS: list[Check] = [
         "`DoS` and `Sybil` send each frame as often as configured; `DataReplay` sends the last old enough one.",
         invalid="a frame sent too often, too seldom, or at another time",
         not_applicable="no such fault",
+    ),
+    Check(
+        check_own_rules,
+        FAULTS,
+        "Rules of your own (`custom`, `custom_sender`) answered each frame. One that fails is named with its error "
+        "and line, and lets everything pass from then on.",
+        invalid="a rule raised, did not answer, or answered nonsense",
+        not_applicable="no rule of your own",
+        without_positions=WithoutPositions.JUDGE,
     ),
     Check(
         check_gnss,

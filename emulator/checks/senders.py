@@ -13,7 +13,7 @@ from emulator.records.distributions import chi2_cdf, chi2_sf
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import GnssFault
-from emulator.scenario.faults import DataReplay, DoS, Sybil
+from emulator.scenario.faults import CustomSender, DataReplay, DoS, Sybil
 from emulator.world.receivers import further_error_m
 from vnet.counted import counted
 from vnet.types import Array, IntArray, Mask
@@ -31,7 +31,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
         return NotExercised(name, "no fault sends frames again" if recorded.plan else NO_FAULTS)
     once = ~received_twice(recorded)
-    first = _first_rows(recorded, once & ~_near_a_change(recorded))
+    first = _first_rows(recorded, once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
     originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
     frame_ns = dict(_of(recorded, originals))
     at_once = np.array([frame_ns.get(f) == t for f, t in _of(recorded, copies)], dtype=bool)
@@ -63,6 +63,15 @@ def _near_a_change(recorded: RecordedRun) -> Mask:
         for edge_ns in (planned.start_ns, planned.end_ns):
             near |= np.abs(recorded.sent_ns - edge_ns) < recorded.guard_ns
     return near
+
+
+def _sent_by_rule(recorded: RecordedRun) -> Mask:
+    """Rows of frames in whose place a rule of the user's own may have sent others, as often as it liked."""
+    ruled = np.zeros(len(recorded.trace), dtype=bool)
+    for planned in recorded.plan:
+        if isinstance(planned.fault, CustomSender):
+            ruled |= recorded.reached(planned, recorded.guard_ns)
+    return ruled
 
 
 def _due(recorded: RecordedRun, rows: Rows) -> IntArray:

@@ -17,6 +17,7 @@ from rich.table import Table
 from emulator.cli.help import group
 from emulator.drivers.control import ask
 from emulator.drivers.status import Snapshot
+from emulator.scenario.fault_families import OwnRule
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
@@ -28,13 +29,15 @@ app = group("Inject faults into a running emulator, and heal them.")
 
 RunOption = Annotated[Path, typer.Option("--run", metavar="FOLDER", help="The folder of the run.")]
 LATEST = Path("runs/latest")
+INJECTED = [name for name, kind in KINDS.items() if not issubclass(kind, OwnRule)]
+"""Kinds that an operator may inject: rules are code, which a scenario brings."""
 WATCH_EVERY_S = 1.0
 ALL_ROWS = 50
 
 
 @app.command()
 def inject(
-    kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(KINDS)}.")],
+    kind: Annotated[str, typer.Argument(metavar="KIND", help=f"One of {', '.join(INJECTED)}.")],
     lasting: Annotated[float, typer.Option("--for", metavar="SECONDS", help="How long, in emulated time.")] = 5.0,
     at: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="When, in emulated time. Default: now.")
@@ -56,7 +59,8 @@ def inject(
             fault["at_s"] = at
         for parameter in parameters or []:
             _set(fault, parameter)
-        parse_fault(fault)  # what is wrong is said before anybody is asked
+        if isinstance(parse_fault(fault), OwnRule):  # what is wrong is said before anybody is asked
+            raise ScenarioError(f"{kind}: a rule is part of the scenario: write it as [[fault]] there")
         _show([ask(run, "inject", fault)])
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from emulator.checks.own import load_checks
+from emulator.radio.own_rules import load_rules
 from emulator.records.code_digest import changed_code
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.recorded import recorded_code
@@ -23,6 +24,7 @@ def prepare_folder(
     Where `path` is of another run's folder, and program or vnet have changed since, the run goes on: one line says
     so, and the event `code_changed` records it.
     """
+    load_rules(scenario.fault, scenario.program)
     load_checks(scenario.program)  # a folder appears only once they have proved usable
     folder = RunFolder.prepare(out, scenario)
     for note in notes:

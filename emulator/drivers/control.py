@@ -19,6 +19,7 @@ import zenoh
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.status import Course, fault_state
+from emulator.scenario.fault_families import OwnRule
 from emulator.scenario.faults import parse_fault
 from emulator.viewer.sinks import ServeAt, Sinks
 from vnet.errors import ScenarioError, TransportError, VnetError
@@ -45,6 +46,8 @@ def answer(
             fault = parse_fault(_json(payload))
             if fault.kind == "router_restart" and not own_router:
                 raise ScenarioError("router_restart: needs a router of its own: vnet run --router separate")
+            if isinstance(fault, OwnRule):
+                raise ScenarioError(f"{fault.kind}: a rule is part of the scenario: write it as [[fault]] there")
             return asdict(fault_state(emulation.inject(fault, now_ns), emulation, now_ns))
         case "heal":
             label = _json(payload)

@@ -21,11 +21,13 @@ from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.engine import Deliveries, Delivery, Engine
+from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics, PeriodFigures
 from emulator.records.payloads import PayloadRecorder
 from emulator.records.run_folder import RunFolder
-from emulator.scenario.fault_families import Fault, Infrastructure, ProcessFault
+from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
@@ -76,7 +78,12 @@ class Emulation:
         self.world = world
         self.folder = folder
         self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
-        self.engine = Engine(world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links)
+        self._rules = OwnRules(scenario.run.seed, world.node_ids)
+        self._rules.load(scenario.fault, scenario.program)
+        self._rules.on_failure = self._rule_failed
+        self.engine = Engine(
+            world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links, self._rules
+        )
         self.payloads = PayloadRecorder(world.node_ids) if scenario.run.keep_payloads else None
         if self.payloads is not None:
             self.engine.on_payload = self.payloads.add
@@ -285,6 +292,21 @@ class Emulation:
         planned = self.faults.add(fault.model_copy(update={"at_s": at_s}))
         self._change_plan()
         return planned
+
+    def inject_rule(self, fault: OwnRule, program: Program, now_ns: int) -> PlannedFault:
+        """Plan a rule of the user's own as `inject` does; `program` has the folders in which it is found.
+
+        Raises ScenarioError, also for a rule that cannot be imported.
+        """
+        self._rules.load([fault], program)
+        self.scenario = self.scenario.model_copy(update={"program": program})
+        planned = self.inject(fault, now_ns)
+        self.folder.add_rules(self.scenario)
+        return planned
+
+    def _rule_failed(self, failure: RuleFailure) -> None:
+        details = {"fault": failure.fault, "rule": failure.rule, "sender": failure.sender, "error": failure.error}
+        self.folder.event(failure.time_ns, "rule_failed", None, **details, where=failure.where)
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
         """End a fault right after `now_ns`, and write that down. Raises ScenarioError if there is no such fault."""

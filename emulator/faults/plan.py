@@ -45,7 +45,7 @@ class PlannedFault:
     @property
     def label(self) -> str:
         """Its name in trace, events and commands, for example `partition-0`."""
-        return f"{self.fault.kind}-{self.number}"
+        return f"{self.fault.title}-{self.number}"
 
     def acts_at(self, time_ns: int) -> bool:
         """Return whether the fault acts at this instant."""
@@ -96,7 +96,7 @@ class FaultPlan:
                 moving = _MovingSelection(fault, self._nodes_at, self._period_ns, self._seed, number)
                 nodes, links = moving(start_ns)
         except ScenarioError as error:
-            raise ScenarioError(f"{fault.kind}-{number}: {error}") from None
+            raise ScenarioError(f"{fault.title}-{number}: {error}") from None
         if not fault.follows_vehicles:
             moving = None
         planned = PlannedFault(number, fault, start_ns, end_ns, nodes, links, moving)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
+from emulator.radio.byte_flips import flipped
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
 from emulator.radio.frames import Frame, Receptions, Stage
@@ -28,6 +29,7 @@ from emulator.radio.link_faults import LinkFaults
 from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
+from emulator.radio.own_rules import OwnRules
 from emulator.radio.reception import Reception
 from emulator.radio.sender_faults import Outgoing, SenderFaults
 from emulator.radio.signals import Signals
@@ -58,7 +60,7 @@ class Engine:
     """The state of the emulated radio. Nodes have the numbers 0 … N-1 in the order of `node_ids`.
 
     `position_m` (N, 2) are positions in metres. `links` (N, N) is `radio.links` as loaded: entry (i, j) is true if
-    i receives j. It is None if range or path loss decide.
+    i receives j. It is None if range or path loss decide. `rules` are those of the user's own.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class Engine:
         seed: int,
         position_m: NDArray[np.float64],
         links: NDArray[np.bool_] | None,
+        rules: OwnRules | None = None,
     ) -> None:
         self._node_ids = tuple(node_ids)
         self._max_payload_bytes = radio.max_payload_bytes
@@ -79,8 +82,9 @@ class Engine:
             Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
         )
         self._mac: Mac = self._csma or TransmitQueue(seed, radio)
-        self._links = LinkFaults(seed, self._mac, count)
-        self._senders = SenderFaults(self._node_ids, self._next_copy)
+        self._rules = rules or OwnRules(seed, node_ids)
+        self._links = LinkFaults(seed, self._mac, count, self._rules)
+        self._senders = SenderFaults(self._node_ids, self._next_copy, self._ask_sender)
         self.chain: list[Stage] = [
             in_range,
             sender_side,
@@ -135,6 +139,10 @@ class Engine:
         self._copies[sender, seq] += 1
         return self._copies[sender, seq]
 
+    def _ask_sender(self, planned: PlannedFault, time_ns: int, node: int, seq: int, payload: bytes) -> list[bytes]:
+        frame = self._frame(time_ns, node, Outgoing(payload, seq))
+        return self._rules.ask_sender(planned, frame, self._max_payload_bytes)
+
     # Enqueueing.
 
     def transmit(self, time_ns: int, node: int, payloads: Sequence[bytes]) -> None:
@@ -154,8 +162,8 @@ class Engine:
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
                 self._enqueue(time_ns, node, outgoing)
 
-    def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
-        frame = Frame(
+    def _frame(self, time_ns: int, node: int, outgoing: Outgoing) -> Frame:
+        return Frame(
             sender=node,
             seq=outgoing.seq,
             sent_ns=time_ns,
@@ -168,6 +176,9 @@ class Engine:
             name=outgoing.alias or self._node_ids[node],
             cause=outgoing.cause,
         )
+
+    def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
+        frame = self._frame(time_ns, node, outgoing)
         if frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
             frame.sender_outcome, frame.end_ns = Outcome.oversize, time_ns
             self._mac.sent.append(frame)
@@ -191,7 +202,7 @@ class Engine:
         """Append the receptions in range to the trace, and put the pending ones in flight."""
         receivers = receptions.receivers()
         for (number, column), flips in receptions.flips.items():
-            frames[number].altered[int(receivers[number, column])] = _flipped(frames[number].payload, flips)
+            frames[number].altered[int(receivers[number, column])] = flipped(frames[number].payload, flips)
         near = receptions.outcome != OUT_OF_RANGE
         each = np.count_nonzero(near, axis=1)
         receiver = receivers[near]
@@ -330,10 +341,3 @@ class Engine:
         self._mac.run(None)
         self._settle()
         self._arrive(NO_ARRIVAL_NS - 1)
-
-
-def _flipped(payload: bytes, flips: Sequence[tuple[int, int]]) -> bytes:
-    changed = bytearray(payload)
-    for position, mask in flips:
-        changed[position] ^= mask
-    return bytes(changed)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import PENDING, Outcome
+from emulator.radio.rule_answers import Answered
 from emulator.radio.topology import TopologySnapshot
 from vnet.types import Mask
 
@@ -53,7 +54,7 @@ class Frame:
     `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
     oversize, queue_full, held_back, or pending for a frame that is sent. The frame is on air from `on_air_ns`
     (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive with other bytes, by
-    receiver.
+    receiver. `answers` are those of rules of the user's own, by fault, with the columns that they speak of.
     """
 
     sender: int
@@ -72,6 +73,7 @@ class Frame:
     end_ns: int = 0
     signal: Signal | None = None
     altered: dict[int, bytes] = field(default_factory=dict)
+    answers: dict[int, tuple[NDArray[np.intp], Answered]] = field(default_factory=dict)
 
 
 class LinkEffects(Protocol):

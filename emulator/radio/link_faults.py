@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault, swizzle_times_ns
+from emulator.radio.byte_flips import random_flips
 from emulator.radio.frames import Copied, Frame, Receptions
 from emulator.radio.mac import Mac
 from emulator.radio.outcomes import PENDING
+from emulator.radio.own_rules import OwnRules, RuledLinks
 from emulator.scenario.fault_families import DelayFault, LossFault
-from emulator.scenario.faults import Corrupt, Duplicate, Range, Swizzle, Throttle
+from emulator.scenario.faults import Corrupt, Custom, Duplicate, Range, Swizzle, Throttle
 from emulator.scenario.random_streams import Draws
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_MS
@@ -49,21 +51,22 @@ class ActiveLinkFaults:
     delaying: Sequence[_RandomFault] = ()
     copying: Sequence[_RandomFault] = ()
     corrupting: Sequence[_RandomFault] = ()
+    ruled: Sequence[RuledLinks] = ()
 
     @property
     def lose(self) -> bool:
         """True if any reception may be lost."""
-        return bool(self.cut or self.shortened or self.losing)
+        return bool(self.cut or self.shortened or self.losing or self.ruled)
 
     @property
     def change(self) -> bool:
         """True if a reception may arrive later, more than once, or with other bytes."""
-        return bool(self.delaying or self.copying or self.corrupting)
+        return bool(self.delaying or self.copying or self.corrupting or self.ruled)
 
     @property
     def copy(self) -> bool:
         """True if a reception may arrive more than once."""
-        return bool(self.copying)
+        return bool(self.copying or self.ruled)
 
     def losses(self, frame: Frame) -> Iterator[tuple[int, Mask]]:
         """Yield, in the order in which faults act, a fault's number and the columns (M,) that lose the frame."""
@@ -75,6 +78,8 @@ class ActiveLinkFaults:
             yield number, beyond & (nodes[at] | nodes[frame.sender])
         for one in self.losing:
             yield one.planned.number, (_lost(one, frame) & _links(one)[frame.sender])[at]
+        for ruled in self.ruled:
+            yield ruled.planned.number, ruled.lost(frame)
 
     def changes(self, frame: Frame, index: int, receptions: Receptions) -> None:
         """Delay, duplicate or alter the pending receptions of frame number `index`."""
@@ -96,12 +101,18 @@ class ActiveLinkFaults:
         for one in self.corrupting:
             draws, links = _drawn(one, frame, at)
             _corrupt(one, frame, index, receptions, draws, pending & links)
+        for ruled in self.ruled:
+            ruled.change(frame, index, receptions)
 
 
 class LinkFaults:
-    """The acting link faults, and their present `effects`. It sets the throttled senders' bitrates in `mac`."""
+    """The acting link faults, and their present `effects`. It sets the throttled senders' bitrates in `mac`.
 
-    def __init__(self, seed: int, mac: Mac, count: int) -> None:
+    `rules` are those of the user's own.
+    """
+
+    def __init__(self, seed: int, mac: Mac, count: int, rules: OwnRules) -> None:
+        self._rules = rules
         self._seed = seed
         self._mac = mac
         self._count = count
@@ -119,6 +130,7 @@ class LinkFaults:
             delaying=_of_kind(random, DelayFault),
             copying=_of_kind(random, Duplicate),
             corrupting=_of_kind(random, Corrupt),
+            ruled=[self._ruled(p) for p in active if isinstance(p.fault, Custom)],
         )
         self._mac.throttle(self._throttled(active))
 
@@ -130,6 +142,9 @@ class LinkFaults:
     def _started(self, planned: PlannedFault) -> _RandomFault:
         bad = np.zeros((self._count, self._count) if isinstance(planned.fault, LossFault) else (0, 0), dtype=bool)
         return _RandomFault(planned, Draws(self._seed, f"fault {planned.number}"), bad)
+
+    def _ruled(self, planned: PlannedFault) -> RuledLinks:
+        return RuledLinks(planned, Draws(self._seed, f"fault {planned.number} bytes"), self._rules)
 
     def _cut_by(self, planned: PlannedFault, time_ns: int) -> Mask | None:
         """Return the mask (N, N) of the links that a fault cuts at `time_ns`; None if it cuts none."""
@@ -172,10 +187,7 @@ def _corrupt(
     hit = pending & (draws < fault.probability)
     for column in np.flatnonzero(hit).tolist() if frame.size_bytes else ():
         # The draw, conditioned on being below the probability, seeds the altered bytes of each receiver.
-        rng = np.random.default_rng(int(draws[column] * 2**53))
-        positions = rng.choice(frame.size_bytes, size=min(fault.flips, frame.size_bytes), replace=False)
-        masks = rng.integers(1, 256, size=len(positions))
-        flips = zip(positions.tolist(), masks.tolist(), strict=True)
+        flips = random_flips(draws[column], frame.size_bytes, fault.flips)
         receptions.flips.setdefault((index, column), []).extend(flips)
         receptions.cause[index, column] = one.planned.number
 

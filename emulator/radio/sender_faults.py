@@ -1,18 +1,18 @@
-"""Sender faults: senders that misbehave by repeating their own frames, whose payloads the emulator does not
-read."""
+"""Sender faults: senders that repeat their own frames, whose payloads the emulator does not read, or send what a
+rule of the user's own says."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from emulator.faults.plan import PlannedFault
 from emulator.radio.frames import NO_CAUSE
 from emulator.scenario.fault_families import SenderFault
-from emulator.scenario.faults import DataReplay, DoS, StaleMessages, Sybil
+from emulator.scenario.faults import CustomSender, DataReplay, DoS, StaleMessages, Sybil
 from vnet.units import NS_PER_S
 
 REMEMBERED_FRAMES = 4096
@@ -37,10 +37,17 @@ class Outgoing:
 class SenderFaults:
     """The acting sender faults, and the frames that affected senders have sent.
 
-    `next_copy` numbers the copies of (sender, seq).
+    `next_copy` numbers the copies of (sender, seq). `ask` returns the payloads that a rule of the user's own sends
+    in place of a frame: of a fault, at a time in ns, by a sender, with a number and a payload.
     """
 
-    def __init__(self, node_ids: Sequence[str], next_copy: Callable[[int, int], int]) -> None:
+    def __init__(
+        self,
+        node_ids: Sequence[str],
+        next_copy: Callable[[int, int], int],
+        ask: Callable[[PlannedFault, int, int, int, bytes], list[bytes]],
+    ) -> None:
+        self._ask = ask
         self._node_ids = node_ids
         self._next_copy = next_copy
         self._acting: dict[int, list[PlannedFault]] = {}
@@ -71,8 +78,16 @@ class SenderFaults:
         for planned in acting:
             if isinstance(planned.fault, StaleMessages) and (old := self._from(node, time_ns, planned.fault.age_s)):
                 original = Outgoing(old[2], seq, cause=planned.number)
+        further: dict[int, list[bytes]] = {}
+        for planned in acting:
+            if isinstance(planned.fault, CustomSender):
+                first, *further[planned.number] = self._ask(planned, time_ns, node, seq, original.payload)
+                if first != original.payload:
+                    original = replace(original, payload=first, cause=planned.number)
         yield original
         for planned in acting:
+            for index, more in enumerate(further.get(planned.number, ()), start=1):
+                yield self._copy(planned, node, more, seq, index)
             yield from self._again(planned, time_ns, node, original)
 
     def _again(self, planned: PlannedFault, time_ns: int, node: int, original: Outgoing) -> Iterator[Outgoing]:

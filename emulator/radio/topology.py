@@ -24,11 +24,14 @@ class TopologySnapshot:
     matrices of all pairs. Else it is the receiver `receiver[sender, j]`: a row begins with the receivers in range,
     by number, and is filled up with columns that are not in range.
 
+    `position_m` (N, 2) are the positions, NaN for an absent vehicle.
+
     `in_range` marks the links in range, and `admitted` those that the receiver's peer cap admits. `power_mw` is the
     mean received power in mW and `fading` the shape of the fading as `Nakagami.shape` returns it; both are None
     without a physical radio, and with one the arrays are matrices.
     """
 
+    position_m: Array
     distance_m: Array
     in_range: Mask
     admitted: Mask
@@ -88,7 +91,7 @@ class Topology:
         self._position_m, self._links = position_m, None
         if self._nakagami is None and len(position_m) > MOST_IN_MATRICES:
             self._links = self._connectivity.links(position_m)
-            self._now = _snapshot_of(self._links)
+            self._now = _snapshot_of(self._links, position_m)
         else:
             self._now = self._matrices(position_m)
         self._is_ranked = False
@@ -105,7 +108,12 @@ class Topology:
             np.fill_diagonal(in_range, False)
             fading = self._nakagami.shape(distance_m)
         return TopologySnapshot(
-            distance_m=distance_m, in_range=in_range, admitted=in_range, power_mw=power_mw, fading=fading
+            position_m=position_m,
+            distance_m=distance_m,
+            in_range=in_range,
+            admitted=in_range,
+            power_mw=power_mw,
+            fading=fading,
         )
 
     def set_up(self, node: int, up: bool) -> None:
@@ -143,11 +151,13 @@ class Topology:
         return candidate
 
 
-def _snapshot_of(pairs: Links) -> TopologySnapshot:
-    """Return the snapshot of these pairs, with nobody's peer cap applied."""
+def _snapshot_of(pairs: Links, position_m: Array) -> TopologySnapshot:
+    """Return the snapshot of these pairs at these positions, with nobody's peer cap applied."""
     each = pairs.out_degrees()
     shape = pairs.count, int(each.max(initial=0))
     in_range = np.arange(shape[1]) < each[:, None]
     distance_m, receiver = np.full(shape, np.inf), np.zeros(shape, np.intp)
     distance_m[in_range], receiver[in_range] = pairs.distance_m, pairs.receiver
-    return TopologySnapshot(distance_m=distance_m, in_range=in_range, admitted=in_range, receiver=receiver)
+    return TopologySnapshot(
+        position_m=position_m, distance_m=distance_m, in_range=in_range, admitted=in_range, receiver=receiver
+    )

@@ -1,4 +1,4 @@
-"""SHA-256 of the code that a run depends on: the program, and vnet itself.
+"""SHA-256 of the code that a run depends on: the program, rules of the user's own, and vnet itself.
 
 The program is every module that its entry leads to by `import`, wherever in a module that stands, from outside the
 standard library and site-packages; modules of the entry's own package count wherever they are installed. Sources
@@ -31,11 +31,25 @@ _SITE_NAMES = frozenset({"site-packages", "dist-packages"})
 
 
 def code_digests(scenario: Scenario) -> dict[str, str]:
-    """Return digests of the `program` of a scenario, its exceptions included, and of `vnet`.
+    """Return digests of the `program` of a scenario, its exceptions included, of its `rules`, and of `vnet`.
 
     A program that cannot be found has none.
     """
-    return digests_of(entries_of(scenario), scenario.program.folders)
+    return digests_of(entries_of(scenario), scenario.program.folders) | rule_digests(scenario)
+
+
+def rule_digests(scenario: Scenario) -> dict[str, str]:
+    """Return the entries of a scenario's rules and their digest; nothing where there are none."""
+    entries = rules_of(scenario)
+    digest = program_digest(entries, scenario.program.folders) if entries else None
+    return {"rule_entries": " ".join(entries), "rules": digest} if digest else {}
+
+
+def rules_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the entries of all rules of the user's own in a scenario, sorted."""
+    from emulator.scenario.fault_families import OwnRule  # whoever has a scenario has imported it
+
+    return tuple(sorted({fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}))
 
 
 def digests_of(entries: tuple[str, ...], folders: tuple[Path, ...] = ()) -> dict[str, str]:
@@ -49,6 +63,8 @@ def changed_code(recorded: Mapping[str, Any], now: Mapping[str, str]) -> str:
     if recorded.get("entries") != now["entries"]:
         return ""
     names = {"program": f"the program {now['entries'].replace(' ', ', ')}", "vnet": "vnet"}
+    if recorded.get("rule_entries") == now.get("rule_entries") is not None:
+        names["rules"] = f"the rules {now['rule_entries'].replace(' ', ', ')}"
     changed = [
         words for key, words in names.items() if key in recorded and key in now and recorded[key] != now[key]
     ]

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from emulator.records.atomic import atomically, disk_errors
-from emulator.records.code_digest import code_digests
+from emulator.records.code_digest import code_digests, rule_digests
 from emulator.scenario.scenario import Scenario, dump_scenario, input_digests
 from vnet.errors import VnetError
 
@@ -121,6 +121,11 @@ class RunFolder:
     def scenario_path(self) -> Path:
         """The file that runs it again."""
         return self.path / SCENARIO_FILE
+
+    def add_rules(self, scenario: Scenario) -> None:
+        """Write the scenario with the digest of the rules of the user's own that it has got since the start."""
+        self._digests["code"] |= rule_digests(scenario)
+        self.put_scenario(scenario)
 
     def put_scenario(self, scenario: Scenario) -> None:
         """Write the scenario, with every default and the digests of what the run has read at its start."""

@@ -10,6 +10,7 @@ draws it, and which law it follows. The layers above act on families:
 | `cuts = True` | `radio/link_faults.py` | `checks/faults.py` |
 | `LossFault`, `DelayFault` | `radio/link_faults.py` by the kind's law | `checks/faults.py`, `checks/latency.py` |
 | `SenderFault` | `radio/sender_faults.py` | `checks/senders.py` |
+| `OwnRule` | `radio/own_rules.py` | `checks/own_rules.py` |
 | `GnssFault`, `ClockFault` | `world/gnss_faults.py` | `checks/senders.py`, `checks/fault_effects.py` |
 | `Infrastructure` | `drivers/live/reconnection.py` | `checks/fault_effects.py` |
 """
@@ -22,6 +23,7 @@ from typing import Annotated, Any, ClassVar, get_args
 from pydantic import Field, model_validator
 
 from emulator.scenario.fault_draws import Chooser, Drawn
+from emulator.scenario.program import Entry, split_file
 from emulator.scenario.renamed import RENAMED_SELECTORS
 from emulator.scenario.sections import Section
 from vnet.errors import shown
@@ -31,6 +33,8 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 Point = tuple[float, float]
 LONGEST_S = 86_400.0
 """No fault starts later or lasts longer: a day."""
+DEFAULT_RULE = "rule"
+"""Function of a file that is named as a rule without one."""
 
 
 class Selector(Section):
@@ -90,7 +94,7 @@ class Fault(Section):
     acts_on: ClassVar[str] = "the network"
     """Targets of the kind, in the words of the reference page."""
     campaign_weight: ClassVar[int] = 1
-    """Frequency at which campaigns draw the kind, relative to others."""
+    """Frequency at which campaigns draw the kind, relative to others; 0: never."""
     live_only: ClassVar[bool] = False
     """True if a simulation has nothing that the kind could act on; campaigns then never draw it."""
     cuts: ClassVar[bool] = False
@@ -104,6 +108,11 @@ class Fault(Section):
     """Start of the fault, in emulated time."""
     duration_s: float = Field(gt=0, le=LONGEST_S)
     """Length of the fault, in emulated time."""
+
+    @property
+    def title(self) -> str:
+        """Name of the fault in its label: its kind, unless it has a name of its own."""
+        return self.kind
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -224,6 +233,28 @@ class SenderFault(NodeFault):
     """A fault of senders: frames of their own are sent again, or in place of others."""
 
     chapter: ClassVar[str] = "Misbehaviour"
+
+
+class OwnRule(Fault):
+    """A fault whose effect a function of the user's own decides, frame by frame."""
+
+    chapter: ClassVar[str] = "Rules of your own"
+    campaign_weight: ClassVar[int] = 0
+
+    rule: Entry
+    """Function that is called with each frame: `package.module:function` or `file.py:function`; a file's is `rule`
+    if left out. It is looked for beside the scenario first, then in the current folder."""
+    name: str | None = Field(None, pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")
+    """Name in the trace, in events and in checks, before the fault's number; the function's, unless it is given."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Given to the rule as `frame.options`; what is allowed is its own business."""
+
+    @property
+    def title(self) -> str:
+        """The name, or that of the function."""
+        file = split_file(self.rule)
+        function = file[1] if file is not None else self.rule.rpartition(":")[2]
+        return self.name or function or DEFAULT_RULE
 
 
 class GnssFault(NodeFault):

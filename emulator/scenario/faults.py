@@ -27,6 +27,7 @@ from emulator.scenario.fault_families import (
     LinkFault,
     LossFault,
     NodeFault,
+    OwnRule,
     Point,
     Probability,
     ProcessFault,
@@ -383,6 +384,21 @@ class Sybil(SenderFault):
     kind: Literal["Sybil"]
     ghosts: Annotated[int, Drawn(1, 3)] = Field(3, ge=1, le=100)
     """Number of other names."""
+
+
+# Rules of the user's own.
+
+
+class Custom(OwnRule, LinkFault):
+    """A function of your own lets frames pass, drops, delays, alters or duplicates them, at each receiver."""
+
+    kind: Literal["custom"]
+
+
+class CustomSender(OwnRule, SenderFault):
+    """A function of your own says which frames a vehicle sends in place of each of its frames."""
+
+    kind: Literal["custom_sender"]
 
 
 # Infrastructure.

@@ -1,4 +1,4 @@
-"""The modules that a scenario names, programs and checks: found beside the scenario, or in the current folder.
+"""The modules that a scenario names (programs, checks, rules): beside the scenario, or in the current folder.
 
 Nothing is imported here. What a scenario names as a file becomes a module and its folder, so that whoever imports
 it needs only the names and `program.folders`.
@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from emulator.scenario.fault_families import DEFAULT_RULE, Fault, OwnRule
 from emulator.scenario.program import Program, split_file
 from vnet.errors import ScenarioError, shown
 from vnet.runtime.own_packages import OWN
 
-DEFAULT_FUNCTIONS = {"program.entry": "main", "program.checks": "check"}
+DEFAULT_FUNCTIONS = {"program.entry": "main", "program.checks": "check", "fault.rule": DEFAULT_RULE}
 """Functions of a file that is named without one, by key."""
 
 
@@ -23,6 +24,13 @@ def with_modules(program: Program, base: Path | None, checks: Sequence[str] = ()
     Modules are looked for in `program.folders`, in `base`, the folder of the scenario, and in the current one.
     `source` is what messages call the scenario. Raises ScenarioError for a file or folder that is not there.
     """
+    return with_rules(program, (), base, checks, source)[0]
+
+
+def with_rules(
+    program: Program, faults: Sequence[Fault], base: Path | None, checks: Sequence[str] = (), source: str = ""
+) -> tuple[Program, tuple[Fault, ...]]:
+    """Return the same, and the faults with the rules of the user's own as modules in `program.folders`."""
     found = _Modules(program.folders, base, f"{source}: " if source else "")
     exceptions = [
         each.model_copy(update={"entry": found.entry("program.entry", each.entry)}) for each in program.exceptions
@@ -32,7 +40,8 @@ def with_modules(program: Program, base: Path | None, checks: Sequence[str] = ()
         "exceptions": tuple(exceptions),
         "checks": tuple(dict.fromkeys(found.entry("program.checks", each) for each in [*program.checks, *checks])),
     }
-    return program.model_copy(update={**data, "folders": found.folders})
+    ruled = tuple(found.fault(each) for each in faults)
+    return program.model_copy(update={**data, "folders": found.folders}), ruled
 
 
 class _Modules:
@@ -59,6 +68,12 @@ class _Modules:
         if parts[0] not in OWN:
             self._holding.update(path for path in self._searched if _holds(path, parts))
         return entry
+
+    def fault(self, fault: Fault) -> Fault:
+        """Return a fault with its rule, if it has one, as `module:function`."""
+        if not isinstance(fault, OwnRule):
+            return fault
+        return fault.model_copy(update={"rule": self.entry("fault.rule", fault.rule)})
 
     def _file(self, key: str, entry: str, name: str, function: str) -> str:
         problem = f"{self._source}{key} = {shown(entry)}"

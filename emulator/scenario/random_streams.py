@@ -48,6 +48,13 @@ def stream(seed: int, name: str, item: int = 0) -> np.random.Generator:
     return np.random.Generator(philox(seed, named_key(name), item))
 
 
+def frame_stream(seed: int, name: str, sender: int, seq: int, copy: int = 0) -> np.random.Generator:
+    """Return the stream of one frame, or a copy of it, among those of a name."""
+    counter = np.array([0, seq, sender, copy], dtype=np.uint64)
+    key = np.array([seed, named_key(name)], dtype=np.uint64)
+    return np.random.Generator(np.random.Philox(key=key, counter=counter))
+
+
 def philox_words_at(
     key: NDArray[np.uint64], frames: NDArray[np.uint64], index: NDArray[np.intp]
 ) -> NDArray[np.uint64]:

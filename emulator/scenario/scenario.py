@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
-from emulator.scenario.modules import with_modules
+from emulator.scenario.modules import with_rules
 from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
@@ -339,10 +339,10 @@ def scenario_from(
         raise wrong_value(path, str(error), overrides) from None
     scenario = _with_absolute_paths(scenario, path)
     try:
-        program = with_modules(scenario.program, path.parent, checks, str(path))
+        program, faults = with_rules(scenario.program, scenario.fault, path.parent, checks, str(path))
     except ScenarioError as error:
         raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
-    scenario = scenario.model_copy(update={"program": program})
+    scenario = scenario.model_copy(update={"program": program, "fault": faults})
     recorded = digests or {}
     for name, digest in input_digests(scenario).items():
         if recorded.get(name, digest) != digest:

@@ -11,6 +11,8 @@ import numpy as np
 
 from emulator.checks.own import load_checks
 from emulator.drivers.order_length import with_order_steps
+from emulator.radio.own_rules import load_rules
+from emulator.scenario.fault_families import OwnRule
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
@@ -24,7 +26,7 @@ LONGEST_S = 20.0
 MOST_FAULTS = 4
 SEEDS = 2**63
 RANDOM, NONE = "random", "none"
-"""Faults of all kinds, and no faults at all: then the runs differ by their seeds."""
+"""Faults of all kinds, and none drawn: then the runs differ by their seeds."""
 T = TypeVar("T")
 
 
@@ -50,7 +52,8 @@ class Plan:
             raise ScenarioError(
                 f"run.duration_s = {run.duration_s:g}: a campaign's runs take {LONGEST_S:g} s at most"
             )
-        plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": ()}), ""
+        own = [fault for fault in scenario.fault if isinstance(fault, OwnRule)]
+        plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": own}), ""
         kinds = () if faults == NONE else known_kinds(None if faults == RANDOM else faults.split(","))
         if kinds:
             plain, note = _with_time_for_faults(plain)
@@ -58,6 +61,7 @@ class Plan:
         search_programs_in(plain.program.folders)
         load_program(plain.program.entry)
         load_checks(plain.program)
+        load_rules(plain.fault, plain.program)
         plain = with_order_steps(plain)
         return cls(plain, runs, seed, kinds, note=note, **options)
 
@@ -70,7 +74,7 @@ class Plan:
         choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
         weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
         faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
-        return make_scenario(scenario, {"faults": faults})
+        return make_scenario(scenario, {"faults": [*scenario.fault, *faults]})
 
 
 def with_seed(scenario: Scenario, seed: int) -> Scenario:

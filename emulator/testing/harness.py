@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.cells.programs import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import Result, finding_of, load_checks
 from emulator.checks.properties import PERIOD, Effect, Predicate, always, eventually, leads_to, never
@@ -29,11 +30,13 @@ from emulator.drivers.conclude import conclude, judge_further
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
+from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.metrics import PeriodFigures
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
-from emulator.scenario.fault_families import LONGEST_S
+from emulator.scenario.fault_families import LONGEST_S, Fault, OwnRule
 from emulator.scenario.faults import parse_fault
+from emulator.scenario.modules import with_rules
 from emulator.scenario.scenario import Scenario
 from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
 from emulator.world.world import build_world
@@ -55,6 +58,7 @@ class RunHarness:
         if any(fault.kind == "router_restart" for fault in scenario.fault):
             raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
         load_checks(scenario.program)
+        load_rules(scenario.fault, scenario.program)
         self.folder = folder
         self.live = live
         self._emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
@@ -62,6 +66,7 @@ class RunHarness:
         self._now_ns = 0
         self._wall_s = 0.0
         self._open: list[str] = []
+        self._folders: list[Path] = []
         self._judgement: Judgement | None = None
         self._promises: list[Callable[[Run], Result]] = []
 
@@ -195,12 +200,33 @@ class RunHarness:
                 f"fault {kind!r} at {self.now_s:g} s: all have healed by {healed_s:g} s, run.settle_s before the "
                 "end: give the run a longer duration= or a shorter settle="
             )
-        planned = self._emulation.inject(fault, self._now_ns - 1)
+        planned = self._inject(fault)
         self._open.append(planned.label)
         try:
             yield planned
         finally:
             self._heal(planned)
+
+    @contextmanager
+    def rule(self, rule: str | Rule, kind: str = "custom", **parameters: Any) -> Iterator[PlannedFault]:
+        """A rule of your own, from now until the block is left: a function of a module, or its entry.
+
+        `kind` is "custom" or "custom_sender"; `parameters` are the kind's: `name`, `options`, selectors. Raises
+        ScenarioError, also for a function that no module has: the run could not be reproduced.
+        """
+        entry, folder = rule_entry(rule)
+        self._folders = [*self._folders, *([folder] if folder else [])]
+        with self.fault(kind, rule=entry, **parameters) as planned:
+            yield planned
+
+    def _inject(self, fault: Fault) -> PlannedFault:
+        if not isinstance(fault, OwnRule):
+            return self._emulation.inject(fault, self._now_ns - 1)
+        program = self.scenario.program
+        program = program.model_copy(update={"folders": (*program.folders, *self._folders)})
+        program, (ruled,) = with_rules(program, [fault], None)
+        assert isinstance(ruled, OwnRule)
+        return self._emulation.inject_rule(ruled, program, self._now_ns - 1)
 
     def _heal(self, planned: PlannedFault) -> None:
         if planned.label in self._open:

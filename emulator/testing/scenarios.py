@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from emulator.scenario.modules import with_modules
+from emulator.scenario.modules import with_rules
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.sections import first_problem
 from emulator.scenario.shipped import find_scenario
@@ -49,8 +49,8 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
             table = table.setdefault(section, {})
         table[key] = _plain(value)
     changed = _validated(data)
-    program = with_modules(changed.program, base)
-    return changed.model_copy(update={"program": program})
+    program, faults = with_rules(changed.program, changed.fault, base)
+    return changed.model_copy(update={"program": program, "fault": faults})
 
 
 def _loaded(source: Source, folders: Iterable[Path]) -> tuple[Scenario, Path | None]:

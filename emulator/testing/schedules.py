@@ -43,8 +43,8 @@ class ScheduleConstraints:
 
 
 def simulated_kinds() -> tuple[str, ...]:
-    """Return the kinds that can be simulated; misbehaviour, whose names are capital, last."""
-    kinds = [name for name, kind in KINDS.items() if not kind.live_only]
+    """Return the kinds that can be drawn and simulated; misbehaviour, whose names are capital, last."""
+    kinds = [name for name, kind in KINDS.items() if kind.campaign_weight and not kind.live_only]
     return tuple(sorted(kinds, key=lambda kind: (kind[0].isupper(), kind)))
 
 

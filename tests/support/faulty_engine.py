@@ -9,6 +9,7 @@ import numpy as np
 from emulator.faults.plan import FaultPlan
 from emulator.faults.selectors import Nodes
 from emulator.radio.engine import Delivery, Engine
+from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.scenario.scenario import Scenario
 
 S = 1_000_000_000
@@ -25,7 +26,11 @@ class FaultyEngine:
         position_m = np.column_stack([100.0 * np.arange(count), np.zeros(count)])
         self.ids = [f"v{n}" for n in range(count)]
         self.plan = FaultPlan(scenario, Nodes(self.ids, position_m, np.full(count, count - 1)))
-        self.engine = Engine(self.ids, scenario.radio, seed, position_m, None)
+        rules = OwnRules(seed, self.ids)
+        rules.load(scenario.fault, scenario.program)
+        self.failures: list[RuleFailure] = []
+        rules.on_failure = self.failures.append
+        self.engine = Engine(self.ids, scenario.radio, seed, position_m, None, rules)
         self.delivered: list[Delivery] = []
         self.now_ns = -1
 

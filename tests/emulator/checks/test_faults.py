@@ -34,8 +34,21 @@ NEEDED: dict[str, dict[str, Any]] = {
     "drift": {"rate_ppm": 20_000.0},
     "block": {"senders": {"count": 3}},
     "burst_loss": {"enter": 0.3, "leave": 0.3},
+    "custom": {"rule": "tests.support.rules:everything", "name": "custom"},
+    "custom_sender": {"rule": "tests.support.rules:babbles", "name": "custom_sender"},
 }
-OF_LINKS = ("partition", "block", "loss", "burst_loss", "delay", "jitter", "reorder", "duplicate", "corrupt")
+OF_LINKS = (
+    "partition",
+    "block",
+    "loss",
+    "burst_loss",
+    "delay",
+    "jitter",
+    "reorder",
+    "duplicate",
+    "corrupt",
+    "custom",
+)
 RESTARTS = ("emulator_restart", "router_restart")
 AT_S, DURATION_S = 2.0, 2.0
 

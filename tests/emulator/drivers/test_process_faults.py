@@ -329,6 +329,8 @@ PARAMETERS: dict[str, dict[str, Any]] = {
     "range": {"range_m": 500},
     "gnss_jump": {"offset_m": [5, 5]},
     "gnss_ramp": {"rate_m_s": [1, 0]},
+    "custom": {"rule": "tests.support.rules:everything"},
+    "custom_sender": {"rule": "tests.support.rules:babbles"},
 }
 
 

@@ -29,6 +29,8 @@ REQUIRED: dict[str, dict[str, Any]] = {
     "gnss_ramp": {"rate_m_s": (1.0, 0.5)},
     "skew": {"offset_ms": 250.0},
     "drift": {"rate_ppm": 300.0},
+    "custom": {"rule": "emulator.nothing:nobody"},
+    "custom_sender": {"rule": "emulator.nothing:nobody"},
 }
 """Parameters that a kind requires."""
 DEFAULTS: dict[str, dict[str, Any]] = {
@@ -44,6 +46,8 @@ DEFAULTS: dict[str, dict[str, Any]] = {
     "StaleMessages": {"age_s": 1.0},
     "DoS": {"factor": 10},
     "Sybil": {"ghosts": 3},
+    "custom": {"name": None, "options": {}},
+    "custom_sender": {"name": None, "options": {}},
     "emulator_restart": {"down_s": 1.0, "duration_s": 0.001},
     "router_restart": {"down_s": 1.0, "duration_s": 0.001},
 }
@@ -117,6 +121,9 @@ WRONG = [
     ("gnss_jump", {"offset_m": [1, "east"]}, ["gnss_jump.offset_m.1 = 'east'", "number"]),
     ("skew", {"offset_ms": 1e9}, ["skew.offset_ms", "less than or equal to 3600000"]),
     ("drift", {"rate_ppm": -1e6}, ["drift.rate_ppm = -1000000.0", "greater than or equal to -500000"]),
+    ("custom", {"rule": "nothing"}, ["custom.rule = 'nothing'", "package.module:function, or as file.py:function"]),
+    ("custom", {"name": "my rule"}, ["custom.name = 'my rule'"]),
+    ("custom_sender", {"senders": {}}, ["custom_sender.senders: unknown key", "nodes, options, rule"]),
     ("DoS", {"factor": 1}, ["DoS.factor = 1", "greater than or equal to 2"]),
 ]
 

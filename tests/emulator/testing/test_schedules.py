@@ -86,7 +86,8 @@ def test_only_the_kinds_that_were_asked_for_are_drawn() -> None:
         find(faults(SMALL, kinds=["kill"]), lambda s: any(fault.kind != "kill" for fault in s), settings=QUIET)
     with pytest.raises(ScenarioError, match="fault 'rain': must be one of block, "):
         faults(SMALL, kinds=["rain"])
-    assert set(KINDS) - set(simulated_kinds()) == {"emulator_restart", "router_restart"}
+    not_drawn = {"emulator_restart", "router_restart", "custom", "custom_sender"}
+    assert set(KINDS) - set(simulated_kinds()) == not_drawn
     assert known_kinds(None) == simulated_kinds()
 
 

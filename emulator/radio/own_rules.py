@@ -1,0 +1,283 @@
+"""Rules of the user's own: faults whose effect a function decides, frame by frame.
+
+A rule is a function of a frame and of a state of its own. On links (`kind = "custom"`) it is called once for each
+frame that has a receiver in range on its links, and says what becomes of it at each receiver. At senders
+(`kind = "custom_sender"`) it is called once for each frame that a program sends, and says what is sent in its
+place. Frames are given in the order in which they are sent, live and simulated alike.
+
+A rule that raises, answers nonsense or does not answer is told once, and then lets everything pass.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.faults.plan import PlannedFault
+from emulator.radio import rule_watch
+from emulator.radio.byte_flips import flips_between, random_flips
+from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions
+from emulator.radio.outcomes import PENDING
+from emulator.radio.rule_answers import Answer, Answered, NonsenseError, answered_by_link, answered_by_sender
+from emulator.radio.topology import TopologySnapshot
+from emulator.scenario.fault_families import OwnRule
+from emulator.scenario.own_functions import in_words, line_of, load_function, outside
+from emulator.scenario.program import Program
+from emulator.scenario.random_streams import Draws, frame_stream
+from vnet.errors import shown
+from vnet.runtime.program_path import search_programs_in
+from vnet.types import Array, Mask
+from vnet.units import NS_PER_S
+
+__all__ = ["Answer", "OwnRules", "RadioFrame", "RuleFailure", "RuledLinks"]
+
+T = TypeVar("T")
+Rule = Callable[["RadioFrame", dict[str, Any]], Any]
+WATCHED = (__file__, rule_watch.__file__)
+"""Files of vnet in the traceback of a rule that fails."""
+
+
+@dataclass(frozen=True)
+class RadioFrame:
+    """A frame as a rule sees it. Arrays are read-only; those over receivers have one entry for each of `receivers`.
+
+    The receivers are those in range on the fault's links, by their numbers. `sequence` counts the sender's frames,
+    and `copy` is 0 but for frames that a fault sends besides them. `time_ns` is when it was sent, in emulated time,
+    and positions and distances are those of that time.
+    """
+
+    sender: str
+    sequence: int
+    copy: int
+    time_ns: int
+    payload: bytes
+    receivers: tuple[str, ...]
+    distance_m: Array
+    """Distance of each receiver from the sender (n,)."""
+    position_m: Array
+    """Position of each receiver (n, 2)."""
+    sender_position_m: Array
+    """Position of the sender (2,)."""
+    options: Mapping[str, Any]
+    """The fault's `options`."""
+    _position_of: Callable[[str], Array]
+    _stream: tuple[int, str, int, int, int]
+
+    @property
+    def time_s(self) -> float:
+        """Time at which it was sent, in emulated seconds."""
+        return self.time_ns / NS_PER_S
+
+    @cached_property
+    def rng(self) -> np.random.Generator:
+        """Random generator of this frame under this fault: nothing else draws from it, or changes it."""
+        return frame_stream(*self._stream)
+
+    def where(self, vehicle: str) -> Array:
+        """Return the position (2,) of any vehicle, NaN if it is not in the network. Raises KeyError."""
+        return self._position_of(vehicle)
+
+
+@dataclass(frozen=True)
+class RuleFailure:
+    """The failure of a rule: fault's label, rule, when and on whose frame, what is wrong, and the traceback."""
+
+    fault: str
+    rule: str
+    time_ns: int
+    sender: str
+    error: str
+    where: str = ""
+
+
+class OwnRules:
+    """The rules of one run, their states, and which of them have failed. `on_failure` is told of each that does."""
+
+    def __init__(self, seed: int, node_ids: Sequence[str]) -> None:
+        self._seed = seed
+        self._node_ids = tuple(node_ids)
+        self._number = {node: number for number, node in enumerate(node_ids)}
+        self._functions: dict[str, Rule] = {}
+        self._states: dict[int, dict[str, Any]] = {}
+        self._options: dict[int, Mapping[str, Any]] = {}
+        self._failed: set[int] = set()
+        self.on_failure: Callable[[RuleFailure], None] = lambda failure: None
+
+    def load(self, faults: Sequence[object], program: Program) -> None:
+        """Import the rules of these faults. Raises ScenarioError."""
+        self._functions |= load_rules(faults, program)
+
+    def ask_link(self, planned: PlannedFault, frame: Frame, columns: NDArray[np.intp]) -> Answered | None:
+        """Return what becomes of a frame at these columns (n,) of its topology; None if nothing does."""
+        if planned.number in self._failed:
+            return None
+        seen = self._seen(planned, frame, columns)
+        return self._ask(planned, seen, lambda answer: answered_by_link(answer, seen.receivers, frame.size_bytes))
+
+    def ask_sender(self, planned: PlannedFault, frame: Frame, max_bytes: int) -> list[bytes]:
+        """Return the payloads that are sent in place of a frame, at least one."""
+        if planned.number in self._failed:
+            return [frame.payload]
+        columns = np.flatnonzero(frame.topology.admitted[frame.sender])
+        seen = self._seen(planned, frame, columns)
+        answer = self._ask(planned, seen, lambda answer: answered_by_sender(answer, max_bytes))
+        return [frame.payload] if answer is None else answer
+
+    def _ask(self, planned: PlannedFault, seen: RadioFrame, understood: Callable[[Any], T]) -> T | None:
+        fault = planned.fault
+        assert isinstance(fault, OwnRule)
+        state = self._states.setdefault(planned.number, {})
+        try:
+            answer = rule_watch.call_bounded(self._functions[fault.rule], seen, state)
+            return None if answer is None else understood(answer)
+        except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
+            self._failed.add(planned.number)
+            said, where = _told(error)
+            self.on_failure(RuleFailure(planned.label, fault.rule, seen.time_ns, seen.sender, said, where))
+            return None
+
+    def _seen(self, planned: PlannedFault, frame: Frame, columns: NDArray[np.intp]) -> RadioFrame:
+        topology, number = frame.topology, planned.number
+        fault = planned.fault
+        assert isinstance(fault, OwnRule)
+        if number not in self._options:
+            self._options[number] = MappingProxyType(deepcopy(fault.options))
+        receivers = columns if topology.receiver is None else topology.receiver[frame.sender, columns]
+        return RadioFrame(
+            sender=self._node_ids[frame.sender],
+            sequence=frame.seq,
+            copy=frame.copy,
+            time_ns=frame.sent_ns,
+            payload=frame.payload,
+            receivers=tuple(self._node_ids[node] for node in receivers.tolist()),
+            distance_m=_fixed(topology.distance_m[frame.sender, columns]),
+            position_m=_fixed(topology.position_m[receivers]),
+            sender_position_m=_fixed(topology.position_m[frame.sender]),
+            options=self._options[number],
+            _position_of=lambda vehicle: self._where(topology, vehicle),
+            _stream=(self._seed, f"fault {number} rule", frame.sender, frame.seq, frame.draw),
+        )
+
+    def _where(self, topology: TopologySnapshot, vehicle: str) -> Array:
+        if vehicle not in self._number:
+            raise KeyError(f"no vehicle {shown(vehicle)}")
+        return _fixed(topology.position_m[self._number[vehicle]])
+
+
+@dataclass
+class RuledLinks:
+    """A rule that acts on links, and its stream of draws for altered bytes."""
+
+    planned: PlannedFault
+    draws: Draws
+    rules: OwnRules
+
+    def lost(self, frame: Frame) -> Mask:
+        """Return the columns (M,) at which the rule drops a frame; what else it answers is kept for `change`."""
+        topology, sender, links = frame.topology, frame.sender, self.planned.links
+        assert links is not None
+        drop = np.zeros(topology.in_range.shape[1], dtype=bool)
+        near = topology.in_range[sender] & topology.admitted[sender] & links[sender][topology.receivers(sender)]
+        columns = np.flatnonzero(near)
+        if frame.sender_outcome or not len(columns):
+            return drop
+        answered = self.rules.ask_link(self.planned, frame, columns)
+        if answered is not None:
+            drop[columns] = answered.drop
+            frame.answers[self.planned.number] = columns, answered
+        return drop
+
+    def change(self, frame: Frame, index: int, receptions: Receptions) -> None:
+        """Delay, alter and duplicate the pending receptions of frame number `index` as the rule has answered."""
+        if self.planned.number not in frame.answers:
+            return
+        columns, answered = frame.answers[self.planned.number]
+        pending = receptions.outcome[index, columns] == PENDING
+        self._delay(answered.delay_ns, columns[pending], pending, index, receptions)
+        self._alter(answered, frame, index, columns, pending, receptions)
+        copied = np.where(pending, answered.copies, 0)
+        for number in range(int(copied.max())):
+            mask = np.zeros(receptions.outcome.shape[1], dtype=bool)
+            mask[columns] = copied > number
+            later_ns = (number + 1) * answered.copy_delay_ns
+            receptions.copies.append(Copied(index, mask, later_ns, self.planned.number))
+
+    def _delay(
+        self,
+        delay_ns: NDArray[np.int64],
+        columns: NDArray[np.intp],
+        pending: Mask,
+        index: int,
+        receptions: Receptions,
+    ) -> None:
+        later = delay_ns[pending]
+        receptions.arrival_ns[index, columns] += later
+        self._name(receptions, index, columns[later > 0])
+
+    def _alter(
+        self,
+        answered: Answered,
+        frame: Frame,
+        index: int,
+        columns: NDArray[np.intp],
+        pending: Mask,
+        receptions: Receptions,
+    ) -> None:
+        """Alter the bytes that the rule says; the number of the receiver keys which ones it leaves to chance."""
+        chance = None
+        for n in np.flatnonzero(pending).tolist():
+            flips = list(flips_between(frame.payload, answered.payload[n])) if n in answered.payload else []
+            if answered.corrupt[n] and frame.payload:
+                if chance is None:
+                    count = len(frame.topology.position_m)
+                    chance = self.draws.uniform(frame.sender, frame.seq, count, frame.draw)
+                    chance = chance[frame.topology.receivers(frame.sender)]
+                flips += random_flips(chance[columns[n]], len(frame.payload), int(answered.corrupt[n]))
+            if flips:
+                receptions.flips.setdefault((index, int(columns[n])), []).extend(flips)
+                self._name(receptions, index, columns[n : n + 1])
+
+    def _name(self, receptions: Receptions, index: int, columns: NDArray[np.intp]) -> None:
+        """Let receptions that name no fault yet name this one."""
+        unnamed = columns[receptions.cause[index, columns] == NO_CAUSE]
+        receptions.cause[index, unnamed] = self.planned.number
+
+
+def load_rules(faults: Sequence[object], program: Program) -> dict[str, Rule]:
+    """Import the rules of faults, by entry; they are looked for in the program's folders, too.
+
+    Raises ScenarioError for one that cannot be imported.
+    """
+    entries = dict.fromkeys(fault.rule for fault in faults if isinstance(fault, OwnRule))
+    if entries:
+        search_programs_in(program.folders)
+    usage = "of a frame and a state: def {}(frame, state)"
+    return {entry: load_function("fault.rule", entry, program, usage) for entry in entries}
+
+
+def _told(error: BaseException) -> tuple[str, str]:
+    """Return in one line how a rule failed, with its line, and the traceback from its own module on."""
+    if isinstance(error, NonsenseError):
+        return f"answers {error}", ""
+    frames = outside(error, *WATCHED)
+    said = f"raises {in_words(error)}"
+    if isinstance(error, rule_watch.NoAnswerError):
+        said = f"does not answer within {rule_watch.LIMIT_S:g} s of processor time"
+    if frames is None:
+        return said, ""
+    return f"{said} ({line_of(frames)})", "".join(traceback.format_exception(error.with_traceback(frames)))
+
+
+def _fixed(values: Array) -> Array:
+    """Return a copy that cannot be changed."""
+    copied = np.array(values, dtype=float)
+    copied.setflags(write=False)
+    return copied

@@ -1,0 +1,251 @@
+"""Rules of the user's own on the radio: what they see, what they may answer, and what happens if they fail."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.radio import rule_watch
+from emulator.radio.own_rules import OwnRules
+from emulator.scenario.program import Program
+from emulator.scenario.scenario import Scenario
+from tests.support import rules
+from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, Row, S, digest, fault
+from vnet.errors import ScenarioError
+
+
+def rule(function: str, at_s: float = 0.0, duration_s: float = 100.0, kind: str = "custom", **more: Any) -> Row:
+    return fault(kind, at_s, duration_s, rule=f"tests.support.rules:{function}", **more)
+
+
+def chatted(*faults: dict[str, Any], periods: int = 20, **more: Any) -> FaultyEngine:
+    air = FaultyEngine(faults, **more)
+    air.chat(periods)
+    return air
+
+
+def without_cause(rows: list[Row]) -> list[Row]:
+    return [{**row, "cause": ""} for row in rows]
+
+
+def test_a_dropped_frame_is_a_fault_by_the_rule_s_name_while_it_acts() -> None:
+    air = chatted(rule("drops", 0.5, 1.0, senders={"ids": ["v1"]}, name="shadow"), rule("drops", 1.8, 0.1))
+    fell = Counter((row["sender"], row["cause"], row["sent_ns"] // PERIOD_NS) for row in air.rows() if row["cause"])
+    assert fell == {("v1", "shadow-0", period): 4 for period in range(5, 15)} | {
+        (node, "drops-1", 18): 4 for node in air.ids
+    }
+    assert {row["outcome"] for row in air.rows() if row["cause"]} == {"fault"}
+
+
+@pytest.mark.parametrize(
+    ("own", "built_in"),
+    [
+        (rule("drops", receivers={"count": 2}), fault("block", receivers={"count": 2})),
+        (rule("delays", 0.3, 0.9, senders={"ids": ["v1"]}), fault("delay", 0.3, 0.9, senders=["v1"], delay_ms=150)),
+        (rule("drops_far", options={"range_m": 150}), fault("range", range_m=150)),
+        (rule("passes"), fault("block", 90.0, 1.0)),
+    ],
+    ids=["block", "delay", "range", "nothing"],
+)
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**40), loss=st.sampled_from([0.0, 0.3]), peers=st.sampled_from([2, 100]))
+def test_a_rule_that_answers_as_a_built_in_fault_does_gives_the_same_receptions(
+    own: dict[str, Any], built_in: dict[str, Any], seed: int, loss: float, peers: int
+) -> None:
+    first, second = (chatted(each, periods=15, seed=seed, loss=loss, max_peers=peers) for each in (own, built_in))
+    assert without_cause(first.rows()) == without_cause(second.rows())
+    assert first.delivered == second.delivered
+    assert first.failures == []
+
+
+def test_a_rule_sees_the_frame_and_its_receivers_and_can_change_nothing_of_it() -> None:
+    rules.SEEN.clear()
+    chatted(rule("looks", receivers={"ids": ["v0", "v3"]}, options={"a": [1]}), periods=2, range_m=250.0)
+    assert len(rules.SEEN) == 2 * 3, "v0 and v3 hear v1, v2 and v4, and not each other"
+    frame = next(each for each in rules.SEEN if each.sender == "v2" and each.sequence == 1)
+    assert frame.receivers == ("v0", "v3")
+    assert frame.distance_m.tolist() == [200.0, 100.0]
+    assert frame.position_m.tolist() == [[0.0, 0.0], [300.0, 0.0]]
+    assert frame.sender_position_m.tolist() == [200.0, 0.0] == frame.where("v2").tolist()
+    assert (frame.copy, frame.time_ns, frame.time_s) == (0, PERIOD_NS, 0.1)
+    assert frame.payload == bytes([2]) + (1).to_bytes(4, "big") + bytes(15)
+    assert frame.options == {"a": [1]}
+    for array in (frame.distance_m, frame.position_m, frame.sender_position_m, frame.where("v1")):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+    with pytest.raises(KeyError, match="no vehicle 'v9'"):
+        frame.where("v9")
+    with pytest.raises(AttributeError):
+        frame.sequence = 3  # type: ignore[misc]
+
+
+def test_many_vehicles_whose_links_are_no_matrices_are_seen_as_they_are() -> None:
+    rules.SEEN.clear()
+    air = FaultyEngine([rule("looks")], count=70, range_m=150.0)
+    air.send(0, 40, b"hello")
+    air.rows()
+    (frame,) = rules.SEEN
+    assert frame.receivers == ("v39", "v41")
+    assert frame.position_m.tolist() == [[3900.0, 0.0], [4100.0, 0.0]]
+
+
+def test_the_draws_of_a_frame_are_its_own_and_do_not_depend_on_other_faults_or_frames() -> None:
+    def drawn(*before: dict[str, Any], seed: int = 1) -> dict[tuple[str, int], list[float]]:
+        rules.SEEN.clear()
+        chatted(fault("block", 90.0, 1.0), rule("looks"), *before, periods=3, seed=seed)
+        return {(frame.sender, frame.sequence): frame.rng.random(3).tolist() for frame in rules.SEEN}
+
+    plain = drawn()
+    assert len({draw for draws in plain.values() for draw in draws}) == 15 * 3
+    assert drawn(fault("loss", probability=0.5), rule("drops")) == plain
+    assert not {draw for draws in plain.values() for draw in draws} & {
+        draw for draws in drawn(seed=2).values() for draw in draws
+    }
+
+
+def test_the_state_is_made_anew_for_each_run_and_each_fault() -> None:
+    once, again = (chatted(rule("every_third"), periods=6) for _ in range(2))
+    assert once.rows() == again.rows()
+    twice = chatted(rule("every_third", senders={"ids": ["v0"]}), rule("every_third", senders={"ids": ["v1"]}))
+    fell = {(row["cause"], row["seq"]) for row in twice.rows() if row["outcome"] == "fault"}
+    assert fell == {(f"every_third-{n}", seq) for n in range(2) for seq in range(2, 20, 3)}
+
+
+def test_all_that_a_rule_may_do_leaves_one_outcome_for_each_reception() -> None:
+    others = fault("corrupt", probability=0.3), fault("DoS", factor=3)
+    air = chatted(rule("everything"), *others, loss=0.1, periods=40)
+    rows = air.rows()
+    assert air.failures == []
+    keys = [(row["sender"], row["seq"], row["receiver"], row["copy"]) for row in rows]
+    assert len(set(keys)) == len(keys)
+    mine = [row for row in rows if row["cause"] == "everything-0"]
+    dropped = sum(row["outcome"] == "fault" for row in mine)
+    assert dropped == pytest.approx(0.2 * 3 * 40 * 5 * 4, rel=0.1)
+    assert sum(row["copy"] > 0 and row["outcome"] == "delivered" for row in mine) > 1000
+    assert max(row["arrival_ns"] - row["sent_ns"] for row in mine if row["arrival_ns"]) > 0.2 * S
+
+
+def test_a_rule_gives_some_receivers_other_bytes_and_leaves_others_to_chance() -> None:
+    air = FaultyEngine([rule("everything")], count=3)
+    for n in range(60):
+        air.send(n * PERIOD_NS, 0, b"abcdef")
+    rows = [row for row in air.rows() if row["outcome"] == "delivered" and row["copy"] == 0]
+    got = {delivery.packet.payload for delivery in air.delivered}
+    assert b"fedcba" in got and b"abcdef" in got and len(got) > 20
+    assert {len(payload) for payload in got} == {6}
+    changed = [row for row in rows if row["payload_digest"] != digest(b"abcdef")]
+    assert {row["cause"] for row in changed} == {"everything-0"}
+
+
+def test_a_sender_s_rule_says_what_is_sent_in_place_of_each_frame() -> None:
+    air = FaultyEngine([rule("babbles", 1.0, 1.0, "custom_sender", nodes={"ids": ["v1"]})], count=3)
+    for n in range(30):
+        air.send(n * PERIOD_NS, 1, b"%d" % n)
+        air.send(n * PERIOD_NS, 0, b"good")
+    sent: dict[int, list[bytes]] = {}
+    for row in air.rows():
+        assert (row["cause"] == "babbles-0") == (row["sender"] == "v1" and 1 * S <= row["sent_ns"] < 2 * S)
+    for delivery in air.delivered:
+        if delivery.receiver == 2 and delivery.packet.payload != b"good":
+            sent.setdefault(delivery.packet.sent_ns // PERIOD_NS, []).append(delivery.packet.payload)
+    assert sorted(sent[9]) == [b"9"]
+    assert sorted(sent[10]) == [b"10", b"lie 10", b"none"]
+    assert sorted(sent[11]) == [b"10", b"11", b"lie 11"]
+    assert sorted(sent[20]) == [b"20"]
+
+
+NONSENSE = {
+    "text": "answers 'drop': Answer(…) is needed, or None to let the frame pass",
+    "mask": "answers drop of shape (5,): one value is needed, or 4, one a receiver",
+    "number": "answers drop = array([0., 0., 0., 0.]): True or False is needed, or 4 of them",
+    "ragged": "answers drop = [[True], [True, False]]: True or False is needed, or 4 of them",
+    "nan": "answers delay_s = nan: a number from 0 to 60 is needed",
+    "negative": "answers delay_s = -0.001: a number from 0 to 60 is needed",
+    "long": "answers delay_s = 61: a number from 0 to 60 is needed",
+    "words": "answers delay_s = 'soon': a number from 0 to 60 is needed, or 4 of them",
+    "flips": "answers corrupt = 1.5: a whole number from 0 to 65000 is needed, or 4 of them",
+    "copies": "answers copies = 21: a whole number from 0 to 20 is needed",
+    "copy_delay": "answers copy_delay_s = 0: a number over 0 and up to 60 is needed",
+    "short": "answers payload['v1'] = b'x': 20 bytes are needed",
+    "stranger": "answers payload['nobody']: is none of the frame's receivers",
+    "list": "answers payload = [",
+}
+NONSENSE_OF_SENDERS = {
+    "text": "answers 'drop': a list of one payload or more is needed, or None to change nothing",
+    "none": "answers []: a list of one payload or more is needed, or None to change nothing",
+    "many": "answers 201 payloads: 200 at most",
+    "str": "answers the payload 'x': bytes are needed",
+    "large": "answers a payload of 100000 bytes: radio.max_payload_bytes = ",
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "answer", "said"),
+    [("custom", *item) for item in NONSENSE.items()]
+    + [("custom_sender", *item) for item in NONSENSE_OF_SENDERS.items()],
+)
+def test_nonsense_is_told_once_and_then_everything_passes(kind: str, answer: str, said: str) -> None:
+    air, free = chatted(rule("nonsense", kind=kind, options={"answer": answer}), periods=3), chatted(periods=3)
+    assert without_cause(air.rows()) == free.rows()
+    (failure,) = air.failures
+    assert failure.error.startswith(said) and "\n" not in failure.error
+    assert (failure.fault, failure.rule, failure.time_ns, failure.sender) == (
+        "nonsense-0",
+        "tests.support.rules:nonsense",
+        0,
+        "v0",
+    )
+
+
+def test_a_rule_that_raises_is_told_with_its_line_and_what_it_did_before_stays() -> None:
+    air = chatted(rule("raises"))
+    (failure,) = air.failures
+    assert failure.error.startswith("raises ValueError: no idea of v0 (rules.py:")
+    assert failure.time_ns == 1 * S
+    assert 'raise ValueError(f"no idea of {frame.sender}")' in failure.where
+    assert "own_rules.py" not in failure.where
+    fell = {row["sent_ns"] for row in air.rows() if row["outcome"] == "fault"}
+    assert fell == {n * PERIOD_NS for n in range(10)}
+
+
+def test_a_rule_that_ends_the_process_fails_like_any_other() -> None:
+    (failure,) = chatted(rule("exits"), periods=1).failures
+    assert failure.error.startswith("raises SystemExit: enough (rules.py:")
+
+
+def test_a_rule_that_never_answers_is_interrupted_after_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    air, free = chatted(rule("loops"), periods=3), chatted(periods=3)
+    (failure,) = air.failures
+    assert failure.error.startswith("does not answer within 0.05 s of processor time (rules.py:")
+    assert air.rows() == free.rows()
+
+
+def test_calls_are_bounded_one_by_one_and_not_in_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rule_watch, "LIMIT_S", 0.05)
+    for _ in range(3):
+        with pytest.raises(rule_watch.NoAnswerError):
+            rule_watch.call_bounded(rules.loops, None, {})
+        assert rule_watch.call_bounded(np.add, 1, 2) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (
+            "tests.support.nowhere:rule",
+            "cannot import: ModuleNotFoundError: No module .*nowhere'",
+        ),
+        ("tests.support.rules:nobody", r"module tests.support.rules \(.*rules.py\) has no 'nobody'"),
+        ("tests.support.rules:NUMBER", r"is not a function of a frame and a state: def NUMBER\(frame, state\)"),
+        ("tests.support.rules:waits", r"is not a function of a frame and a state: def waits\(frame, state\)"),
+        ("agents.beacon:main", "is in the program's module: put it into a module of its own"),
+    ],
+)
+def test_a_rule_that_is_none_is_a_mistake_of_the_scenario(name: str, said: str) -> None:
+    scenario = Scenario.model_validate({"fault": [{"kind": "custom", "rule": name, "duration_s": 1.0}]})
+    with pytest.raises(ScenarioError, match=rf"^fault\.rule = '{name}': {said}$"):
+        OwnRules(1, ["v1"]).load(scenario.fault, Program())
