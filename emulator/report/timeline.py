@@ -38,6 +38,8 @@ LONGEST_PIECE = 10_000
 NS_PER_US = 1000
 FIRST_VIEW_US = 1_000_000
 SHORTEST_VIEW_US = 100_000
+SHARE_BEFORE = 0.6
+"""Share of the first view that is before a failure or the beginning of a fault."""
 DELAYS_IN_VIEW = 60
 """Usual delays of frames in the first view: arrows are then some 20 pixels wide."""
 
@@ -105,8 +107,11 @@ class Timeline:
         return [self.data[i : i + LONGEST_PIECE] for i in range(0, len(self.data), LONGEST_PIECE)]
 
 
-def timeline(source: Source, most: int = MOST_RECEPTIONS) -> Timeline | None:
-    """Return the timeline of a run with `most` receptions at most; None if there is no trace, and so no lanes."""
+def timeline(source: Source, most: int = MOST_RECEPTIONS, at_us: int | None = None) -> Timeline | None:
+    """Return the timeline of a run with `most` receptions at most; None if there is no trace, and so no lanes.
+
+    It begins at the first failure, else at `at_us`, else at the first fault.
+    """
     recorded = source.recorded
     if maybe(lambda: recorded.trace) is None or maybe(lambda: recorded.node_ids) is None or not recorded.node_ids:
         return None
@@ -119,7 +124,7 @@ def timeline(source: Source, most: int = MOST_RECEPTIONS) -> Timeline | None:
     kept, how = choose(frames, sent_us[frames.first], points, most)
     rows = np.flatnonzero(kept[frames.of_row])
     rows = rows[np.lexsort((recorded.receiver[rows], recorded.emission[rows], sent_us[rows]))]
-    view = first_view(sent_us, marks, bars, end_us, _usual_delay_us(recorded, sent_us))
+    view = first_view(_first_point(marks, bars, at_us), end_us, _usual_delay_us(recorded, sent_us))
     data = {
         "end": end_us,
         "view": view,
@@ -342,22 +347,23 @@ def _usual_delay_us(recorded: OpenedRun, sent_us: IntArray) -> int:
     return int(np.median(delay_us)) if len(delay_us) else 0
 
 
-def first_view(
-    sent_us: IntArray, marks: Sequence[Mark], bars: Sequence[Bar], end_us: int, delay_us: int
-) -> list[int]:
-    """Return the time that is shown first: around the first failure, else the first fault, else the first second.
+def _first_point(marks: Sequence[Mark], bars: Sequence[Bar], at_us: int | None) -> int | None:
+    """Return the instant of the first failure, else `at_us`, else that of the first fault, else None."""
+    failure = next((mark.time_us for mark in marks if mark.kind == FAILURE), at_us)
+    return min((bar.start_us for bar in bars), default=None) if failure is None else failure
 
-    Around a failure or a fault it is so short that the slope of arrows shows, which take `delay_us`.
+
+def first_view(at_us: int | None, end_us: int, delay_us: int) -> list[int]:
+    """Return the time that is shown first: around an instant, else the first second.
+
+    Around an instant it is so short that the slope of arrows shows, which take `delay_us`.
     """
-    failure = next((mark.time_us for mark in marks if mark.kind == FAILURE), None)
-    fault = min((bar.start_us for bar in bars), default=None)
     width_us = min(FIRST_VIEW_US, max(end_us, 1))
-    if failure is None and fault is None:
+    if at_us is None:
         return [0, width_us]
-    at_us, share = (fault or 0, 0.4) if failure is None else (failure, 0.75)
-    slope_us = max(SHORTEST_VIEW_US, DELAYS_IN_VIEW * delay_us) if len(sent_us) else width_us
-    width_us = min(width_us, slope_us)
-    start_us = max(0, min(round(at_us - share * width_us), end_us - width_us))
+    if delay_us:
+        width_us = min(width_us, max(SHORTEST_VIEW_US, DELAYS_IN_VIEW * delay_us))
+    start_us = max(0, min(round(at_us - SHARE_BEFORE * width_us), end_us - width_us))
     return [start_us, start_us + width_us]
 
 

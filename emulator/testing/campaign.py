@@ -25,7 +25,6 @@ from rich.table import Table
 from rich.text import Text
 
 from emulator.checks.own import is_broken
-from emulator.pages.page import table as page_table
 from emulator.records.atomic import write_atomically
 from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
@@ -35,6 +34,7 @@ from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.explanation import PARTING_FILE, Explanation, explain
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
+from emulator.testing.failure_page import shown_parting, write_failure_page
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, regression_test
 from emulator.testing.shrinking import Schedule, shrink
@@ -237,6 +237,8 @@ class Campaign:
         other = nearest.scenario if nearest else None
         explanation = explain(outcome.shrunk, outcome.folder, other, self._workshop)
         (outcome.folder / PARTING_FILE).write_text(explanation.text())
+        title = f"Failure {outcome.label} of campaign {self._plan.scenario.run.name}"
+        write_failure_page(outcome.folder, title, outcome.texts(), explanation)
         return replace(outcome, explanation=explanation)
 
     def _smallest(self, outcome: Outcome, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
@@ -279,7 +281,7 @@ class Campaign:
             "order": outcome.order(),
             "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
             "folder": f"failures/{outcome.folder.name}",
-            "parting": _parting(outcome.explanation),
+            "parting": shown_parting(outcome.explanation) if outcome.explanation else None,
         }
 
     def summary(self) -> Iterator[Table | Text]:
@@ -306,15 +308,6 @@ class Campaign:
 def _distance(outcome: Outcome, other: Outcome) -> tuple[bool, int]:
     """Return by what to choose among runs to compare a run with: the last one before it, else the next."""
     return other.number > outcome.number, abs(other.number - outcome.number)
-
-
-def _parting(explanation: Explanation | None) -> dict[str, Any] | None:
-    """Return what a page shows of an explanation: its line, its table, and what came before."""
-    if explanation is None:
-        return None
-    rows = page_table(explanation.rows()) if explanation.partings else None
-    node = explanation.partings[0].node if explanation.partings else ""
-    return {"line": explanation.line(), "rows": rows, "node": node, "until": explanation.until}
 
 
 def runs_of(kind: FailureKind) -> str:

@@ -108,7 +108,7 @@ function drawAxis() {
     pen.fillStyle = colour("purple");
     pen.fillRect(left, top, right - left, BAR_PX - 2);
     pen.globalAlpha = 1;
-    pen.fillRect(left, top, 2, BAR_PX - 2);
+    if (bar.start >= start) pen.fillRect(left, top, 2, BAR_PX - 2);
     pen.fillStyle = colour("ink");
     pen.save();
     pen.beginPath(); pen.rect(left, top, right - left, BAR_PX); pen.clip();

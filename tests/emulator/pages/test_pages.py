@@ -16,6 +16,7 @@ from emulator.pages.page import Table, render, table
 from emulator.pages.text import LONGEST_TEXT, as_text, cell
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import Chart
+from emulator.report.timeline import Timeline
 from emulator.testing.matrix import page as campaign_page
 from tests.support.paths import ROOT
 
@@ -80,7 +81,14 @@ def comparison(text: str) -> str:
     )
 
 
-@pytest.mark.parametrize("make", [campaign, comparison])
+def failure(text: str) -> str:
+    """A failure's page with a text wherever others may have written it."""
+    parting = {"line": text, "rows": table([{text: text}]), "node": text, "until": [text, text]}
+    timeline = Timeline(text[:LONGEST_TEXT], text, [(text, "ink", "1")], [("event", "◆", "blue", text, "1")], True)
+    return render("failure.html.j2", title=text, checks={text: text}, parting=parting, timeline=timeline)
+
+
+@pytest.mark.parametrize("make", [campaign, comparison, failure])
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
 def test_hostile_text_adds_no_element_no_attribute_and_no_control(make: Callable[[str], str], text: str) -> None:
     plain, page = Elements(make("plain")), make(text)

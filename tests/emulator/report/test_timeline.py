@@ -11,6 +11,7 @@ import pytest
 from emulator.api import simulate_into
 from emulator.pages.page import render
 from emulator.records.run_folder import Event
+from emulator.report import timeline as module
 from emulator.report.source import Source
 from emulator.report.timeline import (
     Bar,
@@ -141,13 +142,19 @@ def test_all_frames_of_one_instant_are_more_than_there_is_room_for() -> None:
     assert 0 < 10 * kept.sum() <= 200
 
 
-def test_the_first_view_is_at_the_first_failure_then_the_first_fault_then_the_beginning() -> None:
-    sent_us = np.arange(0, 20_000_000, 100_000)
+def test_the_first_view_is_at_the_first_failure_then_the_parting_then_the_first_fault() -> None:
     marks, bars = [Mark(8_000_000, 1, "failure", "")], [Bar("loss-0", 4_000_000, 5_000_000, (1,))]
-    for some_marks, some_bars, at_us in ((marks, bars, 8_000_000), ([], bars, 4_000_000), ([], [], 0)):
-        start, end = first_view(sent_us, some_marks, some_bars, 20_000_000, 3000)
-        assert start <= at_us < end and end - start == (180_000 if at_us else 1_000_000)
-    assert first_view(sent_us, [], [], 300_000, 3000) == [0, 300_000]
+    assert module._first_point(marks, bars, 6_000_000) == 8_000_000
+    assert module._first_point([], bars, 6_000_000) == 6_000_000
+    assert module._first_point([], bars, None) == 4_000_000
+    assert module._first_point([], [], None) is None
+
+
+def test_the_first_view_shows_the_slope_of_arrows_and_lies_in_the_run() -> None:
+    assert first_view(8_000_000, 20_000_000, 3000) == [7_892_000, 8_072_000]
+    assert first_view(None, 20_000_000, 3000) == [0, 1_000_000]
+    assert first_view(50_000, 300_000, 100_000) == [0, 300_000]
+    assert first_view(19_990_000, 20_000_000, 0) == [19_000_000, 20_000_000]
 
 
 def test_a_fault_that_does_not_end_lasts_until_the_end_and_unknown_nodes_are_left_out() -> None:

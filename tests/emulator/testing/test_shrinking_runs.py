@@ -17,6 +17,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.explanation import PARTING_FILE
+from emulator.testing.failure_page import FAILURE_PAGE
 from emulator.testing.regression_test import TEST_FILE
 from emulator.testing.shrinking_runs import fewest, order_text
 from vnet.transport.orders import Deviation
@@ -73,6 +74,9 @@ def test_a_campaign_of_orders_keeps_the_least_case_as_a_test_that_fails(tmp_path
     parts = "parts from the same run in FIFO order at "
     assert f"\n001 {parts}" in said.getvalue() and page.count(f"This run {parts}") == len(failed)
     assert (folder / "failures" / "001" / PARTING_FILE).read_text().startswith(parts)
+    failure = (folder / "failures" / "001" / FAILURE_PAGE).read_text()
+    assert f"This run {parts}" in failure and 'id="timeline-data"' in failure and "crashed: " in failure
+    assert page.count('<a href="failures/001/failure.html">') == 1
     assert [row["parting"]["differences"][0]["first"] for row in failed] == ["decision"] * len(failed)
     test = folder / "failures" / "001" / TEST_FILE
     done = subprocess.run(
