@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import takewhile, zip_longest
 from typing import Any
 
 import pyarrow as pa
@@ -74,13 +74,26 @@ Entry = tuple[int, str, str]
 
 
 def _first_entry(kind: str, first: Sequence[Entry], second: Sequence[Entry]) -> Parting | None:
-    for ours, theirs in zip_longest(first, second):
+    """Return the first entry that one run has, beside what the other has of that node and instant in its place.
+
+    An entry that the other run has as well, only later in its list, is not in its place.
+    """
+    for i, (ours, theirs) in enumerate(zip_longest(first, second)):
         if ours != theirs:
-            time_ns = min(each[0] for each in (ours, theirs) if each is not None)
-            shown = [each[2] if each is not None and each[0] == time_ns else "" for each in (ours, theirs)]
-            node = next(each[1] for each in (ours, theirs) if each is not None and each[0] == time_ns)
+            time_ns, node, _ = min(each for each in (ours, theirs) if each is not None)
+            shown = [
+                each[2]
+                if each is not None and each[:2] == (time_ns, node) and not _is_among(each, other[i:])
+                else ""
+                for each, other in ((ours, second), (theirs, first))
+            ]
             return Parting(time_ns, kind, node, shown[0], shown[1])
     return None
+
+
+def _is_among(entry: Entry, others: Sequence[Entry]) -> bool:
+    """Return whether the entry is one of the others of its instant, which come first."""
+    return entry in takewhile(lambda other: other[0] <= entry[0], others)
 
 
 def _decisions(run: OpenedRun) -> list[Entry]:

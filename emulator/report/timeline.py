@@ -369,6 +369,8 @@ def first_view(at_us: int | None, end_us: int, delay_us: int) -> list[int]:
 
 def _note(shown: int, total: int, how: tuple[int, int], points: Collection[int]) -> str:
     """Return in words how many receptions are shown, with the weights of the points near which all are."""
+    if not total:
+        return "No frame was sent to anybody in range."
     if shown == total:
         return f"All {total:,} attempted receptions are shown."
     radius_us, step = how

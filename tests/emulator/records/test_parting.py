@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from emulator.api import simulate_into
 from emulator.cli.commands import app
-from emulator.records.parting import Parting, before, partings
+from emulator.records.parting import Entry, Parting, _first_entry, before, partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 
@@ -56,6 +56,27 @@ def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) ->
     assert 0.95 < reception.time_ns / 1e9 < 1.2
     assert any(line.endswith("heard frame 0 of v01") for line in told(plain, reception)) is False
     assert len(told(plain, reception)) == 8
+
+
+V01, V02, V02_LATER = (5, "v01", "frame of v01"), (5, "v02", "frame of v02"), (9, "v02", "frame of v02")
+
+
+@pytest.mark.parametrize(
+    "first, second, expected",
+    [
+        ([V01, V02], [V02], Parting(5, "frame", "v01", "frame of v01", "")),
+        ([V02], [V01, V02], Parting(5, "frame", "v01", "", "frame of v01")),
+        ([V01], [V02_LATER], Parting(5, "frame", "v01", "frame of v01", "")),
+        ([(5, "v01", "a"), (5, "v01", "b")], [(5, "v01", "b")], Parting(5, "frame", "v01", "a", "")),
+        ([(5, "v01", "lost")], [(5, "v01", "delivered")], Parting(5, "frame", "v01", "lost", "delivered")),
+        ([V01, V02], [V01, V02], None),
+    ],
+    ids=["missing", "more", "later", "one of two", "another", "same"],
+)
+def test_a_parting_names_the_entry_that_one_run_lacks(
+    first: list[Entry], second: list[Entry], expected: Parting | None
+) -> None:
+    assert _first_entry("frame", first, second) == expected
 
 
 @pytest.mark.parametrize("other, status", [("a", 0), ("nothing", 2)])

@@ -55,7 +55,9 @@ def test_faults_are_compared_with_none(tmp_path: Path) -> None:
     found, pool = explained(planted("impatient", fault=[pause]), tmp_path)
     assert found.passing == "the same run without faults" and pool.runs == 1
     assert 250_000_000 <= found.partings[0].time_ns <= 650_000_000
-    assert "v02 until then" in found.text() or "v01 until then" in found.text()
+    frame = next(row for row in found.rows() if row["first"] == "frame")
+    assert frame["in the run that passes"].startswith("frame 2 of v02, ") and frame["in this run"] == "nothing"
+    assert "v02 until then, in this run:" in found.text()
 
 
 def test_a_seed_is_compared_with_one_that_passes_and_without_one_says_so(tmp_path: Path) -> None:
