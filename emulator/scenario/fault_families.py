@@ -256,6 +256,11 @@ class OwnRule(Fault):
         function = file[1] if file is not None else self.rule.rpartition(":")[2]
         return self.name or function or DEFAULT_RULE
 
+    def __hash__(self) -> int:
+        """Return a hash as all faults have one, from all but the options, which are tables."""
+        others = (getattr(self, name) for name in type(self).model_fields if name != "options")
+        return hash((type(self), *others))
+
 
 class GnssFault(NodeFault):
     """A fault of GNSS receivers."""

@@ -231,6 +231,12 @@ def test_any_faults_survive_being_written_and_read(
     )
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_equal_faults_have_one_hash(kind: str) -> None:
+    options = {"options": {"a": [1, {"b": 2}]}} if kind.startswith("custom") else {}
+    assert len({parse_fault(minimal(kind, **options)) for _ in range(2)}) == 1
+
+
 def same(one: FaultPlan, other: FaultPlan) -> bool:
     """Return True if two plans do the same at all times, by the same names and with the same draws."""
     return [(p.label, p.start_ns, p.end_ns, p.nodes.tolist()) for p in one.faults] == [
