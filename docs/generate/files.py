@@ -12,8 +12,9 @@ from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
-from emulator.records.metrics import METRICS, PeriodFigures
+from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import ARRAYS
 from emulator.records.reported import MOST_COLUMNS
 from emulator.records.states import STATES

@@ -23,8 +23,9 @@ from emulator.radio.connectivity import connectivity_of
 from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.records.costs import Costs
-from emulator.records.metrics import Metrics, PeriodFigures
+from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
 from emulator.scenario.program import Program
@@ -43,8 +44,13 @@ class PeriodView:
 
     instant: Instant
     reports: list[Report]
-    figures: PeriodFigures
+    metrics: Metrics
     counts: dict[str, int]
+
+    @property
+    def figures(self) -> PeriodFigures:
+        """Its figures."""
+        return self.metrics.rows[self.instant.period]
 
 
 @dataclass(frozen=True)
@@ -367,13 +373,18 @@ class Emulation:
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
             component = self._component(self._period) if self.world.moves else None
-            figures = self.metrics.record(instant, reports, component)
+            self.metrics.record(instant, reports, component)
             self._period += 1
-            counts = {outcome.name: count for outcome, count in self.engine.counts.items()}
-            view = PeriodView(instant, reports, figures, counts)
-            for watcher in self._watchers:
-                watcher(view)
             self._reports = []
+            if self._watchers:
+                self._show_period(instant, reports)
+
+    def _show_period(self, instant: Instant, reports: list[Report]) -> None:
+        """Show those who watch the run the period that has ended."""
+        counts = {outcome.name: count for outcome, count in self.engine.counts.items()}
+        view = PeriodView(instant, reports, self.metrics, counts)
+        for watcher in self._watchers:
+            watcher(view)
 
 
 def node_seed(seed: int, node: str, incarnation: int) -> int:

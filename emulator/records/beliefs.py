@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from vnet.node import Report
 from vnet.types import Array
 
 WEIGHT = "weight."
@@ -34,3 +37,14 @@ class Beliefs:
 def is_cloud(count: int) -> bool:
     """Return whether so many numbers can be points."""
     return count % 2 == 0
+
+
+def collect(number: Mapping[str, int], last: Mapping[str, Report], get: Any, size: int) -> Array:
+    """(N, size) of what `get` finds in each node's report; NaN where it finds nothing of that size."""
+    array = np.full((len(number), size), np.nan)
+    found = [(number[node], value) for node, report in last.items() if (value := get(report)) is not None]
+    fitting = [(i, value) for i, value in found if isinstance(value, (list, tuple)) and len(value) == size]
+    if fitting:
+        at, values = zip(*fitting, strict=True)
+        array[[*at]] = values
+    return array

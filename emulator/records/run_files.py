@@ -20,8 +20,9 @@ import pyarrow.parquet as pq
 
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
-from emulator.records.metrics import METRICS, PeriodFigures
+from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS, KeptPayloads
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
-from emulator.records.beliefs import WEIGHT, Beliefs, is_cloud
-from emulator.records.metrics import PeriodFigures, collect
+from emulator.records.beliefs import WEIGHT, Beliefs, collect, is_cloud
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import MOST_DOTTED, figures_among, is_weight
 from emulator.records.run_folder import Event

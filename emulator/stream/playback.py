@@ -12,7 +12,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from emulator.records.busy import busy_windows, mean_busy
-from emulator.records.metrics import PeriodFigures
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.run_files import check_is_run
 from emulator.records.run_folder import STATES_FILE, Event

@@ -31,7 +31,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
-from emulator.records.metrics import PeriodFigures
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.run import Run
 from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
 from emulator.scenario.fault_families import LONGEST_S, Fault, OwnRule

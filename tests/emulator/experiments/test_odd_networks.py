@@ -8,7 +8,7 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.records.metrics import PeriodFigures
+from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.records.metrics import Metrics, summarize
+from emulator.records.period_figures import PeriodFigures
 from emulator.stream.messages import beliefs_of, pack
 from emulator.world.world import Instant
 from vnet.node import Report, Value
@@ -23,14 +24,21 @@ def metrics() -> Metrics:
     return Metrics(["a", "b"], np.array([0, 0]), 100_000_000)
 
 
+def figures_of_one(*reports: Report) -> PeriodFigures:
+    """Return the figures of the only period of a run."""
+    kept = metrics()
+    kept.record(INSTANT, reports)
+    return kept.rows[-1]
+
+
 @pytest.mark.parametrize("covariance", [(-1.0, 0.0, 0.0, -1.0), (0.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, -1.0)])
 def test_a_covariance_that_is_not_positive_definite_takes_no_part_in_the_anees(
     covariance: tuple[float, float, float, float],
 ) -> None:
     honest = Report(0, "a", (1.0, 0.0), (1.0, 0.0, 0.0, 1.0))
     broken = Report(0, "b", (0.0, 0.0), covariance)
-    assert metrics().record(INSTANT, [broken]).position_anees is None
-    assert metrics().record(INSTANT, [honest, broken]).position_anees == pytest.approx(0.5)
+    assert figures_of_one(broken).position_anees is None
+    assert figures_of_one(honest, broken).position_anees == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("cloud", [1.0, [1.0], [1.0, 2.0, 3.0]])
@@ -87,7 +95,8 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
         for n in rng.permutation(count)
     ]  # fmt: skip
     kept = Metrics([f"v{n}" for n in range(count)], component, 100_000_000)
-    found = kept.record(instant(position, truth, fix), reports)
+    kept.record(instant(position, truth, fix), reports)
+    found = kept.rows[-1]
     groups = [common[component == label] for label in sorted(set(component))]
     means = [group.mean(axis=0) for group in groups]
     expected = {
@@ -110,6 +119,44 @@ def test_every_figure_is_the_one_that_its_definition_gives(seed: int, count: int
         assert getattr(found, name) == pytest.approx(value, rel=1e-9, abs=1e-12), name
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 30), st.sampled_from([0.0, 0.02, 0.6, 1.0]))
+def test_the_figures_of_many_periods_are_those_of_each_bit_by_bit(
+    seed: int, vehicles: int, periods: int, missing: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    nodes = [f"v{n}" for n in range(vehicles)]
+    together, asked = (Metrics(nodes, np.zeros(vehicles, np.intp), 100_000_000) for _ in range(2))
+    component = np.zeros(vehicles, np.intp)
+    for period in range(periods):
+        if rng.random() < 0.3:
+            component = rng.integers(-1, 3, vehicles)
+        position, fix = rng.normal(0, 100, (2, vehicles, 2))
+        absent = rng.random(vehicles) < missing / 2
+        position[absent], fix[absent] = np.nan, np.nan
+        reports = [_random_report(rng, node, missing) for node in nodes]
+        now = instant(position, rng.normal(0, 3, 2), fix, period)
+        for kept in (together, asked):
+            kept.record(now, reports, component)
+        assert asked.rows[-1].period == period
+    assert repr(together.rows) == repr(asked.rows)
+
+
+def _random_report(rng: np.random.Generator, node: str, missing: float) -> Report:
+    """Return a report in which each figure is left out with the probability `missing`."""
+    matrix = rng.normal(0, 1, (2, 2))
+    covariance = (matrix @ matrix.T).ravel().tolist() if rng.random() < 0.9 else [0.0] * 4
+    sizes = {"common_error_m": 2, "stacked_common_error_m": 2, "mean_m": 2}
+    values: Values = {
+        name: rng.normal(0, 1, size).tolist() for name, size in sizes.items() if rng.random() >= missing
+    }
+    if rng.random() >= missing:
+        values["common_error_covariance_m2"] = covariance
+    x_m, y_m = rng.normal(0, 1, 2).tolist()
+    a, b, c, d = covariance
+    return Report(0, node, (x_m, y_m) if rng.random() >= missing else None, (a, b, c, d), values)
+
+
 def test_who_says_nothing_leaves_nulls_in_both_tables() -> None:
     kept = metrics()
     kept.record(INSTANT, [Report(0, "a", (1.0, 2.0), None)])
@@ -126,7 +173,7 @@ def test_who_says_nothing_leaves_nulls_in_both_tables() -> None:
 
 def test_figures_are_of_those_who_reported() -> None:
     one = Report(0, "a", None, None, {"common_error_m": [3.0, 4.0]})
-    figures = metrics().record(INSTANT, [one])
+    figures = figures_of_one(one)
     assert figures.common_error_rmse_m == pytest.approx(5.0)
     assert figures.deviation_m == 0.0
     assert figures.reporting == 1
@@ -134,7 +181,7 @@ def test_figures_are_of_those_who_reported() -> None:
 
 def test_the_last_report_of_a_period_counts_and_earlier_ones_are_still_looked_at() -> None:
     reports = [Report(0, "a", (float("nan"), 0.0), None), Report(1, "a", (2.0, 0.0), None)]
-    figures = metrics().record(INSTANT, reports)
+    figures = figures_of_one(*reports)
     assert figures.position_rmse_m == pytest.approx(2.0)
     assert (figures.reporting, figures.not_finite) == (1, 1)
 
@@ -152,7 +199,8 @@ def test_a_number_that_is_none_is_counted_wherever_it_stands_and_spoils_no_other
     values = wrong.get(place, {})
     honest = Report(0, "a", (0.0, 3.0), (1.0, 0.0, 0.0, 1.0), {"common_error_m": [0.0, 2.0]})
     kept = metrics()
-    figures = kept.record(INSTANT, [honest, Report(0, "b", estimate, covariance, values)])
+    kept.record(INSTANT, [honest, Report(0, "b", estimate, covariance, values)])
+    figures = kept.rows[-1]
     assert figures.not_finite == 1
     assert figures.common_error_rmse_m == pytest.approx(2.0)
     assert figures.position_rmse_m == pytest.approx(3.0 if place == "estimate" else 3.0 / math.sqrt(2))
@@ -169,7 +217,8 @@ def test_a_value_of_the_wrong_size_is_left_out() -> None:
         "weights": [0.5, 0.5],
     }
     kept = metrics()
-    figures = kept.record(INSTANT, [Report(0, "b", None, None, odd)])
+    kept.record(INSTANT, [Report(0, "b", None, None, odd)])
+    figures = kept.rows[-1]
     assert figures.common_error_rmse_m is figures.consensus_error_m is None
     row = kept.states_table().to_pylist()[1]
     assert row["common_error_estimate_m"] is row["mean_m"] is row["cloud_m"] is None

@@ -211,7 +211,8 @@ def test_metrics_are_the_figures_by_hand() -> None:
         })
         for node, x in (("a", 0.0), ("b", 10.0), ("c", 500.0))
     ]  # fmt: skip
-    figures = metrics.record(instant(position, [2.0, 0.0]), reports)
+    metrics.record(instant(position, [2.0, 0.0]), reports)
+    figures = metrics.rows[-1]
     assert figures.common_error_rmse_m == pytest.approx(np.sqrt((1 + 1 + 4) / 3))
     mean = np.array([2.0, 2 / 3])
     assert figures.bias_m == pytest.approx(2 / 3)
@@ -230,12 +231,14 @@ def test_metrics_are_the_figures_by_hand() -> None:
 def test_who_reports_nothing_leaves_nulls_and_nan_is_counted() -> None:
     position = np.array([[0.0, 0.0], [10.0, 0.0]])
     metrics = Metrics(["a", "b"], np.array([0, 0]), 100_000_000)
-    figures = metrics.record(instant(position, [2.0, 0.0]), [])
+    metrics.record(instant(position, [2.0, 0.0]), [])
+    figures = metrics.rows[-1]
     assert figures.common_error_rmse_m is None
     assert figures.position_rmse_m is None
     assert figures.reporting == 0
     broken = Report(0, "a", (float("nan"), 0.0), None, {"x": [float("inf")], "common_error_m": [1.0]})
-    assert metrics.record(instant(position, [2.0, 0.0]), [broken]).not_finite == 1
+    metrics.record(instant(position, [2.0, 0.0]), [broken])
+    assert metrics.rows[-1].not_finite == 1
     assert metrics.states_table().num_rows == 4
     assert metrics.metrics_table()["not_finite"].to_pylist() == [0, 1]
 
