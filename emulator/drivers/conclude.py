@@ -53,6 +53,24 @@ def _start_up_s(emulation: Emulation) -> float | None:
     return float(started[0].details["start_up_s"]) if started else None
 
 
+def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
+    """Return the tables of a run that is over. None of them is kept yet."""
+    folder = emulation.folder
+    emulation.log_book.tell_left_out(emulation.emulated_ns)
+    for node, left_out in collect(folder, emulation.world.node_ids, emulation.scenario.run.files_max_mb).items():
+        folder.event(emulation.emulated_ns, "files_left_out", node, count=left_out.count, which=left_out.which)
+    folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
+    return RecordedRun(
+        emulation.scenario,
+        emulation.engine.trace.to_table(),
+        emulation.metrics.states_table(),
+        emulation.metrics.metrics_table(),
+        folder.events,
+        busy=_busy(emulation),
+        world=RecordedWorld.of(emulation.world),
+    )
+
+
 def conclude(
     emulation: Emulation, wall_s: float, command: str, replay: str = ""
 ) -> tuple[Judgement, dict[str, Any]]:
@@ -63,25 +81,8 @@ def conclude(
     """
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
-    emulation.log_book.tell_left_out(emulation.emulated_ns)
-    for node, left_out in collect(folder, emulation.world.node_ids, emulation.scenario.run.files_max_mb).items():
-        folder.event(emulation.emulated_ns, "files_left_out", node, count=left_out.count, which=left_out.which)
-    folder.event(emulation.emulated_ns, "ended", wall_s=round(wall_s, 3))
-    trace = emulation.engine.trace.to_table()
-    states = emulation.metrics.states_table()
-    metrics = emulation.metrics.metrics_table()
-    busy, world = _busy(emulation), RecordedWorld.of(emulation.world)
-    tables = {TRACE_FILE: trace, STATES_FILE: states, METRICS_FILE: metrics, BUSY_FILE: busy}
-    for name, table in tables.items():
-        if table is not None:
-            folder.put_table(name, table)
-    if emulation.payloads is not None:
-        folder.put_table(PAYLOADS_FILE, emulation.payloads.to_table())
-    folder.put(WORLD_FILE, world.write)
-    if emulation.orders.explores:
-        tape = dump_tape(emulation.orders.in_order())
-        folder.put(TAPE_FILE, lambda path: write_text(path, tape))
-    recorded = RecordedRun(emulation.scenario, trace, states, metrics, folder.events, busy=busy, world=world)
+    recorded = gather(emulation, wall_s)
+    _put_tables(emulation, recorded)
     judgement = judge(recorded, _own_findings(recorded, folder))
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
     if replay:
@@ -102,7 +103,7 @@ def conclude(
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
-        "reported": {name: asdict(figure) for name, figure in reported_figures(states).items()},
+        "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
         "cost": asdict(cost),
         "reproduce": reproduce,
         "versions": {
@@ -113,6 +114,27 @@ def conclude(
     }
     folder.put_json(VERDICT_FILE, verdict)
     return judgement, verdict
+
+
+def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
+    """Write the tables of a run into its folder."""
+    folder = emulation.folder
+    tables = {
+        TRACE_FILE: recorded.trace,
+        STATES_FILE: recorded.states,
+        METRICS_FILE: recorded.metrics,
+        BUSY_FILE: recorded.busy,
+    }
+    for name, table in tables.items():
+        if table is not None:
+            folder.put_table(name, table)
+    if emulation.payloads is not None:
+        folder.put_table(PAYLOADS_FILE, emulation.payloads.to_table())
+    if recorded.world is not None:
+        folder.put(WORLD_FILE, recorded.world.write)
+    if emulation.orders.explores:
+        tape = dump_tape(emulation.orders.in_order())
+        folder.put(TAPE_FILE, lambda path: write_text(path, tape))
 
 
 def _order(emulation: Emulation) -> dict[str, Any] | None:

@@ -18,8 +18,8 @@ import pyarrow.compute as pc
 
 from emulator.cells.executors import WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
-from emulator.checks.judge import Verdict
-from emulator.drivers.conclude import conclude
+from emulator.checks.judge import Verdict, judge
+from emulator.drivers.conclude import conclude, gather
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.simulate import simulate
@@ -66,13 +66,19 @@ UNKNOWN = Trial({}, {})
 """Result of a run that was given up."""
 
 
-def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
-    """Simulate and judge a run in this process. Raises VnetError if it cannot be run."""
+def run_trial(scenario: Scenario, folder: RunFolder, keeps_files: bool = True) -> Trial:
+    """Simulate and judge a run in this process. Raises VnetError if it cannot be run.
+
+    Tables are written only if its files are kept, or if checks of the user's own might read them.
+    """
     started = time.monotonic()
     scenario = with_order_steps(scenario)
     emulation = Emulation(scenario, build_world(scenario), folder)
     wall_s, _ = simulate(emulation)
-    judgement, _ = conclude(emulation, wall_s, "simulate")
+    if keeps_files or scenario.program.checks:
+        judgement, _ = conclude(emulation, wall_s, "simulate")
+    else:
+        judgement = judge(gather(emulation, wall_s))
     verdicts = {check.name: check.verdict for check in judgement.checks}
     texts = {check.name: check.text for check in judgement.checks if check.verdict is not Verdict.VALID}
     greatest = _greatest(emulation)
@@ -134,14 +140,15 @@ class TrialPool:
                 return Trial.failure(EMULATOR, str(error))
         return UNKNOWN
 
-    def _here(self, scenario: Scenario, folder: Path) -> Trial:
+    def _here(self, scenario: Scenario, folder: Path, keeps_files: bool = True) -> Trial:
         self._pool.call(self._place, _get_ready)
-        return self._pool.call(self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s)
+        arguments = (scenario, folder, self.limit_s, keeps_files)
+        return self._pool.call(self._place, _run_in_worker, *arguments, limit_s=self.limit_s)
 
     def _away(self, scenario: Scenario) -> Trial:
         if self._executor is None:
             with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-                return self._here(scenario, Path(name) / "run")
+                return self._here(scenario, Path(name) / "run", keeps_files=False)
         future: Future[Trial] = self._executor.submit(
             call_fitly, self._place, _run_without_folder, scenario, self.limit_s, limit_s=self.limit_s
         )
@@ -164,10 +171,10 @@ def _get_ready() -> None:
 def _run_without_folder(scenario: Scenario, limit_s: float) -> Trial:
     """Run a trial in a worker on any machine."""
     with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-        return _run_in_worker(scenario, Path(name) / "run", limit_s)
+        return _run_in_worker(scenario, Path(name) / "run", limit_s, keeps_files=False)
 
 
-def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, keeps_files: bool = True) -> Trial:
     """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
     run_folder = RunFolder.create(folder, scenario)
     with (run_folder.logs / PROGRAMS_LOG).open("ab") as log, (run_folder.logs / "stacks.txt").open("w") as stacks:
@@ -175,7 +182,7 @@ def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:
         os.dup2(log.fileno(), STDOUT)
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            return run_trial(scenario, run_folder)
+            return run_trial(scenario, run_folder, keeps_files)
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")
