@@ -20,6 +20,7 @@ from vnet.runtime.ahead import RunAhead
 from vnet.runtime.disks import Disks
 from vnet.runtime.forced_end import end_within
 from vnet.runtime.host import Host
+from vnet.runtime.mail import Mail
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import wire
@@ -243,7 +244,7 @@ class _RealTimeAgent:
         self._host.apply_clock_error(batch.clocks, self._loop)
         for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
-        self._host.mail.deliver(batch.packets, batch.fixes)
+        self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:

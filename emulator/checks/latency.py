@@ -91,10 +91,8 @@ def _courses(
     start, end, waits = np.zeros(len(sender)), np.zeros(len(sender)), np.zeros(len(sender), dtype=bool)
     episode = _episodes(recorded, plan, sender, sent_ns)
     who, plain, slow, within = -1, (0.0, 0.0), (0.0, 0.0), NO_EPISODE
-    for index, (node, time_ns, number) in enumerate(
-        zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), strict=True)
-    ):
-        usual, fast, slowest, offered = airtime_ns[index].tolist()
+    batches = zip(sender.tolist(), sent_ns.tolist(), episode.tolist(), airtime_ns.tolist(), strict=True)
+    for index, (node, time_ns, number, (usual, fast, slowest, offered)) in enumerate(batches):
         if node != who:
             who, plain, within = node, (0.0, 0.0), NO_EPISODE
         waits[index] = number != NO_EPISODE or plain[1] > time_ns

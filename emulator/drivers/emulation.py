@@ -81,6 +81,8 @@ class Emulation:
     ) -> None:
         start = world.at(0)
         self.scenario = scenario
+        self.duration_ns = scenario.duration_ns
+        """Length of the run."""
         self.world = world
         self.folder = folder
         self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
@@ -137,11 +139,6 @@ class Emulation:
     def watch(self, watcher: Callable[[PeriodView], None]) -> None:
         """Call `watcher` at the end of every period from now on."""
         self._watchers.append(watcher)
-
-    @property
-    def duration_ns(self) -> int:
-        """Length of the run."""
-        return self.scenario.duration_ns
 
     @property
     def emulated_ns(self) -> int:
@@ -334,7 +331,7 @@ class Emulation:
         self._rewrite(self.scenario.model_copy(update={"fault": self.faults.as_written()}))
 
     def _rewrite(self, scenario: Scenario) -> None:
-        self.scenario = scenario
+        self.scenario, self.duration_ns = scenario, scenario.duration_ns
         self.folder.put_scenario(scenario)
 
     def advance(self, time_ns: int) -> list[Delivery]:

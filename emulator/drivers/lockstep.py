@@ -25,8 +25,12 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import ProtocolError, check_ownership
 from emulator.radio.stages import least_latency_ns
-from vnet.node import INBOX_LIMIT
+from vnet.node import INBOX_LIMIT, Fix, Packet
+from vnet.runtime.mail import Mail
 from vnet.transport import wire
+
+Entry = tuple[int, str, int, int, bytes]
+"""A packet: its receiver, its sender's name, times of sending and arrival in ns, and its payload."""
 
 
 class _Process:
@@ -46,7 +50,7 @@ class _Process:
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
         self.steps: Sequence[wire.Step] = ()
-        self.packets: dict[str, list[wire.WirePacket]] = {node: [] for node in self.nodes}
+        self.packets: dict[str, list[Entry]] = {node: [] for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.affected: set[str] = set()
@@ -57,10 +61,10 @@ class _Process:
         """Nodes that are not paused."""
         return [node for node in self.nodes if node not in self.paused]
 
-    def take_packets(self) -> list[wire.WirePacket]:
-        due = [packet for node in self.running for packet in self.packets[node]]
-        for node in self.running:
-            self.packets[node].clear()
+    def take_packets(self) -> dict[str, list[Entry]]:
+        """Return the packets of nodes that run, and have any."""
+        due = {node: self.packets[node] for node in self.running if self.packets[node]}
+        self.packets.update({node: [] for node in due})
         return due
 
     def take_clocks(self) -> list[wire.ClockError]:
@@ -119,6 +123,7 @@ class Lockstep:
         self._end_ns = 0
         self._quiet_ns = 0
         """Instant before which processes that run ahead may pass through quiet instants."""
+        self._mail: Mail | None = None
         self.ahead: Collection[str] = ()
         """Processes that run ahead."""
         radio = emulation.scenario.radio
@@ -152,6 +157,11 @@ class Lockstep:
         """Return what is to be done to processes at this instant, before the grants are given."""
         actions, self._actions = self._actions, []
         return actions
+
+    def take_mail(self) -> Mail | None:
+        """Return what belongs to the grant of the one process of a simulation, which needs no form for the wire."""
+        mail, self._mail = self._mail, None
+        return mail
 
     def receive(self, process_id: str, message: wire.Yield) -> None:
         """A process has yielded.
@@ -268,17 +278,17 @@ class Lockstep:
             if process := self._processes.get(self._process_of[node]):
                 del process.packets[node][:-INBOX_LIMIT]
         self._crowded.clear()
-        inboxes: dict[int, tuple[str, list[wire.WirePacket]]] = {}
-        for receiver, sender, sent_ns, arrival_ns, payload in self._emulation.engine.foresee(time_ns).entries():
-            if receiver not in inboxes:
-                inboxes[receiver] = self._inbox(self._emulation.world.node_ids[receiver])
-            node, packets = inboxes[receiver]
-            packets.append(wire.WirePacket(node, sender, sent_ns, arrival_ns, payload))
-        self._crowded.update(node for node, packets in inboxes.values() if len(packets) > INBOX_LIMIT)
+        node_ids = self._emulation.world.node_ids
+        inboxes: dict[int, list[Entry]] = {}
+        for entry in self._emulation.engine.foresee(time_ns).entries():
+            if (inbox := inboxes.get(entry[0])) is None:
+                inbox = inboxes[entry[0]] = self._inbox(node_ids[entry[0]])
+            inbox.append(entry)
+        self._crowded.update(node_ids[node] for node, inbox in inboxes.items() if len(inbox) > INBOX_LIMIT)
 
-    def _inbox(self, node: str) -> tuple[str, list[wire.WirePacket]]:
-        """Return a node and the packets that it has yet to be granted."""
-        return node, self._processes[self._process_of[node]].packets[node]
+    def _inbox(self, node: str) -> list[Entry]:
+        """Return the packets that a node has yet to be granted."""
+        return self._processes[self._process_of[node]].packets[node]
 
     def _wakes_in_window(self) -> dict[str, int]:
         """Return the first instant in the window of each process that has one, in the order of the processes."""
@@ -389,16 +399,23 @@ class Lockstep:
     def _grant_one(self, process: _Process, time_ns: int) -> wire.Grant:
         self._woken.discard(process.id)
         process.granted_ns = time_ns
-        fixes = [fix for node in process.running for fix in self._take_fixes(process, node)]
+        fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
-        grant = wire.Grant(process.seq, time_ns, self._end_ns, packets, fixes, clocks)
+        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks)
+        if self._hosts_all:
+            self._mail = Mail(
+                {node: [Packet(*entry[1:]) for entry in some] for node, some in packets.items()}, fixes
+            )
+        else:
+            there = [wire.WirePacket(node, *entry[1:]) for node, some in packets.items() for entry in some]
+            grant = replace(grant, packets=there, fixes=[wire.WireFix.of(*each) for each in fixes])
         if process.id in self.ahead and self._lookahead_ns > 1 and not process.paused:
             grant = self._quiet_grant(process, grant)
         self.owed[process.id] = process.seq
         process.seq += 1
         return grant
 
-    def _take_fixes(self, process: _Process, node: str) -> Iterable[wire.WireFix]:
+    def _take_fixes(self, process: _Process, node: str) -> list[Fix]:
         """Return the fixes that are due: a window ends with the period, so none is due within it."""
         world = self._emulation.world
         last = self.now_ns // world.period_ns
@@ -406,13 +423,13 @@ class Lockstep:
         process.next_fix[node] = max(process.next_fix[node], last + 1)
         return self._fixes(node, range(first, last + 1))
 
-    def _fixes(self, node: str, periods: Iterable[int]) -> list[wire.WireFix]:
+    def _fixes(self, node: str, periods: Iterable[int]) -> list[Fix]:
         """Return the fixes of these periods; none if the node is down."""
         if not self._emulation.up[node]:
             return []
         number = self._emulation.number[node]
         fixes = [self._emulation.gnss.fix(period, number) for period in periods]
-        return [wire.WireFix.of(node, fix) for fix in fixes if fix is not None]
+        return [fix for fix in fixes if fix is not None]
 
     def _quiet_grant(self, process: _Process, grant: wire.Grant) -> wire.Grant:
         """Return the grant with the bound of quiet instants, and the fixes of the next period if it lies before."""
@@ -422,5 +439,5 @@ class Lockstep:
         if due_ns >= self._quiet_ns or not nodes:
             return replace(grant, quiet_ns=self._quiet_ns)
         process.next_fix.update(dict.fromkeys(nodes, period + 1))
-        fixes = [fix for node in nodes for fix in self._fixes(node, [period])]
+        fixes = [wire.WireFix.of(node, fix) for node in nodes for fix in self._fixes(node, [period])]
         return replace(grant, quiet_ns=self._quiet_ns, next_fixes=fixes, next_fixes_ns=due_ns)

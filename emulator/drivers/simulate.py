@@ -203,7 +203,7 @@ class _Simulation:
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self.loop)
         self._apply_process_faults(self._lockstep.take_actions())
-        return self._host.open_window(grant)
+        return self._host.open_window(grant, self._lockstep.take_mail())
 
     def _apply_process_faults(self, actions: Sequence[ProcessActions]) -> None:
         """Do to the programs what faults do to processes."""

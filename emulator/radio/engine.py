@@ -309,6 +309,8 @@ class Engine:
 
     def _arrive(self, time_ns: int) -> Deliveries:
         table = self._in_flight.take(time_ns)
+        if not table.shape[1]:
+            return self._in_flight.deliveries(table, self._trace)
         receiver, row = table[1], table[2]
         up = self._topology.up[receiver]
         self._trace.decide(row[up], Outcome.delivered)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from emulator.records.distributions import chi2_quantiles
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of, vectors
-from emulator.records.reported import Figure, ValueColumns, figures_among
+from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.states import COMMON_VALUES, STATES
 from emulator.world.world import Instant
 from vnet.node import Report, Value
@@ -81,29 +81,27 @@ class Metrics:
         states["heading_rad"] += instant.heading_rad.tolist()
         states["fix_m"] += instant.fix_m.tolist()
         states["common_error_m"] += [instant.common_error_m.tolist()] * count
-        for number, node in enumerate(self._node_ids):
-            report = last.get(node)
-            values = {} if report is None else dict(report.values)
-            figures = figures_among(values)
-            states["estimate_m"].append(None if report is None else report.estimate_m)
-            states["covariance_m2"].append(None if report is None else report.covariance_m2)
-            for name, column in COMMON_VALUES.items():
-                value = values.pop(name, None)
-                fits = isinstance(value, list) and len(value) == VECTORS.get(column, len(value))
-                states[column].append(value if fits else None)
-            states["values"].append(self._other_values(self._recorded * count + number, values, figures))
+        reports = [last.get(node) for node in self._node_ids]
+        states["estimate_m"] += [None if report is None else report.estimate_m for report in reports]
+        states["covariance_m2"] += [None if report is None else report.covariance_m2 for report in reports]
+        values = [{} if report is None else report.values for report in reports]
+        for name, column in COMMON_VALUES.items():
+            states[column] += [_fitting(each.get(name), column) for each in values]
+        first_row = self._recorded * count
+        states["values"] += [self._other_values(row, each) for row, each in enumerate(values, first_row)]
         self._recorded += 1
         if len(states["period"]) >= ROWS_A_PIECE:
             self._pack()
 
-    def _other_values(
-        self, row: int, values: dict[str, Value], figures: dict[str, Figure]
-    ) -> list[tuple[str, list[float]]]:
+    def _other_values(self, row: int, values: Mapping[str, Value]) -> list[tuple[str, list[float]]]:
         """Put the figures of a row of the states into columns; returns the values that have none."""
-        others = []
+        others: list[tuple[str, list[float]]] = []
+        if not values:
+            return others
+        figures = figures_among(values)
         for name, value in sorted(values.items()):
             has_column = name in figures and self._values.put(row, name, figures[name])
-            if not has_column and not isinstance(value, str):
+            if not has_column and not isinstance(value, str) and name not in COMMON_VALUES:
                 others.append((name, value if isinstance(value, list) else [value]))
         return others
 
@@ -154,6 +152,11 @@ def summarize(rows: Sequence[PeriodFigures]) -> dict[str, float | None]:
         values = [value for row in settled if (value := getattr(row, name)) is not None]
         summary[name] = float(np.mean(values)) if values else None
     return summary
+
+
+def _fitting(value: Value | None, column: str) -> Value | None:
+    """Return a reported value, or None if it is no list of the size of its column."""
+    return value if isinstance(value, list) and len(value) == VECTORS.get(column, len(value)) else None
 
 
 def anees_band(samples: int) -> tuple[float, float]:

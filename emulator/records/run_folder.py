@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
@@ -68,7 +69,9 @@ class RunFolder:
         self.scenario_text = ""
         """`scenario.toml` as it is now."""
         self._digests: dict[str, dict[str, str]] = {}
-        self._is_open = self._has_own_number = False
+        self.is_open = False
+        """True once there is a folder, whose files are kept."""
+        self._has_own_number = False
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
@@ -90,15 +93,29 @@ class RunFolder:
         folder.open(scenario)
         return folder
 
+    @classmethod
+    def scratch(cls, path: Path) -> RunFolder:
+        """Return the folder of a run of which nothing is kept: only logs and disks of its programs are written.
+
+        What an earlier run has left in it is removed.
+        """
+        folder = cls(path)
+        with disk_errors(path):
+            folder.logs.mkdir(parents=True, exist_ok=True)
+            if folder.disks.exists() or any(folder.logs.iterdir()):
+                shutil.rmtree(path)
+                folder.logs.mkdir(parents=True)
+        return folder
+
     def open(self, scenario: Scenario) -> None:
         """Make the folder, with a number where `runs/{name}-{seed}` exists already."""
         with disk_errors(self.path):
             if self._has_own_number:
                 self.path = _claim(self.path)
             self.logs.mkdir(parents=True)
+            self.is_open = True
             self.put_scenario(scenario)
             (self.path / EVENTS_FILE).write_text("".join(map(_line, self.events)))
-            self._is_open = True
             if self._has_own_number:
                 _point_latest_to(self.path)
 
@@ -129,6 +146,8 @@ class RunFolder:
 
     def put_scenario(self, scenario: Scenario) -> None:
         """Write the scenario, with every default and the digests of what the run has read at its start."""
+        if not self.is_open:
+            return
         self.scenario_text = dump_scenario(scenario, self._digests)
         self.put(SCENARIO_FILE, lambda path: write_text(path, self.scenario_text))
 
@@ -142,7 +161,7 @@ class RunFolder:
         """Write down what happened at an emulated instant."""
         event = Event(time_ns, kind, node, details)
         self.events.append(event)
-        if self._is_open:
+        if self.is_open:
             with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:
                 file.write(_line(event))
 

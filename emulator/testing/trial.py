@@ -6,6 +6,7 @@ import faulthandler
 import os
 import sys
 import tempfile
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -66,16 +67,16 @@ UNKNOWN = Trial({}, {})
 """Result of a run that was given up."""
 
 
-def run_trial(scenario: Scenario, folder: RunFolder, keeps_files: bool = True) -> Trial:
+def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     """Simulate and judge a run in this process. Raises VnetError if it cannot be run.
 
-    Tables are written only if its files are kept, or if checks of the user's own might read them.
+    In a folder that is open its files are written, as of any other run.
     """
     started = time.monotonic()
     scenario = with_order_steps(scenario)
     emulation = Emulation(scenario, build_world(scenario), folder)
     wall_s, _ = simulate(emulation)
-    if keeps_files or scenario.program.checks:
+    if folder.is_open:
         judgement, _ = conclude(emulation, wall_s, "simulate")
     else:
         judgement = judge(gather(emulation, wall_s))
@@ -113,6 +114,7 @@ class TrialPool:
         self._place = Place.here(scenario)
         self._pool = WorkerPool()
         self._executor = executor
+        self._scratch = tempfile.TemporaryDirectory(prefix="vnet-trials-")
 
     def run(self, scenario: Scenario, folder: Path) -> Trial:
         """Return a trial on this machine, whose files stay in `folder`.
@@ -140,17 +142,20 @@ class TrialPool:
                 return Trial.failure(EMULATOR, str(error))
         return UNKNOWN
 
-    def _here(self, scenario: Scenario, folder: Path, keeps_files: bool = True) -> Trial:
+    def _here(self, scenario: Scenario, folder: Path | None) -> Trial:
         self._pool.call(self._place, _get_ready)
-        arguments = (scenario, folder, self.limit_s, keeps_files)
-        return self._pool.call(self._place, _run_in_worker, *arguments, limit_s=self.limit_s)
+        if folder is not None:
+            return self._pool.call(
+                self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s
+            )
+        scratch = Path(self._scratch.name) / str(threading.get_ident())
+        return self._pool.call(self._place, _run_unkept, scenario, scratch, self.limit_s, limit_s=self.limit_s)
 
     def _away(self, scenario: Scenario) -> Trial:
         if self._executor is None:
-            with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-                return self._here(scenario, Path(name) / "run", keeps_files=False)
+            return self._here(scenario, None)
         future: Future[Trial] = self._executor.submit(
-            call_fitly, self._place, _run_without_folder, scenario, self.limit_s, limit_s=self.limit_s
+            call_fitly, self._place, _run_elsewhere, scenario, self.limit_s, limit_s=self.limit_s
         )
         while not self.closed:
             if wait([future], timeout=LOOK_S).done:
@@ -162,27 +167,40 @@ class TrialPool:
         """Have every trial that is on given up."""
         self.closed = True
         self._pool.close()
+        self._scratch.cleanup()
 
 
 def _get_ready() -> None:
     """Have a worker import all of this module before the time of a trial is measured."""
 
 
-def _run_without_folder(scenario: Scenario, limit_s: float) -> Trial:
-    """Run a trial in a worker on any machine."""
+def _run_elsewhere(scenario: Scenario, limit_s: float) -> Trial:
+    """Run a trial in a worker on any machine, and keep nothing but its result."""
     with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-        return _run_in_worker(scenario, Path(name) / "run", limit_s, keeps_files=False)
+        return _run_unkept(scenario, Path(name) / "run", limit_s)
 
 
-def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, keeps_files: bool = True) -> Trial:
+def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float) -> Trial:
+    """Run a trial in a worker, and keep nothing but its result: files take as long as a small run's checks."""
+    if not scenario.program.checks:
+        return _run(scenario, RunFolder.scratch(scratch), Path(os.devnull), Path(os.devnull), limit_s)
+    with tempfile.TemporaryDirectory(dir=scratch.parent) as name:  # the user's own checks may read them
+        return _run_in_worker(scenario, Path(name) / "run", limit_s)
+
+
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:
     """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
     run_folder = RunFolder.create(folder, scenario)
-    with (run_folder.logs / PROGRAMS_LOG).open("ab") as log, (run_folder.logs / "stacks.txt").open("w") as stacks:
+    return _run(scenario, run_folder, run_folder.logs / PROGRAMS_LOG, run_folder.logs / "stacks.txt", limit_s)
+
+
+def _run(scenario: Scenario, run_folder: RunFolder, log_path: Path, stacks_path: Path, limit_s: float) -> Trial:
+    with log_path.open("ab") as log, stacks_path.open("w") as stacks:
         before = os.dup(STDOUT)
         os.dup2(log.fileno(), STDOUT)
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            return run_trial(scenario, run_folder, keeps_files)
+            return run_trial(scenario, run_folder)
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")

@@ -27,6 +27,8 @@ class FaultyGnss:
 
     def fix(self, period: int, number: int) -> Fix | None:
         """Return the fix of vehicle `number` at the start of `period`; None in an outage."""
+        if not self._faults:
+            return self._world.fix(period, number)
         time_ns = period * self._world.period_ns
         acting = [
             planned

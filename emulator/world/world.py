@@ -92,6 +92,7 @@ class World:
         further_m = further_error_m(scenario, self.course_m, self.area_m.mean(axis=0), self.receiver_m)
         if further_m is not None:
             self._noise_m += further_m
+        self._fix_m = self.course_m[: self.periods] + self._common_m[: self.periods, None] + self._noise_m
         self._fix_heading_rad = heading_of_fixes_rad(scenario, self.course_m, self._heading_rad, self.moves)
 
     def present(self, period: int) -> NDArray[np.bool_]:
@@ -127,15 +128,16 @@ class World:
             position_m=position_m,
             heading_rad=self._heading_rad[period],
             common_error_m=common_m,
-            fix_m=position_m + common_m + self._noise_m[period],
+            fix_m=self._fix_m[period],
             fix_heading_rad=self._fix_heading_rad[period],
         )
 
     def fix(self, period: int, node: int) -> Fix:
         """Return the fix of vehicle number `node`, which must be present, at the start of `period`."""
-        fix_m = self.course_m[period, node] + self._common_m[period] + self._noise_m[period, node]
-        heading = float(self._fix_heading_rad[period, node])
-        return Fix(period * self.period_ns, fix_m, self._covariance_m2, None if math.isnan(heading) else heading)
+        heading_rad: float = self._fix_heading_rad[period, node].item()
+        # Copies: a program may do with its fix what it likes.
+        fix_m, covariance_m2 = self._fix_m[period, node].copy(), self._covariance_m2.copy()
+        return Fix(period * self.period_ns, fix_m, covariance_m2, None if math.isnan(heading_rad) else heading_rad)
 
 
 def _stated_variance_m2(gnss: Gnss) -> float:

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from vnet.errors import VirtualTimeError
 from vnet.runtime.host import Host
+from vnet.runtime.mail import Mail
 from vnet.transport import wire
 
 Swap = Callable[[int | None], int]
@@ -100,7 +101,7 @@ class RunAhead:
         if wake_ns is None or not self._may_pass(next_timer_ns):
             return None
         if self._fixes_ns is not None and self._fixes_ns <= wake_ns:
-            self._host.mail.deliver((), self._take_fixes(), wake_ns)
+            self._host.mail.deliver(Mail.of((), self._take_fixes()), wake_ns)
         return wake_ns
 
     def _may_pass(self, next_timer_ns: int | None) -> bool:

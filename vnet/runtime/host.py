@@ -17,13 +17,14 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from vnet.node import Node, NoteDetail, Report
+from vnet.node import Fix, Node, NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
 from vnet.runtime.disks import Disks
 from vnet.runtime.event_order import Chooser, chooser_of
 from vnet.runtime.log_handler import NodeLogHandler
+from vnet.runtime.mail import Mail
 from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.programs import Program, Programs, error_line
@@ -244,10 +245,14 @@ class Host:
 
     # Windows (lockstep).
 
-    def open_window(self, grant: wire.Grant) -> int:
-        """Take a grant; returns its first instant, with everything delivered that is due at it."""
-        self._window.open(grant)
-        self._deliver_due(grant.time_ns, grant.fixes)
+    def open_window(self, grant: wire.Grant, mail: Mail | None = None) -> int:
+        """Take a grant; returns its first instant, with everything delivered that is due at it.
+
+        `mail` is what comes with the grant, if it is not in it (simulated).
+        """
+        packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
+        self._window.open(grant.end_ns, packets)
+        self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 
     def next_instant(self, next_timer_ns: int | None) -> int | None:
@@ -266,9 +271,10 @@ class Host:
         self._deliver_due(next_ns)
         return next_ns
 
-    def _deliver_due(self, time_ns: int, fixes: Sequence[wire.WireFix] = ()) -> None:
-        due = self._window.take_packets(time_ns, self._paused)
-        self.mail.deliver([packet for packet in due if self._active[packet.node]], fixes, time_ns)
+    def _deliver_due(self, time_ns: int, fixes: Sequence[tuple[str, Fix]] = ()) -> None:
+        packets = self._window.take_packets(time_ns, self._paused)
+        due = {node: some for node, some in packets.items() if self._active[node]}
+        self.mail.deliver(Mail(due, fixes), time_ns)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""

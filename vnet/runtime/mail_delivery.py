@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from vnet.node import Mailbox, Node, Packet
+from vnet.runtime.mail import Mail
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.ready_queue import OrderedQueue
-from vnet.transport import wire
 
 
 class MailDelivery:
@@ -24,50 +24,38 @@ class MailDelivery:
         self._clocks = clocks
         self.ordered: OrderedQueue | None = None
 
-    def deliver(
-        self, packets: Iterable[wire.WirePacket], fixes: Sequence[wire.WireFix], time_ns: int | None = None
-    ) -> None:
+    def deliver(self, mail: Mail, time_ns: int | None = None) -> None:
         """Deliver packets, then fixes; `time_ns` is the instant, where there is one."""
         if self.ordered is not None and time_ns is not None:
-            self._add_events(self.ordered, packets, fixes, time_ns)
+            self._add_events(self.ordered, mail, time_ns)
             return
-        arrived: dict[str, list[Packet]] = {}
-        for packet in packets:
-            arrived.setdefault(packet.node, []).append(self._shown(packet))
-        for node, some in arrived.items():
-            self._nodes[node].radio.inbox.deliver(some)
-        for fix in fixes:
-            self._nodes[fix.node].gnss.inbox.deliver((fix.fix(),))
+        for node, packets in mail.packets.items():
+            self._nodes[node].radio.inbox.deliver(self._shown(node, packets))
+        for node, fix in mail.fixes:
+            self._nodes[node].gnss.inbox.deliver((fix,))
 
-    def _shown(self, packet: wire.WirePacket) -> Packet:
-        """Return a packet with the time of its arrival as its receiver's clock showed it."""
-        received = packet.packet()
-        if self._clocks.has_been_wrong(packet.node):
-            return replace(received, received_ns=self._clocks.shown_ns(packet.node, received.received_ns))
-        return received
+    def _shown(self, node: str, packets: Sequence[Packet]) -> Sequence[Packet]:
+        """Return the packets of a node with the times of their arrivals as its clock showed them."""
+        if not self._clocks.has_been_wrong(node):
+            return packets
+        return [replace(each, received_ns=self._clocks.shown_ns(node, each.received_ns)) for each in packets]
 
-    def _add_events(
-        self,
-        ordered: OrderedQueue,
-        packets: Iterable[wire.WirePacket],
-        fixes: Sequence[wire.WireFix],
-        time_ns: int,
-    ) -> None:
+    def _add_events(self, ordered: OrderedQueue, mail: Mail, time_ns: int) -> None:
         """Deliver what has come before `time_ns`, and let the rest come in the order that is tried."""
-        for packet in packets:
-            node = self._nodes[packet.node]
-            show = partial(node.radio.inbox.deliver, (self._shown(packet),))
-            if packet.received_ns < time_ns:
-                show()
-            else:
-                ordered.add_event(
-                    node, f"packet from {packet.sender}", "radio", show, partial(_is_awaited, node.radio.inbox)
-                )
-        latest = {fix.node: fix for fix in fixes}
-        for fix in fixes:
-            node = self._nodes[fix.node]
-            show_fix = partial(node.gnss.inbox.deliver, (fix.fix(),))
-            if fix is latest[fix.node] and time_ns % node.period_ns == 0:
+        for name, packets in mail.packets.items():
+            node = self._nodes[name]
+            for packet, shown in zip(packets, self._shown(name, packets), strict=True):
+                show = partial(node.radio.inbox.deliver, (shown,))
+                if packet.received_ns < time_ns:
+                    show()
+                else:
+                    awaited = partial(_is_awaited, node.radio.inbox)
+                    ordered.add_event(node, f"packet from {packet.sender}", "radio", show, awaited)
+        latest = dict(mail.fixes)
+        for name, fix in mail.fixes:
+            node = self._nodes[name]
+            show_fix = partial(node.gnss.inbox.deliver, (fix,))
+            if fix is latest[name] and time_ns % node.period_ns == 0:
                 ordered.add_event(node, "fix", "gnss", show_fix, partial(_is_awaited, node.gnss.inbox))
             else:
                 show_fix()

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection
-from operator import attrgetter
+from operator import itemgetter
 
+from vnet.node import Packet
 from vnet.transport import wire
 
 
@@ -19,18 +20,27 @@ class Window:
     def __init__(self) -> None:
         self.end_ns = 0
         """The end of the window, which is not in it."""
-        self._packets: deque[wire.WirePacket] = deque()
+        self._new: dict[str, list[Packet]] = {}
+        self._packets: deque[tuple[int, str, Packet]] = deque()
         self._steps: list[wire.Step] = []
         self._instants = 0
 
-    def open(self, grant: wire.Grant) -> None:
+    def open(self, end_ns: int, packets: dict[str, list[Packet]]) -> None:
         """Begin the next window; the steps of the last one have been taken."""
-        self.end_ns = grant.end_ns
-        self._packets.extend(sorted(grant.packets, key=attrgetter("received_ns")))
+        self._queue_new()
+        self.end_ns = end_ns
+        self._new = packets
+
+    def _queue_new(self) -> None:
+        """Put packets in the order of their arrivals: only when needed, because most are due at once."""
+        new = [(packet.received_ns, node, packet) for node, some in self._new.items() for packet in some]
+        self._packets.extend(sorted(new, key=itemgetter(0)))
+        self._new = {}
 
     def drop(self, node: str) -> None:
         """Drop the packets of a node whose process is gone."""
-        self._packets = deque(packet for packet in self._packets if packet.node != node)
+        self._new.pop(node, None)
+        self._packets = deque(entry for entry in self._packets if entry[1] != node)
 
     def end_instant(self, time_ns: int, traffic: wire.Traffic) -> None:
         """Note that the process has nothing left to do at an instant, and what was enqueued at it."""
@@ -41,23 +51,28 @@ class Window:
     @property
     def has_packets(self) -> bool:
         """True if packets are yet to be taken."""
-        return bool(self._packets)
+        return bool(self._new or self._packets)
 
     def first_packet_ns(self, nodes: Collection[str]) -> int:
         """Return the arrival of the first packet at one of these nodes, or the window's end."""
-        return next((packet.received_ns for packet in self._packets if packet.node in nodes), self.end_ns)
+        self._queue_new()
+        return next((received_ns for received_ns, node, _ in self._packets if node in nodes), self.end_ns)
 
-    def take_packets(self, time_ns: int, paused: Collection[str]) -> list[wire.WirePacket]:
+    def take_packets(self, time_ns: int, paused: Collection[str]) -> dict[str, list[Packet]]:
         """Remove and return the packets that have arrived by then, oldest first; those of paused nodes wait."""
-        if self._packets and self._packets[-1].received_ns <= time_ns and not paused:
-            due = list(self._packets)
-            self._packets.clear()
+        due = self._new
+        if not (self._packets or paused) and all(some[-1].received_ns <= time_ns for some in due.values()):
+            self._new = {}
             return due
-        due = []
-        waiting: list[wire.WirePacket] = []
-        while self._packets and self._packets[0].received_ns <= time_ns:
-            packet = self._packets.popleft()
-            (waiting if packet.node in paused else due).append(packet)
+        self._queue_new()
+        due = {}
+        waiting: list[tuple[int, str, Packet]] = []
+        while self._packets and self._packets[0][0] <= time_ns:
+            _, node, packet = entry = self._packets.popleft()
+            if node in paused:
+                waiting.append(entry)
+            else:
+                due.setdefault(node, []).append(packet)
         self._packets.extendleft(reversed(waiting))
         return due
 

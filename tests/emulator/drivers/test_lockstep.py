@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.protocol import ProtocolError
+from emulator.drivers.protocol import ProtocolError, wire_packet
 from emulator.radio.outcomes import Outcome
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
@@ -420,6 +421,10 @@ class Course:
         """Give a process its grant, let its vehicles pass through the window, and yield."""
         assert grant.seq == self.seqs.get(process_id, -1) + 1
         self.seqs[process_id] = grant.seq
+        if (mail := self.lockstep.take_mail()) is not None:
+            packets = [wire_packet(node, packet) for node, some in mail.packets.items() for packet in some]
+            fixes = [wire.WireFix.of(node, fix) for node, fix in mail.fixes]
+            grant = msgspec.structs.replace(grant, packets=packets, fixes=fixes)
         for packet in grant.packets:
             assert self.sent_ns[packet.payload] == packet.sent_ns, "nothing is delivered that was not sent before"
             assert packet.sent_ns <= packet.received_ns < grant.end_ns

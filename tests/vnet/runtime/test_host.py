@@ -391,11 +391,22 @@ def test_a_program_that_cannot_be_loaded_says_why(entry: str, message: str) -> N
 
 def test_packets_of_a_paused_node_wait_and_keep_their_order() -> None:
     """With and without a paused node a window gives what is due, oldest first, and keeps the rest."""
-    packets = [packet_at("v2", 5), packet_at("v1", 3), packet_at("v1", 9)]
+    first, early, late = (packet_at("v1", time_ns).packet() for time_ns in (3, 5, 9))
     window = Window()
-    window.open(wire.Grant(0, 0, 10, packets))
-    assert window.take_packets(5, {"v2"}) == [packets[1]]
-    assert window.take_packets(5, ()) == [packets[0]]
-    assert window.take_packets(8, ()) == []
-    assert window.take_packets(9, ()) == [packets[2]]
+    window.open(10, {"v2": [early], "v1": [first, late]})
+    assert window.take_packets(5, {"v2"}) == {"v1": [first]}
+    assert window.take_packets(5, ()) == {"v2": [early]}
+    assert window.take_packets(8, ()) == {}
+    assert window.take_packets(9, ()) == {"v1": [late]}
     assert not window.has_packets
+
+
+def test_packets_that_are_due_at_once_are_those_that_are_sorted() -> None:
+    """Whether or not an earlier window has left packets, those of each node come oldest first."""
+    first, second, third = (packet_at("v1", time_ns).packet() for time_ns in (3, 5, 12))
+    window = Window()
+    window.open(10, {"v1": [first, second]})
+    assert window.take_packets(4, ()) == {"v1": [first]}
+    window.open(20, {"v1": [third]})
+    assert window.first_packet_ns({"v1"}) == 5
+    assert window.take_packets(20, ()) == {"v1": [second, third]}
