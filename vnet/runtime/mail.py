@@ -1,4 +1,4 @@
-"""What a grant brings to the nodes of a process."""
+"""Packets and fixes that a grant brings to the nodes of a process."""
 
 from __future__ import annotations
 

@@ -402,7 +402,7 @@ def test_packets_of_a_paused_node_wait_and_keep_their_order() -> None:
 
 
 def test_packets_that_are_due_at_once_are_those_that_are_sorted() -> None:
-    """Whether or not an earlier window has left packets, those of each node come oldest first."""
+    """Packets of each node come oldest first, also where an earlier window has left some."""
     first, second, third = (packet_at("v1", time_ns).packet() for time_ns in (3, 5, 12))
     window = Window()
     window.open(10, {"v1": [first, second]})
