@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import faulthandler
 import os
+import shutil
 import sys
 import tempfile
 import threading
 import time
 import traceback
+import weakref
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
@@ -114,7 +116,8 @@ class TrialPool:
         self._place = Place.here(scenario)
         self._pool = WorkerPool()
         self._executor = executor
-        self._scratch = tempfile.TemporaryDirectory(prefix="vnet-trials-")
+        self._scratch = Path(tempfile.mkdtemp(prefix="vnet-trials-"))
+        self._forget = weakref.finalize(self, shutil.rmtree, self._scratch, ignore_errors=True)
 
     def run(self, scenario: Scenario, folder: Path) -> Trial:
         """Return a trial on this machine, whose files stay in `folder`.
@@ -148,7 +151,7 @@ class TrialPool:
             return self._pool.call(
                 self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s
             )
-        scratch = Path(self._scratch.name) / str(threading.get_ident())
+        scratch = self._scratch / str(threading.get_ident())
         return self._pool.call(self._place, _run_unkept, scenario, scratch, self.limit_s, limit_s=self.limit_s)
 
     def _away(self, scenario: Scenario) -> Trial:
@@ -167,7 +170,7 @@ class TrialPool:
         """Have every trial that is on given up."""
         self.closed = True
         self._pool.close()
-        self._scratch.cleanup()
+        self._forget()
 
 
 def _get_ready() -> None:
