@@ -31,6 +31,11 @@ def delays(frame: RadioFrame, state: State) -> Answer:
     return Answer(delay_s=0.15)
 
 
+def doubles(frame: RadioFrame, state: State) -> Answer:
+    """Let everything arrive three times, 7 ms apart."""
+    return Answer(copies=2, copy_delay_s=0.007)
+
+
 def every_third(frame: RadioFrame, state: State) -> Answer:
     """Drop every third frame of all, as the state counts them."""
     state["frames"] = state.get("frames", 0) + 1

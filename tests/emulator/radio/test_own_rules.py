@@ -46,9 +46,10 @@ def test_a_dropped_frame_is_a_fault_by_the_rule_s_name_while_it_acts() -> None:
         (rule("drops", receivers={"count": 2}), fault("block", receivers={"count": 2})),
         (rule("delays", 0.3, 0.9, senders={"ids": ["v1"]}), fault("delay", 0.3, 0.9, senders=["v1"], delay_ms=150)),
         (rule("drops_far", options={"range_m": 150}), fault("range", range_m=150)),
+        (rule("doubles"), fault("duplicate", probability=1.0, copies=2, delay_ms=7.0)),
         (rule("passes"), fault("block", 90.0, 1.0)),
     ],
-    ids=["block", "delay", "range", "nothing"],
+    ids=["block", "delay", "range", "duplicate", "nothing"],
 )
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**40), loss=st.sampled_from([0.0, 0.3]), peers=st.sampled_from([2, 100]))
