@@ -130,7 +130,7 @@ def timeline(source: Source, most: int = MOST_RECEPTIONS, at_us: int | None = No
         "view": view,
         "lanes": MOST_LANES,
         "nodes": [printable(node) for node in recorded.node_ids],
-        "first": _first_lanes(recorded, marks),
+        "first": _first_lanes(recorded, marks, bars),
         "marks": [[mark.time_us, mark.node, mark.kind, mark.text] for mark in marks],
         "bars": [[bar.label, bar.start_us, bar.end_us, list(bar.nodes)] for bar in bars],
         "down": _down(recorded, end_us),
@@ -328,16 +328,18 @@ def _outcome(name: str) -> tuple[str, str, bool]:
 # Which lanes and which time come first.
 
 
-def _first_lanes(recorded: OpenedRun, marks: Sequence[Mark]) -> list[int]:
-    """Return the lanes that are shown first: vehicles with marks, then the busiest."""
+def _first_lanes(recorded: OpenedRun, marks: Sequence[Mark], bars: Sequence[Bar]) -> list[int]:
+    """Return the lanes that are shown first: vehicles with failures, with other marks, with faults, the busiest."""
     count = len(recorded.node_ids)
-    weight = np.bincount(recorded.sender, minlength=count) + np.bincount(recorded.receiver, minlength=count)
-    weight = weight.astype(float)
+    frames = np.bincount(recorded.sender, minlength=count) + np.bincount(recorded.receiver, minlength=count)
+    failed, marked, faulty = (np.zeros(count, dtype=bool) for _ in range(3))
     for mark in marks:
         if mark.node >= 0:
-            weight[mark.node] += 1e15 if mark.kind == FAILURE else 1e9
-    chosen = np.argsort(-weight, kind="stable")[:MOST_LANES]
-    return [int(node) for node in np.sort(chosen)]
+            (failed if mark.kind == FAILURE else marked)[mark.node] = True
+    for bar in bars:
+        faulty[list(bar.nodes)] = True
+    order = np.lexsort((np.arange(count), -frames, ~faulty, ~marked, ~failed))
+    return [int(node) for node in np.sort(order[:MOST_LANES])]
 
 
 def _usual_delay_us(recorded: OpenedRun, sent_us: IntArray) -> int:

@@ -2,7 +2,7 @@
 const root = document.querySelector("#timeline"), data = JSON.parse(document.querySelector("#timeline-data").textContent);
 const pick = selector => root.querySelector(selector);
 const axis = pick(".axis"), lanes = pick(".lanes"), scroll = pick(".scroll"), tip = pick(".tip"), filter = pick("input[type=search]");
-const GUTTER = 74, AXIS_PX = 26, BAR_PX = 15, MOST_ARROWS = 2500, LEAST_US = 20, NEAR_PX = 7;
+const GUTTER = 74, AXIS_PX = 26, BAR_PX = 15, MOST_ARROWS = 1000, LEAST_US = 20, NEAR_PX = 7;
 const MARKS = {failure: "rust", process: "quiet", warning: "orange", event: "blue"};
 const ORDER = ["event", "warning", "process", "failure"];
 
@@ -149,9 +149,11 @@ function drawLanes() {
     pen.globalAlpha = 1;
   }
   const first = firstAfter(start - longest), last = firstAfter(end);
-  let count = 0;
-  for (let i = first; i < last; i++) count += frames[i].to - frames[i].from;
-  const asArrows = count <= MOST_ARROWS;
+  let arrows = 0;
+  for (let n = first; n < last && arrows <= MOST_ARROWS; n++) {
+    if (laneOf.has(frames[n].sender)) for (let i = frames[n].from; i < frames[n].to; i++) arrows += laneOf.has(data.receiver[i]) && !hidden(i);
+  }
+  const asArrows = arrows <= MOST_ARROWS;
   (asArrows ? drawArrows : drawTicks)(pen, first, last, laneOf);
   if (!asArrows && hover?.frame) drawArrows(pen, frames.indexOf(hover.frame), frames.indexOf(hover.frame) + 1, laneOf);
   pick(".hint").hidden = asArrows;
@@ -194,46 +196,55 @@ function sign(pen, kind, at, y) {
 
 function hidden(i) { return off.has(data.outcomes[data.outcome[i]][0]); }
 
+// One path for all arrows of a colour and kind.
 function drawArrows(pen, first, last, laneOf) {
-  const strong = hover?.frame;
-  for (const pass of [false, true]) {
-    for (let n = first; n < last; n++) {
-      const frame = frames[n], from = laneOf.get(frame.sender);
-      if (pass !== (frame === strong)) continue;
-      if (pass) pen.lineWidth = 2.2; else pen.lineWidth = 1.1;
-      for (let i = frame.from; i < frame.to; i++) {
-        const to = laneOf.get(data.receiver[i]), [, name, stays] = data.outcomes[data.outcome[i]];
-        if (hidden(i) || from === undefined || to === undefined) continue;
-        pen.globalAlpha = strong && !pass ? .18 : name === "green" ? .75 : .95;
-        arrow(pen, x(frame.time), middle(from), x(endOf(frame, i)), middle(to), colour(name), data.delay[i] >= 0, stays);
-      }
-      pen.globalAlpha = 1;
-      if (from === undefined || frame.time < start) continue;
-      pen.fillStyle = colour("ink");
-      pen.beginPath(); pen.arc(x(frame.time), middle(from), pass ? 4 : 2.6, 0, 7); pen.fill();
+  const strong = hover?.frame, dots = new Path2D(), faint = new Map(), bold = new Map();
+  let at = null;
+  for (let n = first; n < last; n++) {
+    const frame = frames[n], from = laneOf.get(frame.sender);
+    if (from === undefined) continue;
+    for (let i = frame.from; i < frame.to; i++) {
+      const to = laneOf.get(data.receiver[i]), [, name, stays] = data.outcomes[data.outcome[i]];
+      if (to === undefined || hidden(i)) continue;
+      const paths = frame === strong ? bold : faint, arrives = data.delay[i] >= 0, key = name + (arrives ? "" : " lost");
+      if (!paths.has(key)) paths.set(key, {name, arrives, lines: new Path2D(), ends: new Path2D()});
+      arrow(paths.get(key), x(frame.time), middle(from), x(endOf(frame, i)), middle(to), stays);
     }
+    if (frame === strong) at = [x(frame.time), middle(from)];
+    else if (frame.time >= start) { dots.moveTo(x(frame.time) + 2.6, middle(from)); dots.arc(x(frame.time), middle(from), 2.6, 0, 7); }
   }
+  stroke(pen, faint, 1.1, strong ? .18 : 0);
+  pen.fillStyle = colour("ink");
+  pen.fill(dots);
+  stroke(pen, bold, 2.2, 0);
+  if (at) { pen.fillStyle = colour("ink"); pen.beginPath(); pen.arc(...at, 4, 0, 7); pen.fill(); }
 }
 
-function arrow(pen, left, top, right, bottom, paint, arrives, stays) {
-  pen.strokeStyle = pen.fillStyle = paint;
-  const apart = Math.hypot(right - left, bottom - top) || 1, along = (right - left) / apart, down = (bottom - top) / apart;
-  if (!stays) {
+function stroke(pen, paths, thickness, opacity) {
+  for (const {name, arrives, lines, ends} of paths.values()) {
+    pen.lineWidth = thickness;
+    pen.globalAlpha = opacity || (name === "green" ? .75 : .95);
+    pen.strokeStyle = pen.fillStyle = colour(name);
     pen.setLineDash(arrives ? [] : [4, 3]);
-    pen.beginPath(); pen.moveTo(left, top); pen.lineTo(right, bottom); pen.stroke();
+    pen.stroke(lines);
     pen.setLineDash([]);
+    arrives ? pen.fill(ends) : pen.stroke(ends);
   }
+  pen.globalAlpha = 1;
+}
+
+function arrow({arrives, lines, ends}, left, top, right, bottom, stays) {
+  const apart = Math.hypot(right - left, bottom - top) || 1, along = (right - left) / apart, down = (bottom - top) / apart;
+  if (!stays) { lines.moveTo(left, top); lines.lineTo(right, bottom); }
   if (arrives) {
-    pen.beginPath(); pen.moveTo(right, bottom);
-    pen.lineTo(right - 7 * along + 3 * down, bottom - 7 * down - 3 * along);
-    pen.lineTo(right - 7 * along - 3 * down, bottom - 7 * down + 3 * along);
-    pen.fill();
+    ends.moveTo(right, bottom);
+    ends.lineTo(right - 7 * along + 3 * down, bottom - 7 * down - 3 * along);
+    ends.lineTo(right - 7 * along - 3 * down, bottom - 7 * down + 3 * along);
+    ends.closePath();
     return;
   }
   const [h, v] = stays ? [left, top] : [right, bottom];
-  pen.beginPath();
-  pen.moveTo(h - 3.5, v - 3.5); pen.lineTo(h + 3.5, v + 3.5); pen.moveTo(h + 3.5, v - 3.5); pen.lineTo(h - 3.5, v + 3.5);
-  pen.stroke();
+  ends.moveTo(h - 3.5, v - 3.5); ends.lineTo(h + 3.5, v + 3.5); ends.moveTo(h + 3.5, v - 3.5); ends.lineTo(h - 3.5, v + 3.5);
 }
 
 // Too many for arrows: what a vehicle sent is above its line, what became of what it was to receive below it.
@@ -352,10 +363,15 @@ function show(from, to) {
   end = start + span;
   draw();
 }
-const zoom = (factor, at = (start + end) / 2) => show(at - (at - start) * factor, at + (end - at) * factor);
+const instants = () => [...data.marks.filter(mark => !off.has(mark[2])).map(mark => mark[0]), ...bars.flatMap(bar => [bar.start, bar.end])];
+function anchor() {
+  const centre = (start + end) / 2, seen = instants().filter(time => start <= time && time <= end);
+  return seen.length ? seen.reduce((a, b) => Math.abs(a - centre) <= Math.abs(b - centre) ? a : b) : centre;
+}
+const zoom = (factor, at = anchor()) => show(at - (at - start) * factor, at + (end - at) * factor);
 const pan = share => show(start + share * (end - start), end + share * (end - start));
 function step(way) {
-  const times = [...new Set([...data.marks.filter(mark => !off.has(mark[2])).map(mark => mark[0]), ...data.bars.flatMap(bar => [bar[1], bar[2]])])].sort((a, b) => a - b);
+  const times = [...new Set(instants())].sort((a, b) => a - b);
   const centre = (start + end) / 2, slack = (end - start) / 1000;
   const time = way > 0 ? times.find(each => each > centre + slack) : times.findLast(each => each < centre - slack);
   if (time !== undefined) { start = time - (end - start) / 2; const span = (time - start) * 2; end = start + span; draw(); }

@@ -170,6 +170,15 @@ def test_a_fault_that_does_not_end_lasts_until_the_end_and_unknown_nodes_are_lef
     assert (interrupted.node, interrupted.kind, interrupted.text) == (-1, "process", "interrupted")
 
 
+def test_of_many_vehicles_those_with_failures_marks_and_faults_have_lanes_first(
+    run: Source, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bars, failure, event = [Bar("loss-0", 0, 1, (0,))], Mark(1, 2, "failure", ""), Mark(1, 3, "event", "")
+    for most, lanes in ((1, [2]), (2, [2, 3]), (3, [0, 2, 3]), (4, [0, 1, 2, 3])):
+        monkeypatch.setattr(module, "MOST_LANES", most)
+        assert module._first_lanes(run.recorded, [event, failure], bars) == lanes
+
+
 def test_the_page_holds_all_of_the_data_as_text(run: Source) -> None:
     found, _ = shown(run)
     data = '"</pre><script>alert(1)</script>' + "x" * 50_000
