@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
 from importlib.metadata import version
@@ -69,6 +69,17 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         busy=_busy(emulation),
         world=RecordedWorld.of(emulation.world),
     )
+
+
+def judge_unkept(emulation: Emulation, wall_s: float) -> Judgement:
+    """Judge a run of which nothing is kept: files are written only if a check of the user's own asks for them."""
+    recorded = gather(emulation, wall_s)
+
+    def write() -> None:
+        emulation.folder.open(emulation.scenario)
+        _put_tables(emulation, recorded)
+
+    return judge(recorded, _own_findings(recorded, emulation.folder, write))
 
 
 def conclude(
@@ -154,13 +165,18 @@ def _order(emulation: Emulation) -> dict[str, Any] | None:
     }
 
 
-def _own_findings(recorded: RecordedRun, folder: RunFolder) -> list[Finding]:
-    """Judge a run by its own checks. What they print goes to logs/checks.log; Ctrl-C ends them, and no more."""
+def _own_findings(
+    recorded: RecordedRun, folder: RunFolder, write: Callable[[], None] = lambda: None
+) -> list[Finding]:
+    """Judge a run by its own checks. What they print goes to logs/checks.log; Ctrl-C ends them, and no more.
+
+    `write` makes the folder's files should a check ask for them.
+    """
     program = recorded.scenario.program
     if not program.checks:
         return []
     with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
-        findings = own_findings(program, Run(recorded, folder.path))
+        findings = own_findings(program, Run(recorded, folder.path, write=write))
     if printed.getvalue():
         folder.put("logs/checks.log", lambda path: write_text(path, printed.getvalue()))
     return findings

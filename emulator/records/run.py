@@ -31,11 +31,29 @@ class Run:
     VnetError, in one line, for a file that is missing or broken.
     """
 
-    def __init__(self, recorded: RecordedRun, folder: Path, record: Record | None = None) -> None:
-        """Wrap what was recorded; without a `record` the run has not been judged yet."""
-        self.folder = folder
+    def __init__(
+        self,
+        recorded: RecordedRun,
+        folder: Path,
+        record: Record | None = None,
+        write: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Wrap what was recorded; without a `record` the run has not been judged yet.
+
+        `write` makes the files of the folder, where they are not there until somebody asks for them.
+        """
+        self._folder = folder
         self._recorded = recorded
         self._record = record
+        self._write: Callable[[], None] | None = write
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run's files."""
+        write, self._write = self._write, None
+        if write is not None:
+            write()
+        return self._folder
 
     @classmethod
     def open(cls, folder: str | Path) -> Run:
@@ -52,14 +70,14 @@ class Run:
 
     def __repr__(self) -> str:
         verdict = "not judged yet" if self._record is None else self._record.verdict.value
-        return f"<Run {str(self.folder)!r}: {verdict}>"
+        return f"<Run {str(self._folder)!r}: {verdict}>"
 
     # The verdict.
 
     @property
     def _judged(self) -> Record:
         if self._record is None:
-            raise VnetError(f"{self.folder}: has no verdict yet: its checks are still being made")
+            raise VnetError(f"{self._folder}: has no verdict yet: its checks are still being made")
         return self._record
 
     @property

@@ -71,7 +71,7 @@ class RunFolder:
         self._digests: dict[str, dict[str, str]] = {}
         self.is_open = False
         """True once there is a folder, whose files are kept."""
-        self._has_own_number = False
+        self._has_own_number = self._is_scratch = False
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
@@ -83,7 +83,7 @@ class RunFolder:
         folder = cls(path)
         folder._has_own_number = out is None
         # Digests are those of the start: what is edited while the run is on has not been read.
-        folder._digests = {"inputs": input_digests(scenario), "code": code_digests(scenario)}
+        folder._digests = _digests(scenario)
         return folder
 
     @classmethod
@@ -100,9 +100,10 @@ class RunFolder:
         What an earlier run has left in it is removed.
         """
         folder = cls(path)
+        folder._is_scratch = True
         with disk_errors(path):
             folder.logs.mkdir(parents=True, exist_ok=True)
-            if folder.disks.exists() or any(folder.logs.iterdir()):
+            if any(each != folder.logs for each in path.iterdir()) or any(folder.logs.iterdir()):
                 shutil.rmtree(path)
                 folder.logs.mkdir(parents=True)
         return folder
@@ -112,7 +113,8 @@ class RunFolder:
         with disk_errors(self.path):
             if self._has_own_number:
                 self.path = _claim(self.path)
-            self.logs.mkdir(parents=True)
+            self.logs.mkdir(parents=True, exist_ok=self._is_scratch)
+            self._digests = self._digests or _digests(scenario)
             self.is_open = True
             self.put_scenario(scenario)
             (self.path / EVENTS_FILE).write_text("".join(map(_line, self.events)))
@@ -173,6 +175,10 @@ class RunFolder:
     def put_json(self, name: str, data: dict[str, Any]) -> None:
         """Write a JSON file in one step."""
         self.put(name, lambda path: write_text(path, json.dumps(data, indent=2) + "\n"))
+
+
+def _digests(scenario: Scenario) -> dict[str, dict[str, str]]:
+    return {"inputs": input_digests(scenario), "code": code_digests(scenario)}
 
 
 def _line(event: Event) -> str:

@@ -21,8 +21,8 @@ import pyarrow.compute as pc
 
 from emulator.cells.executors import WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
-from emulator.checks.judge import Verdict, judge
-from emulator.drivers.conclude import conclude, gather
+from emulator.checks.judge import Verdict
+from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.simulate import simulate
@@ -81,7 +81,7 @@ def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     if folder.is_open:
         judgement, _ = conclude(emulation, wall_s, "simulate")
     else:
-        judgement = judge(gather(emulation, wall_s))
+        judgement = judge_unkept(emulation, wall_s)
     verdicts = {check.name: check.verdict for check in judgement.checks}
     texts = {check.name: check.text for check in judgement.checks if check.verdict is not Verdict.VALID}
     greatest = _greatest(emulation)
@@ -185,10 +185,10 @@ def _run_elsewhere(scenario: Scenario, limit_s: float) -> Trial:
 
 def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float) -> Trial:
     """Run a trial in a worker, and keep nothing but its result: files take as long as a small run's checks."""
-    if not scenario.program.checks:
-        return _run(scenario, RunFolder.scratch(scratch), Path(os.devnull), Path(os.devnull), limit_s)
-    with tempfile.TemporaryDirectory(dir=scratch.parent) as name:  # the user's own checks may read them
-        return _run_in_worker(scenario, Path(name) / "run", limit_s)
+    folder = RunFolder.scratch(scratch)
+    # Checks of the user's own may read what programs have printed.
+    log = folder.logs / PROGRAMS_LOG if scenario.program.checks else Path(os.devnull)
+    return _run(scenario, folder, log, Path(os.devnull), limit_s)
 
 
 def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:

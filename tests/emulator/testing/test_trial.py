@@ -1,0 +1,45 @@
+"""Runs of a campaign leave no files, unless a check of the user's own asks for them."""
+
+from pathlib import Path
+
+from emulator.checks.own import PREFIX
+from emulator.records.run_folder import SCENARIO_FILE, TRACE_FILE, RunFolder
+from emulator.records.verdicts import Verdict
+from emulator.scenario.scenario import Scenario
+from emulator.testing.trial import run_trial
+
+CHECKS = "tests.emulator.testing.own_checks"
+
+
+def scenario_with(check: str) -> Scenario:
+    program = {"entry": "agents.beacon:main", "checks": [f"{CHECKS}:{check}"]}
+    run = {"duration_s": 1.0, "settle_s": 0.0}
+    return Scenario.model_validate({"run": run, "network": {"vehicles": 2}, "program": program})
+
+
+def test_tables_that_a_check_looks_at_are_in_no_file(tmp_path: Path) -> None:
+    trial = run_trial(scenario_with("reads_tables"), RunFolder.scratch(tmp_path))
+    assert trial.verdicts[f"{PREFIX}tables"] is Verdict.VALID, trial.texts
+    assert [path.name for path in tmp_path.iterdir()] == ["logs"]
+
+
+def test_files_that_a_check_asks_for_are_written(tmp_path: Path) -> None:
+    trial = run_trial(scenario_with("reads_files"), RunFolder.scratch(tmp_path))
+    assert trial.verdicts[f"{PREFIX}files"] is Verdict.VALID, trial.texts
+    assert {SCENARIO_FILE, TRACE_FILE} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_next_run_finds_nothing_of_the_last(tmp_path: Path) -> None:
+    for name in ("logs/v01.log", "disks/v01/kept.txt", SCENARIO_FILE):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("left")
+    folder = RunFolder.scratch(tmp_path)
+    assert [path.name for path in tmp_path.rglob("*")] == ["logs"]
+    assert folder.events == [] and not folder.is_open
+
+
+def test_a_kept_trial_and_one_that_is_not_give_the_same(tmp_path: Path) -> None:
+    scenario = scenario_with("reads_tables")
+    kept = run_trial(scenario, RunFolder.create(tmp_path / "kept", scenario))
+    unkept = run_trial(scenario, RunFolder.scratch(tmp_path / "unkept"))
+    assert (kept.verdicts, kept.texts, kept.trace_sha256) == (unkept.verdicts, unkept.texts, unkept.trace_sha256)
