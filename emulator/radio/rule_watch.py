@@ -43,10 +43,22 @@ class _Call:
         """Return the time of the clock; of the whole process where threads have no clocks."""
         return time.process_time_ns() if self.clock is None else time.clock_gettime_ns(self.clock)
 
-    def raise_in_thread(self, error: type[BaseException] | None) -> None:
-        """Raise an exception in the thread, or with None take back one that has not been raised yet."""
-        raised = ctypes.py_object(error) if error is not None else None
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), raised)
+    def interrupt(self) -> None:
+        """Raise NoAnswerError in the thread at its next step."""
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), ctypes.py_object(NoAnswerError))
+
+    def take_back(self) -> None:
+        """Catch an exception that has perhaps not been raised yet; in the thread itself.
+
+        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a debugger
+        traces a coroutine.
+        """
+        try:
+            self.interrupt()
+            while True:
+                pass
+        except NoAnswerError:
+            pass
 
 
 def _own_clock() -> int | None:
@@ -76,7 +88,7 @@ class _Watch:
         with self._lock:
             self._calls.discard(call)
         if call.is_interrupted:
-            call.raise_in_thread(None)
+            call.take_back()
 
     def _look(self) -> None:
         while True:
@@ -85,7 +97,7 @@ class _Watch:
                 for call in self._calls:
                     if call.cpu_ns() - call.start_ns > LIMIT_S * 1e9:
                         call.is_interrupted, call.start_ns = True, call.cpu_ns()  # again, if it goes on
-                        call.raise_in_thread(NoAnswerError)
+                        call.interrupt()
                 if not self._calls and time.monotonic() - self._last_s > IDLE_S:
                     self._thread = None
                     return
