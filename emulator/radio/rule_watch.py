@@ -50,8 +50,8 @@ class _Call:
     def take_back(self) -> None:
         """Catch an exception that has perhaps not been raised yet; in the thread itself.
 
-        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a debugger
-        traces a coroutine.
+        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a
+        debugger traces a coroutine.
         """
         try:
             self.interrupt()
