@@ -174,7 +174,7 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
 def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
     # Frames sent at the instant of a death may have been sent before or after it: they are not judged.
     judged = capped | recorded.outcome_is("fault", *ON_AIR)
-    judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns)
+    judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns) & ~recorded.dropped_by_sender
     everybody = np.arange(len(recorded.node_ids))
     edges = {0, END_OF_TIME_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
     if recorded.moves:

@@ -98,7 +98,7 @@ def _(fault: Custom, recorded: RecordedRun) -> Mask:
 
 @can_cause.register
 def _(fault: CustomSender, recorded: RecordedRun) -> Mask:
-    return ~recorded.outcome_is("fault")
+    return np.asarray(~recorded.outcome_is("fault") | (recorded.copy == 0))
 
 
 def check_partition_respected(recorded: RecordedRun) -> Finding:

@@ -67,7 +67,9 @@ def _queue(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arra
     airtimes_ns = [usual_ns, *slowed_ns]
     longest_ns = int(recorded.sent_ns.max(initial=0)) + 1
     key, batch = np.unique(recorded.sender * longest_ns + recorded.sent_ns, return_inverse=True)
-    offered = np.flatnonzero(~received_twice(recorded) & ~recorded.outcome_is("oversize"))
+    offered = np.flatnonzero(
+        ~received_twice(recorded) & ~recorded.outcome_is("oversize") & ~recorded.dropped_by_sender
+    )
     first = offered[np.unique(recorded.emission[offered], return_index=True)[1]]
     taken = first[~recorded.outcome_is("queue_full")[first]]
     sums = [np.bincount(batch[taken], weights=air[taken], minlength=len(key)) for air in airtimes_ns]

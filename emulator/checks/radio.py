@@ -204,7 +204,8 @@ def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:
     began = recorded.on_air_ns >= 0
     end_ns = np.where(began, recorded.on_air_ns + recorded.airtime_ns, recorded.sent_ns)
     left_ns = recorded.column("left_ns")
-    wrong = (began == recorded.outcome_is(*NEVER_SENT)) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
+    never = recorded.outcome_is(*NEVER_SENT) | recorded.dropped_by_sender
+    wrong = (began == never) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
     wrong |= began & (recorded.on_air_ns < recorded.sent_ns)
     for planned in recorded.plan:
         if isinstance(planned.fault, Throttle):

@@ -179,8 +179,9 @@ class Engine:
 
     def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
         frame = self._frame(time_ns, node, outgoing)
-        if frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
-            frame.sender_outcome, frame.end_ns = Outcome.oversize, time_ns
+        if outgoing.dropped or frame.size_bytes > self._max_payload_bytes:  # the MAC never sees it
+            frame.sender_outcome = Outcome.fault if outgoing.dropped else Outcome.oversize
+            frame.end_ns = time_ns
             self._mac.sent.append(frame)
         else:
             self._mac.enqueue(frame)

@@ -52,9 +52,10 @@ class Frame:
     sender's name is `name`, and `cause` is the number of the fault that sends or changes it.
 
     `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
-    oversize, queue_full, held_back, or pending for a frame that is sent. The frame is on air from `on_air_ns`
-    (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive with other bytes, by
-    receiver. `answers` are those of rules of the user's own, by fault, with the columns that they speak of.
+    oversize, queue_full, held_back, fault (a rule dropped it), or pending for a frame that is sent. The frame is
+    on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive
+    with other bytes, by receiver. `answers` are those of rules of the user's own, by fault, with the columns that
+    they speak of.
     """
 
     sender: int

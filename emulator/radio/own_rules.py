@@ -123,7 +123,7 @@ class OwnRules:
         return self._ask(planned, seen, lambda answer: answered_by_link(answer, seen.receivers, frame.size_bytes))
 
     def ask_sender(self, planned: PlannedFault, frame: Frame, max_bytes: int) -> list[bytes]:
-        """Return the payloads that are sent in place of a frame, at least one."""
+        """Return the payloads that are sent in place of a frame; none if the rule drops it."""
         if planned.number in self._failed:
             return [frame.payload]
         columns = np.flatnonzero(frame.topology.admitted[frame.sender])
@@ -270,7 +270,7 @@ def _told(error: BaseException) -> tuple[str, str]:
     frames = outside(error, *WATCHED)
     said = f"raises {in_words(error)}"
     if isinstance(error, rule_watch.NoAnswerError):
-        said = f"does not answer within {rule_watch.LIMIT_S:g} s of processor time"
+        said = f"does not answer within {error}"
     if frames is None:
         return said, ""
     return f"{said} ({line_of(frames)})", "".join(traceback.format_exception(error.with_traceback(frames)))

@@ -71,9 +71,9 @@ def answered_by_link(answer: Any, receivers: Sequence[str], size_bytes: int) -> 
 
 
 def answered_by_sender(answer: Any, max_bytes: int) -> list[bytes]:
-    """Return the payloads that a rule at a sender answers. Raises NonsenseError."""
-    if not isinstance(answer, (list, tuple)) or not answer:
-        raise NonsenseError(f"{shown(answer)}: a list of one payload or more is needed, or None to change nothing")
+    """Return the payloads that a rule at a sender answers; none if it drops the frame. Raises NonsenseError."""
+    if not isinstance(answer, (list, tuple)):
+        raise NonsenseError(f"{shown(answer)}: a list of payloads is needed, or None to change nothing")
     if len(answer) > MOST_FRAMES:
         raise NonsenseError(f"{len(answer)} payloads: {MOST_FRAMES} at most")
     for payload in answer:

@@ -1,22 +1,32 @@
-"""A bound on the processor time of a call into code of the user's own: a rule that loops forever is interrupted.
+"""Bounds on a call into code of the user's own: a rule that loops, or waits, forever is interrupted.
 
 A thread looks at the processor time of the calling thread now and then, and raises an exception in it once the
-call has had its time. So a slow machine, or one that is stopped, interrupts nothing. What waits without computing,
-and a single long call into a library, are not interrupted before they return.
+call has had its time. So a slow machine, or one that is stopped, interrupts nothing.
+
+A call that waits (sleeps, reads from a socket, acquires a lock) sees no such exception. In the main thread, to
+which Python gives signals, it is interrupted by a signal whose handler raises; the handler is set for the call
+alone. On any other thread, and in a single long call into a library, nothing is interrupted before it returns.
 """
 
 from __future__ import annotations
 
 import ctypes
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from types import FrameType
+from typing import Any, TypeVar
 
 LIMIT_S = 10.0
 """Processor time of one call: a thousand times what a rule for hundreds of receivers takes."""
+WAIT_LIMIT_S = 30.0
+"""Time that one call may wait: three times what it may compute."""
+BUSY_SHARE = 0.01
+"""Share of processor time above which a call computes, and does not wait."""
+WAKE_UP = signal.SIGALRM
 LOOK_EVERY_S = 0.1
 IDLE_S = 5.0
 """Time without a call after which the thread ends."""
@@ -24,41 +34,96 @@ T = TypeVar("T")
 
 
 class NoAnswerError(BaseException):
-    """A call has had its processor time. No Exception, so that the function does not catch it by accident."""
+    """A call has had its time. No Exception, so that the function does not catch it by accident."""
+
+    def __str__(self) -> str:
+        return f"{LIMIT_S:g} s of processor time"
+
+
+class WaitedError(NoAnswerError):
+    """A call has waited for too long."""
+
+    def __str__(self) -> str:
+        return f"{WAIT_LIMIT_S:g} s of waiting"
 
 
 @dataclass(eq=False)
 class _Call:
-    """A call that is on: its thread, the clock of that thread, and its time by that clock at the start, in ns."""
+    """A call that is on: its thread, the clock of that thread, and its time by that clock at the start, in ns.
+
+    `looked_ns` is that time when the watch last looked, and `waited_s` how long it has seen the call wait.
+    `takes_signals` says that the handler of `WAKE_UP` is that of this call, in place of `handler_before`.
+    """
 
     thread: int = field(default_factory=threading.get_ident)
     clock: int | None = field(default_factory=lambda: _own_clock())
     start_ns: int = 0
+    looked_ns: int = 0
+    waited_s: float = 0.0
     is_interrupted: bool = False
+    is_on: bool = True
+    takes_signals: bool = False
+    is_awaited: bool = False
+    is_signalled: bool = False
+    handler_before: Any = None
 
     def __post_init__(self) -> None:
-        self.start_ns = self.cpu_ns()
+        self.start_ns = self.looked_ns = self.cpu_ns()
+
+    def take_signals(self) -> None:
+        """Set the handler of `WAKE_UP` to that of this call, where Python allows it."""
+        self.handler_before = signal.getsignal(WAKE_UP)
+        # None: a handler that Python has not set, and cannot set again.
+        if threading.current_thread() is threading.main_thread() and self.handler_before is not None:
+            self.takes_signals = True
+            signal.signal(WAKE_UP, self._wake_up)
 
     def cpu_ns(self) -> int:
         """Return the time of the clock; of the whole process where threads have no clocks."""
         return time.process_time_ns() if self.clock is None else time.clock_gettime_ns(self.clock)
 
-    def interrupt(self) -> None:
-        """Raise NoAnswerError in the thread at its next step."""
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), ctypes.py_object(NoAnswerError))
+    def raise_in_thread(self, error: type[BaseException] | None) -> None:
+        """Raise an exception in the thread, or with None take back one that has not been raised yet."""
+        raised = ctypes.py_object(error) if error is not None else None
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), raised)
 
-    def take_back(self) -> None:
-        """Catch an exception that has perhaps not been raised yet; in the thread itself.
+    def look(self) -> None:
+        """Interrupt the call if it has had its time: again and again, if it goes on."""
+        cpu_ns = self.cpu_ns()
+        self.waited_s += LOOK_EVERY_S if cpu_ns - self.looked_ns < BUSY_SHARE * LOOK_EVERY_S * 1e9 else 0.0
+        self.looked_ns = cpu_ns
+        if cpu_ns - self.start_ns > LIMIT_S * 1e9:
+            self.is_interrupted, self.start_ns = True, cpu_ns
+            self.raise_in_thread(NoAnswerError)
+        if self.takes_signals and self.waited_s > WAIT_LIMIT_S:
+            self.waited_s, self.is_awaited, self.is_signalled = 0.0, True, True
+            signal.pthread_kill(self.thread, WAKE_UP)
 
-        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a
-        debugger traces a coroutine.
-        """
-        try:
-            self.interrupt()
-            while True:
-                pass
-        except NoAnswerError:
-            pass
+    def release_signals(self) -> None:
+        """Set the handler of before; the watch does not look at the call any more."""
+        if self.takes_signals:
+            if self.is_signalled:
+                time.sleep(0)  # a signal that has been sent is taken before a system call returns
+            self.takes_signals = False
+            signal.signal(WAKE_UP, self.handler_before)
+
+    def _wake_up(self, number: int, frame: FrameType | None) -> None:
+        """Raise in a call that has waited too long; give every other such signal to the handler of before."""
+        is_own, self.is_awaited = self.is_awaited, False
+        if not is_own:
+            if callable(self.handler_before):
+                self.handler_before(number, frame)
+        elif self.is_on and not _in_debugger(frame):
+            raise WaitedError
+
+
+def _in_debugger(frame: FrameType | None) -> bool:
+    """Return whether pdb waits for its user."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "bdb":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _own_clock() -> int | None:
@@ -74,30 +139,29 @@ class _Watch:
         self._thread: threading.Thread | None = None
         self._last_s = 0.0
 
-    def begin(self) -> _Call:
-        call = _Call()
+    def begin(self, call: _Call) -> None:
+        call.take_signals()
         with self._lock:
             self._calls.add(call)
             self._last_s = time.monotonic()
             if self._thread is None or not self._thread.is_alive():  # a fork has no threads but its own
                 self._thread = threading.Thread(target=self._look, name="rule watch", daemon=True)
                 self._thread.start()
-        return call
 
     def end(self, call: _Call) -> None:
+        call.is_on = False
         with self._lock:
             self._calls.discard(call)
         if call.is_interrupted:
-            call.take_back()
+            call.raise_in_thread(None)
+        call.release_signals()
 
     def _look(self) -> None:
         while True:
             time.sleep(LOOK_EVERY_S)
             with self._lock:
                 for call in self._calls:
-                    if call.cpu_ns() - call.start_ns > LIMIT_S * 1e9:
-                        call.is_interrupted, call.start_ns = True, call.cpu_ns()  # again, if it goes on
-                        call.interrupt()
+                    call.look()
                 if not self._calls and time.monotonic() - self._last_s > IDLE_S:
                     self._thread = None
                     return
@@ -107,10 +171,14 @@ _WATCH = _Watch()
 
 
 def call_bounded(function: Callable[..., T], *arguments: object) -> T:
-    """Return what a function returns. Raises what it raises, or NoAnswerError after `LIMIT_S` of processor time."""
-    call = _WATCH.begin()
+    """Return what a function returns. Raises what it raises, or NoAnswerError after its time.
+
+    It may compute for `LIMIT_S`, and on the main thread wait for `WAIT_LIMIT_S`.
+    """
+    call = _Call()
     try:
         try:
+            _WATCH.begin(call)
             return function(*arguments)
         finally:
             _WATCH.end(call)

@@ -23,7 +23,8 @@ REMEMBERED_FRAMES = 4096
 class Outgoing:
     """A frame before it is enqueued: copy number `copy` of frame `seq`, sent under the name `alias` if it is set.
 
-    `draw` distinguishes its random draws from those of the other copies.
+    `draw` distinguishes its random draws from those of the other copies. The frame is recorded, but never sent, if
+    the fault `cause` has `dropped` it.
     """
 
     payload: bytes
@@ -32,13 +33,14 @@ class Outgoing:
     draw: int = 0
     cause: int = NO_CAUSE
     alias: str | None = None
+    dropped: bool = False
 
 
 class SenderFaults:
     """The acting sender faults, and the frames that affected senders have sent.
 
     `next_copy` numbers the copies of (sender, seq). `ask` returns the payloads that a rule of the user's own sends
-    in place of a frame: of a fault, at a time in ns, by a sender, with a number and a payload.
+    in place of a frame, none if it drops it: of a fault, at a time in ns, by a sender, with a number and a payload.
     """
 
     def __init__(
@@ -80,10 +82,13 @@ class SenderFaults:
                 original = Outgoing(old[2], seq, cause=planned.number)
         further: dict[int, list[bytes]] = {}
         for planned in acting:
-            if isinstance(planned.fault, CustomSender):
-                first, *further[planned.number] = self._ask(planned, time_ns, node, seq, original.payload)
-                if first != original.payload:
-                    original = replace(original, payload=first, cause=planned.number)
+            if isinstance(planned.fault, CustomSender) and not original.dropped:
+                sent = self._ask(planned, time_ns, node, seq, original.payload)
+                further[planned.number] = sent[1:]
+                if not sent:
+                    original = replace(original, cause=planned.number, dropped=True)
+                elif sent[0] != original.payload:
+                    original = replace(original, payload=sent[0], cause=planned.number)
         yield original
         for planned in acting:
             for index, more in enumerate(further.get(planned.number, ()), start=1):

@@ -228,6 +228,11 @@ class RecordedRun(RecordedTables):
         return reached
 
     @cached_property
+    def dropped_by_sender(self) -> Mask:
+        """Mask of the rows of frames that a rule at their sender dropped: they were never enqueued."""
+        return np.asarray(self.outcome_is("fault") & self.caused_by("custom_sender"))
+
+    @cached_property
     def last_heal_ns(self) -> int:
         """From when on no fault acts any more; 0 without faults."""
         return max((planned.end_ns for planned in self.plan), default=0)

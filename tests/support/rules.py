@@ -2,12 +2,15 @@
 
 import contextlib
 import math
+import signal
+import threading
 import time
 from typing import Any
 
 import numpy as np
 
 from emulator import Answer, RadioFrame
+from emulator.radio import rule_watch
 
 State = dict[str, Any]
 
@@ -82,6 +85,31 @@ def loops(frame: RadioFrame, state: State) -> Answer:
             time.monotonic()
 
 
+def sleeps(frame: RadioFrame, state: State) -> Answer:
+    """Wait for what never comes, and compute nothing."""
+    while True:
+        time.sleep(1000.0)
+
+
+def locks_up(frame: RadioFrame, state: State) -> Answer:
+    """Wait for itself."""
+    lock = threading.Lock()
+    with lock, lock:
+        return Answer()
+
+
+def alarms(frame: RadioFrame, state: State) -> None:
+    """Send the process the signal that interrupts rules which wait."""
+    signal.raise_signal(rule_watch.WAKE_UP)
+
+
+def silences(frame: RadioFrame, state: State) -> list[bytes] | None:
+    """Drop every second frame of a sender, and send each third one three times."""
+    if frame.sequence % 2:
+        return []
+    return [frame.payload] * 3 if frame.sequence % 3 == 0 else None
+
+
 def nonsense(frame: RadioFrame, state: State) -> Any:
     """Answer what the option says."""
     count = len(frame.receivers)
@@ -100,7 +128,7 @@ def nonsense(frame: RadioFrame, state: State) -> Any:
         "short": Answer(payload={frame.receivers[0]: b"x"}),
         "stranger": Answer(payload={"nobody": frame.payload}),
         "list": Answer(payload=[frame.payload]),  # type: ignore[arg-type]
-        "none": [],
+        "dict": {},
         "many": [b"x"] * 201,
         "str": ["x"],
         "large": [bytes(100_000)],

@@ -23,6 +23,12 @@ rule = "tests.support.rules:babbles"
 at_s = 0.3
 duration_s = 1.0
 nodes = ["v02"]
+[[fault]]
+kind = "custom_sender"
+rule = "tests.support.rules:silences"
+at_s = 0.2
+duration_s = 1.0
+nodes = ["v03"]
 """
 
 
@@ -33,4 +39,4 @@ def test_rules_do_the_same_live_and_simulated(vnet: Vnet, tmp_path: Path) -> Non
     simulated = vnet("simulate", str(scenario))
     assert (live.status, simulated.status) == (0, 0), live.stderr + live.stdout
     assert live.fingerprint == simulated.fingerprint
-    assert {row["cause"] for row in live.trace()} == {"", "everything-0", "babbles-1"}
+    assert {row["cause"] for row in live.trace()} == {"", "everything-0", "babbles-1", "silences-2"}

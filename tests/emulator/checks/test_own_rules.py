@@ -48,6 +48,8 @@ DATA: dict[str, Any] = {
     "radio": {"range_m": 1e5},
 }
 
+MAC: dict[str, Any] = {"path_loss": {"kind": "dual_slope"}, "mac": {}}
+
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
@@ -160,12 +162,15 @@ def test_a_rule_that_fails_makes_the_run_invalid_and_is_named(tmp_path: Path, na
     assert json.loads((tmp_path / "run" / "verdict.json").read_text())["verdict"] == "invalid"
 
 
-@pytest.mark.parametrize("kind", ["custom", "custom_sender"])
-@pytest.mark.parametrize("radio", [{}, {"loss": 0.2, "max_peers": 2, "queue_frames": 3}], ids=["", "full"])
+@pytest.mark.parametrize(
+    ("kind", "own"), [("custom", "everything"), ("custom_sender", "babbles"), ("custom_sender", "silences")]
+)
+@pytest.mark.parametrize(
+    "radio", [{}, {"loss": 0.2, "max_peers": 2, "queue_frames": 3}, MAC], ids=["", "full", "mac"]
+)
 def test_rules_beside_all_other_faults_leave_the_run_valid(
-    tmp_path: Path, kind: str, radio: dict[str, Any]
+    tmp_path: Path, kind: str, own: str, radio: dict[str, Any]
 ) -> None:
-    own = {"custom": "everything", "custom_sender": "babbles"}[kind]
     kinds = ["DoS", "Sybil", "DataReplay", "StaleMessages", "duplicate", "corrupt"]
     faults: list[dict[str, Any]] = [{"kind": each, "at_s": 0.2, "duration_s": 1.0} for each in kinds]
     faults += [{"kind": "loss", "probability": 0.2, "duration_s": 1.0}]

@@ -1,6 +1,10 @@
 """Rules of the user's own on the radio: what they see, what they may answer, and what happens if they fail."""
 
+import signal
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -8,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.drivers.signals import signals_handled
 from emulator.radio import rule_watch
 from emulator.radio.own_rules import OwnRules
 from emulator.scenario.program import Program
@@ -158,6 +163,39 @@ def test_a_sender_s_rule_says_what_is_sent_in_place_of_each_frame() -> None:
     assert sorted(sent[20]) == [b"20"]
 
 
+def test_a_sender_s_rule_drops_a_frame_that_is_recorded_and_never_sent() -> None:
+    silent, free = chatted(rule("silences", 0.5, 1.0, "custom_sender", nodes={"ids": ["v1"]})), chatted()
+    for air in (silent, free):
+        air.go(3 * S)
+    dropped = [row for row in silent.rows() if row["outcome"] == "fault"]
+    assert {(row["sender"], row["cause"], row["arrival_ns"]) for row in dropped} == {("v1", "silences-0", None)}
+    assert Counter(row["seq"] for row in dropped) == dict.fromkeys(range(5, 15, 2), 4)
+    key = ("sender", "seq", "receiver", "payload_digest")
+    mine, all_rows = (
+        [tuple(row[name] for name in key) for row in air.rows() if row["copy"] == 0] for air in (silent, free)
+    )
+    assert mine == all_rows, "each frame has its number, and its rows"
+    heard = [delivery.packet.payload for delivery in silent.delivered if delivery.receiver == 0]
+    assert Counter(payload[4] for payload in heard if payload[0] == 1) == {
+        seq: 3 if seq in (6, 12) else 1 for seq in range(20) if not (5 <= seq < 15 and seq % 2)
+    }
+
+
+def test_a_dropped_frame_takes_no_time_of_its_sender_s_queue_and_no_other_rule_is_asked() -> None:
+    silence, babble = (rule(name, kind="custom_sender") for name in ("silences", "babbles"))
+    slow: dict[str, Any] = {"count": 2, "bitrate_mbps": 0.01, "access_jitter_ms": 0.0, "jitter_ms": 0.0}
+    silent, free = FaultyEngine([silence, babble], **slow), FaultyEngine([babble], **slow)
+    for air in (silent, free):
+        air.send(0, 0, b"0")
+    silent.send(10 * S, 0, b"1", b"2")
+    free.send(10 * S, 0, b"2")
+    rows = silent.rows(10 * S)
+    assert [(row["outcome"], row["cause"]) for row in rows if row["seq"] == 1] == [("fault", "silences-0")]
+    assert {row["cause"] for row in rows if row["seq"] == 2} == {"babbles-1"}
+    arrivals = [row["arrival_ns"] for row in rows if row["seq"] == 2]
+    assert arrivals == [row["arrival_ns"] for row in free.rows(10 * S)], "as if nothing had been sent before"
+
+
 NONSENSE = {
     "text": "answers 'drop': Answer(…) is needed, or None to let the frame pass",
     "mask": "answers drop of shape (5,): one value is needed, or 4, one a receiver",
@@ -175,8 +213,8 @@ NONSENSE = {
     "list": "answers payload = [",
 }
 NONSENSE_OF_SENDERS = {
-    "text": "answers 'drop': a list of one payload or more is needed, or None to change nothing",
-    "none": "answers []: a list of one payload or more is needed, or None to change nothing",
+    "text": "answers 'drop': a list of payloads is needed, or None to change nothing",
+    "dict": "answers {}: a list of payloads is needed, or None to change nothing",
     "many": "answers 201 payloads: 200 at most",
     "str": "answers the payload 'x': bytes are needed",
     "large": "answers a payload of 100000 bytes: radio.max_payload_bytes = ",
@@ -223,6 +261,46 @@ def test_a_rule_that_never_answers_is_interrupted_after_its_processor_time(monke
     (failure,) = air.failures
     assert failure.error.startswith("does not answer within 0.05 s of processor time (rules.py:")
     assert air.rows() == free.rows()
+
+
+@pytest.fixture
+def handled(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """A handler of the signal that interrupts rules, and what it was given; a rule may not wait at all."""
+    given: list[int] = []
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        given.append(number)
+
+    monkeypatch.setattr(rule_watch, "WAIT_LIMIT_S", 0.0)
+    monkeypatch.setattr(rule_watch, "LOOK_EVERY_S", 0.01)
+    with signals_handled(handler, rule_watch.WAKE_UP):
+        yield given
+        assert signal.getsignal(rule_watch.WAKE_UP) is handler
+
+
+@pytest.mark.parametrize("name", ["sleeps", "locks_up"])
+def test_a_rule_that_waits_is_interrupted_and_handlers_stay(name: str, handled: list[int]) -> None:
+    air, free = chatted(rule(name), periods=3), chatted(periods=3)
+    (failure,) = air.failures
+    assert failure.error.startswith("does not answer within 0 s of waiting (rules.py:")
+    assert air.rows() == free.rows()
+    assert handled == [], "no handler but the call's own saw the signal"
+
+
+def test_other_signals_of_the_kind_reach_the_handler_of_before(
+    handled: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rule_watch, "WAIT_LIMIT_S", 1e9)
+    air = chatted(rule("alarms"), periods=2)
+    assert air.failures == []
+    assert handled == [rule_watch.WAKE_UP] * 10
+
+
+def test_on_another_thread_no_handler_is_set(handled: list[int]) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        during = pool.submit(rule_watch.call_bounded, signal.getsignal, rule_watch.WAKE_UP).result()
+    assert during is signal.getsignal(rule_watch.WAKE_UP)
+    assert rule_watch.call_bounded(signal.getsignal, rule_watch.WAKE_UP) is not during
 
 
 def test_calls_are_bounded_one_by_one_and_not_in_sum(monkeypatch: pytest.MonkeyPatch) -> None:
