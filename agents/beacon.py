@@ -33,5 +33,6 @@ async def main(node: Node) -> None:
         for packet in node.radio.drain():
             if decode(packet.payload) is not None:
                 last_heard_ns[packet.sender] = packet.received_ns
-        fresh = [t for t in last_heard_ns.values() if node.now_ns - t <= FRESH_NS]
+        now_ns = node.now_ns
+        fresh = [t for t in last_heard_ns.values() if now_ns - t <= FRESH_NS]
         node.report(fix.position_m, fix.covariance_m2, neighbours=len(fresh))

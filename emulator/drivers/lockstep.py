@@ -23,14 +23,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.protocol import ProtocolError, check_ownership
+from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
 from emulator.radio.stages import least_latency_ns
 from vnet.node import INBOX_LIMIT, Fix, Packet
 from vnet.runtime.mail import Mail
 from vnet.transport import wire
-
-Entry = tuple[int, str, int, int, bytes]
-"""A packet: its receiver, its sender's name, times of sending and arrival in ns, and its payload."""
 
 
 class _Process:
@@ -50,7 +47,7 @@ class _Process:
         self.waiting_radio: Sequence[str] = ()
         self.waiting_gnss: Sequence[str] = ()
         self.steps: Sequence[wire.Step] = ()
-        self.packets: dict[str, list[Entry]] = {node: [] for node in self.nodes}
+        self.packets: dict[str, list[Packet]] = {node: [] for node in self.nodes}
         self.next_fix = dict.fromkeys(self.nodes, 0)
         self.paused: set[str] = set()
         self.affected: set[str] = set()
@@ -61,7 +58,7 @@ class _Process:
         """Nodes that are not paused."""
         return [node for node in self.nodes if node not in self.paused]
 
-    def take_packets(self) -> dict[str, list[Entry]]:
+    def take_packets(self) -> dict[str, list[Packet]]:
         """Return the packets of nodes that run, and have any."""
         due = {node: self.packets[node] for node in self.running if self.packets[node]}
         self.packets.update({node: [] for node in due})
@@ -279,14 +276,14 @@ class Lockstep:
                 del process.packets[node][:-INBOX_LIMIT]
         self._crowded.clear()
         node_ids = self._emulation.world.node_ids
-        inboxes: dict[int, list[Entry]] = {}
-        for entry in self._emulation.engine.foresee(time_ns).entries():
-            if (inbox := inboxes.get(entry[0])) is None:
-                inbox = inboxes[entry[0]] = self._inbox(node_ids[entry[0]])
-            inbox.append(entry)
+        inboxes: dict[int, list[Packet]] = {}
+        for receiver, sender, sent_ns, arrival_ns, payload in self._emulation.engine.foresee(time_ns).entries():
+            if (inbox := inboxes.get(receiver)) is None:
+                inbox = inboxes[receiver] = self._inbox(node_ids[receiver])
+            inbox.append(Packet(sender, sent_ns, arrival_ns, payload))
         self._crowded.update(node_ids[node] for node, inbox in inboxes.items() if len(inbox) > INBOX_LIMIT)
 
-    def _inbox(self, node: str) -> list[Entry]:
+    def _inbox(self, node: str) -> list[Packet]:
         """Return the packets that a node has yet to be granted."""
         return self._processes[self._process_of[node]].packets[node]
 
@@ -403,12 +400,10 @@ class Lockstep:
         packets, clocks = process.take_packets(), process.take_clocks()
         grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks)
         if self._hosts_all:
-            self._mail = Mail(
-                {node: [Packet(*entry[1:]) for entry in some] for node, some in packets.items()}, fixes
-            )
+            self._mail = Mail(packets, fixes)
         else:
-            there = [wire.WirePacket(node, *entry[1:]) for node, some in packets.items() for entry in some]
-            grant = replace(grant, packets=there, fixes=[wire.WireFix.of(*each) for each in fixes])
+            encoded = [wire_packet(node, packet) for node, some in packets.items() for packet in some]
+            grant = replace(grant, packets=encoded, fixes=[wire.WireFix.of(*each) for each in fixes])
         if process.id in self.ahead and self._lookahead_ns > 1 and not process.paused:
             grant = self._quiet_grant(process, grant)
         self.owed[process.id] = process.seq

@@ -82,10 +82,22 @@ class _Call:
         """Return the time of the clock; of the whole process where threads have no clocks."""
         return time.process_time_ns() if self.clock is None else time.clock_gettime_ns(self.clock)
 
-    def raise_in_thread(self, error: type[BaseException] | None) -> None:
-        """Raise an exception in the thread, or with None take back one that has not been raised yet."""
-        raised = ctypes.py_object(error) if error is not None else None
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), raised)
+    def interrupt(self) -> None:
+        """Raise NoAnswerError in the thread at its next step."""
+        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self.thread), ctypes.py_object(NoAnswerError))
+
+    def take_back(self) -> None:
+        """Catch an exception that has perhaps not been raised yet; in the thread itself.
+
+        It is raised here. If it were withdrawn, Python 3.11 would look for it for ever, and hang as soon as a
+        debugger traces a coroutine.
+        """
+        try:
+            self.interrupt()
+            while True:
+                pass
+        except NoAnswerError:
+            pass
 
     def look(self) -> None:
         """Interrupt the call if it has had its time: again and again, if it goes on."""
@@ -94,7 +106,7 @@ class _Call:
         self.looked_ns = cpu_ns
         if cpu_ns - self.start_ns > LIMIT_S * 1e9:
             self.is_interrupted, self.start_ns = True, cpu_ns
-            self.raise_in_thread(NoAnswerError)
+            self.interrupt()
         if self.takes_signals and self.waited_s > WAIT_LIMIT_S:
             self.waited_s, self.is_awaited, self.is_signalled = 0.0, True, True
             signal.pthread_kill(self.thread, WAKE_UP)
@@ -153,7 +165,7 @@ class _Watch:
         with self._lock:
             self._calls.discard(call)
         if call.is_interrupted:
-            call.raise_in_thread(None)
+            call.take_back()
         call.release_signals()
 
     def _look(self) -> None:
