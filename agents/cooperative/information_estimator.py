@@ -172,13 +172,13 @@ class InformationEstimator:
             table = table[believed]
             said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
         names = list(frames)
-        priors, means_m = self._moderated(names, said[:, :5], means_m, table[:, 12:])
+        priors, means_m, leaning = self._moderated(names, said[:, :5], means_m, table[:, 12:])
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
             self.mean_m = tracked_mean(means_m.sum(axis=0) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE)
         priors, increments = self._limited(priors, said[:, 5:])
-        weights = self._weigh(frames, means_m, covariances_m2)
+        weights = self._weigh(frames, means_m, covariances_m2, leaning)
         pooled = weights @ priors + increments.sum(axis=0)
         passed = self._passed_on(frames, weights)
         pooled += passed.sum(axis=0)
@@ -230,31 +230,32 @@ class InformationEstimator:
 
     def _moderated(
         self, names: list[str], priors: Array, means_m: Array, variances_m2: Array
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Return the priors (1 + n, 5) of the vehicle and of `names`, and their means, none far from their median.
 
-        `variances_m2` (1 + n, 3) are those of the means (1 + n, 2). No prior is dropped: where a few vehicles hear
-        what the others cannot know, they are always off, and right.
+        `variances_m2` (1 + n, 3) are those of the means (1 + n, 2). No vehicle is dropped: where a few hear what
+        the others cannot know, they are always off, and right. The last value (1 + n,) tells which always are.
         """
+        leaning = np.zeros(len(means_m), dtype=np.bool_)
         if not self._options.defence or not names:
             self.limit_m = np.inf
-            return priors, means_m
+            return priors, means_m, leaning
         median_m, self.limit_m = spread_limit_m(means_m)
         if self.limit_m == np.inf:
             median_m = means_m[0]
         off_m = means_m[1:] - median_m
         codes = [_code(name) for name in names]
         now_s = self._now_ns / NS_PER_S
-        less_m = self._origins.without_lean(codes, off_m, variances_m2[1:] + variances_m2[0], now_s)
+        less_m, leaning[1:] = self._origins.without_lean(codes, off_m, variances_m2[1:] + variances_m2[0], now_s)
         less_m = cut_to(less_m, self.limit_m)
         if less_m is off_m:
-            return priors, means_m
+            return priors, means_m, leaning
         moved_m = np.zeros_like(means_m)
         moved_m[1:] = less_m - off_m
         priors = priors.copy()
         priors[:, 3] += priors[:, 0] * moved_m[:, 0] + priors[:, 1] * moved_m[:, 1]
         priors[:, 4] += priors[:, 1] * moved_m[:, 0] + priors[:, 2] * moved_m[:, 1]
-        return priors, means_m + moved_m
+        return priors, means_m + moved_m, leaning
 
     def _limited(self, priors: Array, increments: Array) -> tuple[Array, Array]:
         """Return priors and increments (1 + n, 5) of all rows, none much more certain than one's own."""
@@ -266,14 +267,23 @@ class InformationEstimator:
         largest = PRIOR_FACTOR * _trace(self._prior)
         return scaled_down(priors, largest), scaled_down(increments, self._largest_increment)
 
-    def _weigh(self, frames: Mapping[str, InformationFrame], means_m: Array, covariances_m2: Array) -> Array:
-        """Return the weights (1 + n,) of the priors, with means (1 + n, 2) and covariances (1 + n, 2, 2)."""
+    def _weigh(
+        self,
+        frames: Mapping[str, InformationFrame],
+        means_m: Array,
+        covariances_m2: Array,
+        leaning: NDArray[np.bool_],
+    ) -> Array:
+        """Return the weights (1 + n,) of the priors, with means (1 + n, 2) and covariances (1 + n, 2, 2).
+
+        The weight of who is always to one side, `leaning` (1 + n,), goes to the vehicle itself.
+        """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
         weights = self._rule.weights(means_m, covariances_m2, self.mean_m, degrees)
         if self._options.defence:
-            weights = (1 - SELF_SHARE) * weights
-            weights[0] += SELF_SHARE
+            weights = np.where(leaning, 0.0, (1 - SELF_SHARE) * weights)
+            weights[0] += 1 - weights.sum()
         ids = [self._node_id, *(self._admission.ids[name] for name in frames)]
         self.weights = dict(zip(ids, weights.tolist(), strict=True))
         return weights

@@ -238,8 +238,12 @@ class Origins:
         limit = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * of_many
         return np.asarray((squared[:count] < INCREMENT_GATE) & (squared[count:] < limit))
 
-    def without_lean(self, codes: Sequence[int], off_m: Array, variance_m2: Array, now_s: float) -> Array:
+    def without_lean(
+        self, codes: Sequence[int], off_m: Array, variance_m2: Array, now_s: float
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Return the deviations (n, 2) of the priors of `codes` from the median, less what is always to one side.
+
+        The second value (n,) tells which priors lean so.
 
         `variance_m2` (n, 3), entries (xx, xy, yy), is how far each may be off. Deviations of the honest change
         sides in a second; a mean of more than `LEAN_LIMIT` deviations is taken off.
@@ -253,10 +257,11 @@ class Origins:
         lean = now + keep * (lean - now)
         self._priors.store(rows, lean, now_s)
         squared = lean[0] * lean[0] + lean[1] * lean[1]
-        if squared.max() <= LEAN_LIMIT**2:
-            return off_m
+        leans = squared > LEAN_LIMIT**2
+        if not leans.any():
+            return off_m, leans
         x, y = lean * np.maximum(0.0, 1 - LEAN_LIMIT / np.sqrt(np.maximum(squared, 1e-300)))
-        return np.asarray(off_m - np.stack([root_xx * x, root_yx * x + root_yy * y], axis=1))
+        return off_m - np.stack([root_xx * x, root_yx * x + root_yy * y], axis=1), leans
 
 
 def median_belief(priors: Array) -> Information:

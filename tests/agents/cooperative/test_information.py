@@ -191,6 +191,20 @@ def test_an_attacker_moves_nobody(lie: Lie) -> None:
     assert network.errors_m()[1:].max() < 0.7
 
 
+def test_who_is_always_to_one_side_gets_no_weight() -> None:
+    """The priors of one of eight are off by less than a gate lets through, always to the same side."""
+
+    def lie(name: str, frame: InformationFrame) -> InformationFrame:
+        return replace(frame, prior=_shifted(frame.prior, np.array([0.3, 0.0]))) if name == "v0" else frame
+
+    network = Network(8)
+    network.run(80, lie)
+    others = [e.weights for e in network.estimators[1:]]
+    assert [weights["v0"] for weights in others] == [0.0] * 7
+    assert [sum(weights.values()) for weights in others] == pytest.approx([1.0] * 7)
+    assert all(max(weights[f"v{k}"] for weights in others) > 0 for k in range(1, 8))
+
+
 def test_passed_on_increments_that_are_forged_are_seen() -> None:
     def lie(name: str, frame: InformationFrame) -> InformationFrame:
         passed = frame.passed.copy()

@@ -153,9 +153,10 @@ def test_a_lean_to_one_side_is_taken_off_beyond_what_is_claimed(variance_m2: flo
     origins, claimed = Origins(), np.tile([2 * variance_m2, 0.0, variance_m2], (2, 1))
     for k in range(600):
         off_m = np.array([[0.5, 0.0], [0.5 * (-1) ** k, 0.0]])
-        less_m = origins.without_lean([1, 2], off_m, claimed, 0.1 * k)
+        less_m, leans = origins.without_lean([1, 2], off_m, claimed, 0.1 * k)
     assert_allclose(less_m[0], [limit_m, 0.0], atol=0.01)
     assert_allclose(less_m[1], off_m[1], atol=1e-9)
+    assert leans.tolist() == [True, False]
 
 
 def test_a_lean_is_measured_by_deviations_in_all_directions() -> None:
@@ -166,7 +167,7 @@ def test_a_lean_is_measured_by_deviations_in_all_directions() -> None:
     for off_m in (along, across):
         origins = Origins()
         for k in range(600):
-            less_m = origins.without_lean([1], off_m, claimed, 0.1 * k)
+            less_m, _ = origins.without_lean([1], off_m, claimed, 0.1 * k)
         left_m.append(float(np.hypot(*less_m[0])))
     assert left_m[0] == pytest.approx(0.1 * np.sqrt(1.9), rel=0.03)
     assert left_m[1] == pytest.approx(0.1 * np.sqrt(0.1), rel=0.05)
