@@ -227,7 +227,7 @@ class Estimator:
         heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
         left = room(len(heard), max_payload)
         mixes = self._options.exchange == "particles" and self._options.fusion != "none"
-        particles = min(self._options.particles, left // PARTICLE_BYTES) if mixes else 0
+        particles = min(self.rbpf.config.particles, left // PARTICLE_BYTES) if mixes else 0
         relays = min(RELAY_LIMIT, (left - PARTICLE_BYTES * particles) // RELAYED.itemsize)
         return CooperativeFrame(
             fix_time_ns=fix.time_ns,

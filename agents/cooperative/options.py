@@ -24,6 +24,9 @@ Positive = Annotated[float, Meta(gt=0)]
 RENAMED = {"roads_apart": "separate_map_update"}
 """New names of options, by the old."""
 
+OWN_PARTICLES, SHARED_PARTICLES = 1000, 200
+"""Numbers of particles of a filter of a vehicle's own fixes, and of one of the fixes of all."""
+
 PAPER_STEP_S = 0.1
 """The paper's period (s)."""
 PAPER_STEP_M = 0.5 / math.sqrt(3)
@@ -55,9 +58,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """`paper` gives many other keys the paper's values as defaults; keys that are set besides still count."""
     fusion: Literal["optimized", "random", "metropolis", "max-degree", "constant", "none"] = "optimized"
     """Rule of the fusion weights; `none` fuses nothing."""
-    exchange: Literal["information", "estimates", "particles"] = "estimates"
-    """Fusion moves the cloud towards the neighbours' estimates, or mixes particles, as in the paper. With
-    `information` a vehicle filters itself alone and exchanges what it knows of the common error, not fixes."""
+    exchange: Literal["information", "estimates", "particles"] = "information"
+    """With `information` a vehicle filters itself alone and exchanges what it knows of the common error, not fixes.
+    Else it filters all fixes that it hears of, and fusion moves the cloud towards the neighbours' `estimates`, or
+    mixes `particles`, as in the paper."""
     relay: bool = True
     """If true, a frame relays the newest fixes of others; not with `exchange = "information"`."""
     relay_increments: Annotated[int, Meta(ge=0, le=255)] = 30
@@ -76,8 +80,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     """Solver of the weights' quadratic program; `auto` is DAQP with `exchange = "information"` and OSQP else."""
     fusion_interval_s: Positive = 0.2
     """Time between two fusions."""
-    particles: Annotated[int, Meta(ge=1, le=100_000)] = 200
-    """Number of hypotheses of the common error that a vehicle keeps."""
+    particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
+    """Number of hypotheses of the common error that a vehicle keeps; 0 means 1000 with `exchange = "information"`
+    and 200 else, where a vehicle filters the fixes of all."""
     least_particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
     """With `exchange = "information"` on straight lanes: their number goes down to it as their spread does, by KLD
     sampling (Fox 2003), `particles` being the largest; 0 keeps `particles` always."""
@@ -128,12 +133,12 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
     def own_config(self) -> OwnConfig:
         """Return the constants of the filter of a vehicle that exchanges information."""
-        return OwnConfig(self.filter_config(), self.lateral_sigma_m, self.least_particles)
+        return OwnConfig(self.filter_config(OWN_PARTICLES), self.lateral_sigma_m, self.least_particles)
 
-    def filter_config(self) -> RbpfConfig:
-        """Return the constants of the vehicle's particle filter."""
+    def filter_config(self, particles: int = SHARED_PARTICLES) -> RbpfConfig:
+        """Return the constants of the vehicle's particle filter, of so many particles if the options do not say."""
         return RbpfConfig(
-            particles=self.particles,
+            particles=self.particles or particles,
             common_sigma_m=self.common_sigma_m,
             common_tau_s=self.common_tau_s,
             common_walk_m=self.common_walk_m or None,

@@ -15,6 +15,9 @@ from vnet.types import Array
 
 DIFFUSING = 2
 """Number of the coordinates that diffuse, the first."""
+LEAST_VARIANCE_M2 = 1e-4
+"""Variance (m²) that is added to those of the coordinates that diffuse: so few particles may be left that their own
+is none, and nothing is known to a centimetre."""
 _ROOT_HALF = np.sqrt(0.5)
 
 
@@ -120,6 +123,8 @@ class AffineCloud:
         for row, out in zip(off, weighted, strict=True):  # in half the time of one call for all rows
             np.multiply(row, self.weight, out=out)
         self.covariance = weighted.dot(off.T) - mean_off[:, None] * mean_off
+        for axis in range(DIFFUSING):
+            self.covariance[axis, axis] += LEAST_VARIANCE_M2
         self._linear = self._unmoved.copy()
         self._linear[:, -2], self._linear[:, -1] = origin, origin + mean_off
         self._is_diffused = False

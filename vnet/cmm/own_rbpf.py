@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.affine_cloud import AffineCloud
+from vnet.cmm.affine_cloud import LEAST_VARIANCE_M2, AffineCloud
 from vnet.cmm.common_error import systematic
 from vnet.cmm.information import Information, inverse, square_root, transport
 from vnet.cmm.kalman_bound import LaneModel, lane_axes
@@ -138,7 +138,7 @@ class OwnRbpf:
         place = self._point_m[:, :, None] + self._axes.transpose(0, 2, 1) @ self._own[:, :2]
         self.estimate_m = self.common_m @ self.weight
         spread = self.common_m - self.estimate_m[:, None]
-        self.estimate_covariance_m2 = (spread * self.weight) @ spread.T
+        self.estimate_covariance_m2 = (spread * self.weight) @ spread.T + LEAST_VARIANCE_M2 * _IDENTITY
         place_m = np.einsum("hik,hk->i", place, weight)
         off = place - place_m[:, None]
         # Weighted sums over lanes and particles as products: an einsum of three factors takes ten times as long.

@@ -143,7 +143,7 @@ def test_a_lie_that_begins_late_does_not_poison_the_mean_of_before() -> None:
         ({"offset_m": [1.0]}, "program.options.offset_m = [1.0]: a list of 2 (each a number"),
         ({"offset_m": [1.0, float("nan")]}, "program.options.offset_m = [1.0, nan]: a list of 2"),
         ({"from_s": "later"}, "program.options.from_s = 'later': a number from"),
-        ({"particles": 0}, "program.options.particles = 0: a whole number from 1 to 100000 expected"),
+        ({"particles": -1}, "program.options.particles = -1: a whole number from 0 to 100000 expected"),
         ({"offset": 3}, "program.options.offset: unknown"),
     ],
 )
@@ -363,16 +363,24 @@ def test_after_a_partition_heals_the_halves_agree_within_ten_seconds() -> None:
     assert town.rejected(0) == set()
 
 
-def test_a_scenario_may_have_a_liar_and_what_is_rejected_is_reported(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("exchange", "reason"), [("estimates", "outlier"), ("information", "prior")])
+def test_a_scenario_may_have_a_liar_and_what_is_rejected_is_reported(
+    tmp_path: Path, exchange: str, reason: str
+) -> None:
     attacker = "agents.cooperative.attacker:main"
-    liar = {"nodes": ["v01"], "entry": attacker, "options": {"lie": "offset", "particles": 30}}
-    program = {"entry": "agents.cooperative:main", "options": {"particles": 30}, "exceptions": [liar]}
+    liar = {
+        "nodes": ["v01"],
+        "entry": attacker,
+        "options": {"lie": "offset", "particles": 30, "exchange": exchange},
+    }
+    options = {"particles": 30, "exchange": exchange}
+    program = {"entry": "agents.cooperative:main", "options": options, "exceptions": [liar]}
     network = {"vehicles": 6, "layout": "dense"}
     scenario = Scenario.model_validate({"run": {"duration_s": 2.5}, "network": network, "program": program})
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
     simulate(emulation)
     states = emulation.metrics.states_table().to_pylist()
     last = {row["node"]: row for row in states if row["period"] == 20}
-    assert all(row["rejected.outlier"] >= 15 for node, row in last.items() if node != "v01")
+    assert all(row[f"rejected.{reason}"] >= 15 for node, row in last.items() if node != "v01")
     assert not any(value for name, value in last["v01"].items() if name.startswith("rejected."))
     assert all(row["rejected"] >= 15 for node, row in last.items() if node != "v01")
