@@ -55,6 +55,11 @@ class Bug:
     report: str = ""
     """Published report after which the bug was planted: repository, number and title; "" for a bug of our own."""
 
+    @property
+    def is_cooperative(self) -> bool:
+        """True for a bug of the cooperative program."""
+        return self.program.startswith("cooperative:")
+
     def scenario(self, repaired: bool = False) -> Scenario:
         """Return the scenario, with the program with or without the bug."""
         own = self.judged_by.removeprefix("own:")

@@ -46,7 +46,7 @@ def test_the_registry_names_twelve_bugs_of_which_six_were_reported() -> None:
     assert len({bug.name for bug in BUGS}) == 12
     assert sum(bool(bug.report) for bug in BUGS) == 6
     assert sum(bug.needs_order for bug in BUGS) >= 6
-    assert sum("cooperative" in bug.program for bug in BUGS) == 2
+    assert sum(bug.is_cooperative for bug in BUGS) == 2
 
 
 @each_bug
