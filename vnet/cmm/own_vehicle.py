@@ -27,6 +27,8 @@ GATE_SIGMAS = 5.0
 """Fixes further from their prediction are outliers."""
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else."""
+OFF_ROAD_WALK_M = 1.0
+"""Random walk (m/√s) of a vehicle that is on no road, across the direction in which it drives."""
 SAME_LANE_M = 0.3
 SAME_LANE_RAD = 0.02
 """Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""
@@ -68,7 +70,9 @@ class OwnVehicle:
         )
         sigma_m = config.rbpf.start_sigma_m or config.rbpf.common_sigma_m
         start = np.array(config.rbpf.start_m), sigma_m**2 * np.eye(2)
-        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M)
+        # On no road a vehicle keeps its place: a renewed offset would be anywhere after seconds without a fix.
+        tau_s = 2 * (UNKNOWN_ALONG_M / OFF_ROAD_WALK_M) ** 2
+        unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
         nowhere = np.zeros((1, 2)), np.zeros(1)
         self._unknown = unknown
         self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start, self._least)
@@ -106,10 +110,12 @@ class OwnVehicle:
         nothing = Information(np.zeros((2, 2)), np.zeros(2))
         if fix is None:
             return nothing
-        if not self._is_placed:
+        was_placed = self._is_placed
+        if not was_placed:
             self._place(fix)
         distance, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
         if distance > GATE_SIGMAS**2:
+            self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
                 return nothing
