@@ -27,8 +27,8 @@ GATE_SIGMAS = 5.0
 """Fixes further from their prediction are outliers."""
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else."""
-OFF_ROAD_WALK_M = 1.0
-"""Random walk (m/√s) of a vehicle that is on no road, across the direction in which it drives."""
+OFF_ROAD_WALK_M = 10.0
+"""Random walk (m/√s) of a vehicle that is on no road, across its direction: a fix tells nearly all of its place."""
 SAME_LANE_M = 0.3
 SAME_LANE_RAD = 0.02
 """Distance (m) and angle (rad) within which two lanes of a map are taken for the same."""

@@ -11,7 +11,7 @@ from vnet.roads.lanes import LaneMap
 COMMON_M = np.array([2.0, 1.5])
 FAULT_M = np.array([33.0, 60.0])
 NOISE_M2 = np.eye(2)
-LARGEST_M2 = 100.0
+LARGEST_M2 = 1000.0
 
 
 def vehicle() -> OwnVehicle:
