@@ -7,45 +7,32 @@ estimates. The source of the packets (lockstep or real time, one process or fift
 
 from __future__ import annotations
 
-import asyncio
-import math
-import sys
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Generic, Protocol, TypeVar
+from typing import Any, Protocol
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import ArrayLike
 
 from vnet.errors import PayloadTooLargeError, shown
+from vnet.mailbox import Mailbox
+from vnet.reports import (
+    NoteDetail,
+    Report,
+    Value,
+    check_name,
+    checked_covariance,
+    checked_detail,
+    checked_numbers,
+    checked_value,
+)
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
 
-T = TypeVar("T")
-
-LONGEST_TEXT = 64
-"""Characters of a reported text: it names a state, and is no log."""
-Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
-"""A reported value besides the estimates."""
-
-RESERVED_NAMES = frozenset(
-    ["period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_estimate_m", "values"]
-)
-"""Names that no reported value can have: columns that the emulator fills in every row of a run's states."""
-COVARIANCE_TOLERANCE = 1e-6
-"""Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
-LARGEST_EXACT = 2**53
-"""Integers below it are numbers of double precision."""
 LEVELS = ("debug", "info", "warning", "error", "critical")
 """Levels of a line of a node's log."""
-NoteDetail = bool | int | float | str
-"""Value of a detail of an event."""
-INBOX_LIMIT = 4096
-"""Packets (or fixes) that are kept for a program that does not read them; beyond it the oldest are dropped."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,17 +71,6 @@ class Fix:
     heading_rad: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
-    """A program's estimates at one time; see `Node.report`."""
-
-    time_ns: int
-    node: str
-    estimate_m: tuple[float, float] | None
-    covariance_m2: tuple[float, float, float, float] | None
-    values: dict[str, Value] = field(default_factory=dict)
-
-
 class NodeTransport(Protocol):
     """Interface of a node to the process that hosts it."""
 
@@ -113,57 +89,6 @@ class NodeTransport(Protocol):
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         """Send a line of the log (kind "log"), or an event named `text` (kind "event")."""
         ...
-
-
-class Mailbox(Generic[T]):
-    """A bounded queue with one side for the transport (`deliver`) and one for the program.
-
-    `waiting` tells the transport that a task of the program waits here: only then does an arrival wake the node;
-    otherwise the program finds the item when it next runs. `refill` is called before the program reads, so that a
-    transport may leave items in its own buffer until then (real time).
-    """
-
-    def __init__(self) -> None:
-        self.refill: Callable[[], None] = lambda: None
-        self._items: deque[T] = deque(maxlen=INBOX_LIMIT)
-        self._waiters: deque[asyncio.Future[None]] = deque()
-
-    @property
-    def awaited(self) -> bool:
-        """True if a task may be waiting here; may be read from another thread."""
-        return bool(self._waiters)
-
-    @property
-    def waiting(self) -> bool:
-        """True if a task waits for the next item."""
-        return any(not waiter.done() for waiter in self._waiters)
-
-    def deliver(self, items: Sequence[T]) -> None:
-        """Append items and wake the waiting tasks."""
-        self._items.extend(items)
-        for waiter in self._waiters:
-            if not waiter.done():
-                waiter.set_result(None)
-
-    async def get(self) -> T:
-        """Remove and return the oldest item; wait for one if there is none. Cancelling it loses no item."""
-        self.refill()
-        while not self._items:
-            waiter = asyncio.get_running_loop().create_future()
-            self._waiters.append(waiter)
-            try:
-                self.refill()  # again: an item that came before the waiter was visible woke no task
-                await waiter
-            finally:
-                self._waiters.remove(waiter)
-        return self._items.popleft()
-
-    def drain(self) -> list[T]:
-        """Remove and return all items, oldest first, without waiting."""
-        self.refill()
-        items = list(self._items)
-        self._items.clear()
-        return items
 
 
 class Radio:
@@ -312,9 +237,9 @@ class Node:
         none (not finite, not symmetric, or not positive semidefinite), for a name that is none or that vnet's
         own columns have, and for a text under a name that this node has reported numbers by, or the reverse.
         """
-        estimate = None if estimate_m is None else _floats("estimate_m", estimate_m, 2)
-        covariance = None if covariance_m2 is None else _covariance("covariance_m2", covariance_m2)
-        named = {name: _value(name, value) for name, value in values.items()}
+        estimate = None if estimate_m is None else checked_numbers("estimate_m", estimate_m, 2)
+        covariance = None if covariance_m2 is None else checked_covariance("covariance_m2", covariance_m2)
+        named = {name: checked_value(name, value) for name, value in values.items()}
         for name, kept in named.items():
             self._check_kind(name, kept)
         self._transport.send_report(
@@ -333,7 +258,7 @@ class Node:
         """Raise ValueError for a name that no value can have, and for a text where numbers were, or the reverse."""
         is_text = isinstance(value, str)
         if name not in self._is_text:
-            _check_name(name)
+            check_name(name)
             self._is_text[name] = is_text
         elif self._is_text[name] != is_text:
             before, now = ("a text", "a number") if self._is_text[name] else ("a number", "a text")
@@ -359,7 +284,7 @@ class Node:
         """
         if not isinstance(name, str) or not name:
             raise ValueError(f"event({name!r}): a name is expected")
-        values = {key: _detail(key, value) for key, value in details.items()}
+        values = {key: checked_detail(key, value) for key, value in details.items()}
         self._transport.send_note(self.id, "event", "info", name, values)
 
 
@@ -380,71 +305,3 @@ class _Disconnected:
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         pass
-
-
-def _detail(name: str, value: object) -> NoteDetail:
-    """A detail of an event as plain Python; numbers of numpy are taken, and what is not finite becomes a text."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if not isinstance(value, (bool, int, float, str)):
-        raise ValueError(f"event({name}={value!r}): a number, a boolean or a text is expected")
-    if isinstance(value, float) and not math.isfinite(value):
-        return str(value)
-    if isinstance(value, int) and abs(value) >= 2**63:
-        return str(value)
-    return value
-
-
-def _floats(name: str, value: ArrayLike, size: int | None = None) -> list[float]:
-    try:
-        flat: list[float] = np.asarray(value, dtype=float).ravel().tolist()
-    except OverflowError:
-        raise ValueError(
-            f"report({name}={shown(value)}): a number within ±{sys.float_info.max:.2g} is expected"
-        ) from None
-    except (TypeError, ValueError):
-        raise ValueError(f"report({name}={shown(value)}): numbers are expected") from None
-    if size is not None and len(flat) != size:
-        raise ValueError(f"report({name}=…): {len(flat)} numbers given, {size} expected")
-    return flat
-
-
-def _covariance(name: str, value: ArrayLike) -> list[float]:
-    """Return a covariance matrix (2, 2) in row-major order; errors of rounding are allowed."""
-    flat = _floats(name, value, 4)
-    (a, b, c, d), margin = flat, COVARIANCE_TOLERANCE * max(map(abs, flat))
-    if not all(map(math.isfinite, flat)):
-        reason = "not finite"
-    elif abs(b - c) > margin:
-        reason = "not symmetric"
-    elif min(a, d) < -margin or a * d - b * c < -margin * max(map(abs, flat)):
-        reason = "not positive semidefinite"
-    else:
-        return flat
-    raise ValueError(f"report({name}=[[{a:g}, {b:g}], [{c:g}, {d:g}]]): {reason}, so no covariance")
-
-
-def _check_name(name: str) -> None:
-    if name in RESERVED_NAMES:
-        taken = ", ".join(sorted(RESERVED_NAMES))
-        raise ValueError(f"report({name}=…): this name is taken by vnet; so are {taken}")
-    if not name.partition(".")[0].isidentifier():
-        allowed = "a Python identifier is expected, with a dot and any text behind it if need be"
-        raise ValueError(f"report(**{{{name!r}: …}}): not a name of a value; {allowed}")
-
-
-def _value(name: str, value: ArrayLike) -> Value:
-    if name == "common_error_covariance_m2":
-        return _covariance(name, value)
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, str):
-        if len(value) > LONGEST_TEXT:
-            raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
-        return str(value)
-    if type(value) is float:
-        return value
-    if type(value) is int and abs(value) < LARGEST_EXACT:
-        return float(value)
-    flat = _floats(name, value)
-    return flat[0] if np.ndim(value) == 0 else flat

@@ -33,7 +33,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.world import Instant, World, components
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.transport import wire
 from vnet.units import NS_PER_S
 

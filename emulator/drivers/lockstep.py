@@ -25,7 +25,8 @@ from msgspec.structs import replace
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
 from emulator.radio.stages import least_latency_ns
-from vnet.node import INBOX_LIMIT, Fix, Packet
+from vnet.mailbox import INBOX_LIMIT
+from vnet.node import Fix, Packet
 from vnet.runtime.mail import Mail
 from vnet.transport import wire
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.types import Array
 
 WEIGHT = "weight."

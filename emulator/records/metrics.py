@@ -21,7 +21,7 @@ from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figu
 from emulator.records.reported import ValueColumns, figures_among
 from emulator.records.states import COMMON_VALUES, STATES
 from emulator.world.world import Instant
-from vnet.node import Report, Value
+from vnet.reports import Report, Value
 
 ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""

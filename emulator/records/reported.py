@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from emulator.records.beliefs import WEIGHT
 from emulator.records.states import TAKEN
-from vnet.node import Value
+from vnet.reports import Value
 from vnet.types import Array
 from vnet.units import title_of, unit_of
 

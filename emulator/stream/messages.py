@@ -25,7 +25,7 @@ from emulator.records.reported import MOST_DOTTED, figures_among, is_weight
 from emulator.records.run_folder import Event
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, components
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.types import Array
 
 LATENCY_BIN_NS = 2_000_000

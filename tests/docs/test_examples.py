@@ -15,7 +15,7 @@ from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.node import Report
+from vnet.reports import Report
 
 WARNING = {"kind": "hazard", "event": "v01/1", "position_m": [1.0, 2.0], "since_ns": 0, "hops": 0}
 

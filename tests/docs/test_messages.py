@@ -22,7 +22,7 @@ from tests.docs.layouts import Field, Layouts, split
 from tests.support.paths import ROOT
 from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times
 from vnet.errors import WireError
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.transport import keys, wire
 from vnet.transport.orders import Deviation, Order
 

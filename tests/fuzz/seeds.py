@@ -12,7 +12,7 @@ from agents.cooperative import information_frame
 from emulator.drivers.hosts import messages
 from emulator.scenario.faults import KINDS
 from tests.support import maps
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.transport import wire
 
 OVERRIDE = b"\n--set "

@@ -7,7 +7,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from vnet.node import Mailbox, Node, Packet
+from vnet.mailbox import Mailbox
+from vnet.node import Node, Packet
 from vnet.runtime.mail import Mail
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.ready_queue import OrderedQueue

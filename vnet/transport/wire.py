@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 
 from vnet.errors import WireError, printable
-from vnet.node import Fix, Packet, Report
+from vnet.node import Fix, Packet
+from vnet.reports import Report
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
 
 VERSION = 2

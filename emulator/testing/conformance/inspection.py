@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 
 from emulator.testing.conformance.findings import Findings
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.transport import wire
 
 OF_TRAFFIC = ("own_node", "payload", "numbers", "report_time")

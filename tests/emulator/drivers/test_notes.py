@@ -16,7 +16,8 @@ from emulator.records.states import COMMON_VALUES, STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
-from vnet.node import RESERVED_NAMES, Node
+from vnet.node import Node
+from vnet.reports import RESERVED_NAMES
 
 logger = logging.getLogger("my.program")
 

@@ -11,7 +11,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_together, scenario_of
 from vnet import Node
-from vnet.node import Report
+from vnet.reports import Report
 from vnet.transport import wire
 
 pytestmark = pytest.mark.slow

@@ -13,7 +13,7 @@ from emulator.records.metrics import Metrics, summarize
 from emulator.records.period_figures import PeriodFigures
 from emulator.stream.messages import beliefs_of, pack
 from emulator.world.world import Instant
-from vnet.node import Report, Value
+from vnet.reports import Report, Value
 
 Values = dict[str, Value]
 POSITION_M = np.array([[0.0, 0.0], [10.0, 0.0]])

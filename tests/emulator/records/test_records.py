@@ -21,7 +21,7 @@ from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import Instant, build_world
 from vnet.errors import VnetError
-from vnet.node import Report
+from vnet.reports import Report
 
 
 def beacons(folder: Path, **radio: float) -> RecordedRun:

@@ -18,7 +18,7 @@ from emulator.records.reported import (
     value_columns,
 )
 from emulator.world.world import Instant
-from vnet.node import Report, Value
+from vnet.reports import Report, Value
 
 NODES = ["a", "b"]
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vnet.errors import WireError
-from vnet.node import Fix, Report
+from vnet.node import Fix
+from vnet.reports import Report
 from vnet.transport import wire
 from vnet.transport.orders import Deviation
 

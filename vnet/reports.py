@@ -1,0 +1,109 @@
+"""What a program reports: its estimates, values of its own and details of events, and which of them are allowed."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import ArrayLike
+
+from vnet.errors import shown
+
+LONGEST_TEXT = 64
+"""Characters of a reported text: it names a state, and is no log."""
+Value = bool | float | Annotated[str, Meta(max_length=LONGEST_TEXT)] | list[float]
+"""A reported value besides the estimates."""
+
+RESERVED_NAMES = frozenset(
+    ["period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_estimate_m", "values"]
+)
+"""Names that no reported value can have: columns that the emulator fills in every row of a run's states."""
+COVARIANCE_TOLERANCE = 1e-6
+"""Asymmetry and negative eigenvalues of a covariance, relative to its largest element, that rounding may cause."""
+LARGEST_EXACT = 2**53
+"""Integers below it are numbers of double precision."""
+NoteDetail = bool | int | float | str
+"""Value of a detail of an event."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A program's estimates at one time; see `Node.report`."""
+
+    time_ns: int
+    node: str
+    estimate_m: tuple[float, float] | None
+    covariance_m2: tuple[float, float, float, float] | None
+    values: dict[str, Value] = field(default_factory=dict)
+
+
+def checked_detail(name: str, value: object) -> NoteDetail:
+    """A detail of an event as plain Python; numbers of numpy are taken, and what is not finite becomes a text."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if not isinstance(value, (bool, int, float, str)):
+        raise ValueError(f"event({name}={value!r}): a number, a boolean or a text is expected")
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, int) and abs(value) >= 2**63:
+        return str(value)
+    return value
+
+
+def checked_numbers(name: str, value: ArrayLike, size: int | None = None) -> list[float]:
+    try:
+        flat: list[float] = np.asarray(value, dtype=float).ravel().tolist()
+    except OverflowError:
+        raise ValueError(
+            f"report({name}={shown(value)}): a number within ±{sys.float_info.max:.2g} is expected"
+        ) from None
+    except (TypeError, ValueError):
+        raise ValueError(f"report({name}={shown(value)}): numbers are expected") from None
+    if size is not None and len(flat) != size:
+        raise ValueError(f"report({name}=…): {len(flat)} numbers given, {size} expected")
+    return flat
+
+
+def checked_covariance(name: str, value: ArrayLike) -> list[float]:
+    """Return a covariance matrix (2, 2) in row-major order; errors of rounding are allowed."""
+    flat = checked_numbers(name, value, 4)
+    (a, b, c, d), margin = flat, COVARIANCE_TOLERANCE * max(map(abs, flat))
+    if not all(map(math.isfinite, flat)):
+        reason = "not finite"
+    elif abs(b - c) > margin:
+        reason = "not symmetric"
+    elif min(a, d) < -margin or a * d - b * c < -margin * max(map(abs, flat)):
+        reason = "not positive semidefinite"
+    else:
+        return flat
+    raise ValueError(f"report({name}=[[{a:g}, {b:g}], [{c:g}, {d:g}]]): {reason}, so no covariance")
+
+
+def check_name(name: str) -> None:
+    if name in RESERVED_NAMES:
+        taken = ", ".join(sorted(RESERVED_NAMES))
+        raise ValueError(f"report({name}=…): this name is taken by vnet; so are {taken}")
+    if not name.partition(".")[0].isidentifier():
+        allowed = "a Python identifier is expected, with a dot and any text behind it if need be"
+        raise ValueError(f"report(**{{{name!r}: …}}): not a name of a value; {allowed}")
+
+
+def checked_value(name: str, value: ArrayLike) -> Value:
+    if name == "common_error_covariance_m2":
+        return checked_covariance(name, value)
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, str):
+        if len(value) > LONGEST_TEXT:
+            raise ValueError(f"report({name}=…): text of {len(value)} characters, at most {LONGEST_TEXT} allowed")
+        return str(value)
+    if type(value) is float:
+        return value
+    if type(value) is int and abs(value) < LARGEST_EXACT:
+        return float(value)
+    flat = checked_numbers(name, value)
+    return flat[0] if np.ndim(value) == 0 else flat
