@@ -1,4 +1,4 @@
-"""What a program reports: its estimates, values of its own and details of events, and which of them are allowed."""
+"""Reports: estimates, values and details of events that a program gives, and which of them are allowed."""
 
 from __future__ import annotations
 
