@@ -7,6 +7,8 @@ import inspect
 import re
 from collections.abc import Iterator
 
+import msgspec
+
 import vnet
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
@@ -68,8 +70,8 @@ def _part(title: str, thing: type) -> Iterator[str]:
     said, _, attributes = docstring(thing).partition("\nAttributes:\n")
     yield said
     yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
-    if dataclasses.is_dataclass(thing):
-        rows = ([f"`{each.name}`", _plain(each.type), unit_of(each.name)] for each in dataclasses.fields(thing))
+    if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct):
+        rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in thing.__annotations__.items())
         yield table(["attribute", "type", "unit"], rows)
     for name, member in _members(thing):
         yield f"**`{name}`**: {docstring(member)}"

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from agents.cooperative.admission import FORGET_PERIODS, MAX_SENDERS, Admission
 from agents.cooperative.attack import Attack
@@ -227,7 +228,7 @@ def test_ghosts_are_copies() -> None:
 
     def ghosts(packet: Packet) -> list[Packet]:
         own = replace(decode(packet.payload), name=short_name("v3~2"))
-        return [replace(packet, sender="v3~1"), replace(packet, sender="v3~2", payload=encode(own))]
+        return [structs.replace(packet, sender="v3~1"), structs.replace(packet, sender="v3~2", payload=encode(own))]
 
     town.air = lambda period, packets: again(period, packets, ghosts)
     town.run(20)
@@ -243,7 +244,7 @@ def test_corrupt_frames_are_no_frames() -> None:
     def corrupt(period: int, packets: list[Packet]) -> list[Packet]:
         broken = bytearray(packets[3].payload)
         broken[rng.integers(len(broken))] ^= 1 << rng.integers(8)
-        return [*packets[:3], replace(packets[3], payload=bytes(broken)), *packets[4:]]
+        return [*packets[:3], structs.replace(packets[3], payload=bytes(broken)), *packets[4:]]
 
     town.air = corrupt
     town.run(30)
