@@ -50,13 +50,15 @@ class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
 
     The covariance is that of the receiver's own noise, without the common error of all receivers. A receiver has no
-    heading where the scenario says so, for example while the vehicle stands.
+    heading where the scenario says so, for example while the vehicle stands. `speed_m_s` is the vehicle's own speed
+    as its receiver measures it, with noise; None if the emulator does not tell it.
     """
 
     time_ns: int
     position_m: Array
     covariance_m2: Array
     heading_rad: float | None
+    speed_m_s: float | None = None
 
 
 class NodeTransport(Protocol):

@@ -67,6 +67,8 @@ class Gnss(Section):
     the vehicle's speed it adds to the heading's deviation, up to π."""
     heading_min_speed_mps: float = Field(0.0, ge=0, le=FAR_M)
     """Fixes of slower vehicles have no heading. Vehicles of a network of straight lanes stand."""
+    speed_sigma_mps: float = Field(0.1, ge=0, le=FAR_M)
+    """Standard deviation of the speed that fixes tell: by default that of Doppler measurements under open sky."""
 
 
 class Lateral(Section):

@@ -1,4 +1,4 @@
-"""GNSS receivers: the error of each vehicle's fixes beyond the common one, and the headings that they know."""
+"""GNSS receivers: each vehicle's errors beyond the common one, and the headings and speeds that it is told."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from vnet.units import NS_PER_S
 M_PER_KM = 1000.0
 SLOWEST_MPS = 1e-9
 """Speed of a vehicle that stands, as a divisor."""
+EVERY = slice(None)
+"""All periods."""
 
 
 def noise_m(scenario: Scenario, periods: int, count: int) -> Array:
@@ -61,23 +63,42 @@ def _outliers_m(scenario: Scenario, periods: int, count: int) -> Array:
     return np.stack([away_m * np.cos(angle), away_m * np.sin(angle)], axis=-1)
 
 
-def heading_of_fixes_rad(scenario: Scenario, position_m: Array, heading_rad: Array, moves: bool) -> Array:
-    """Return the headings (K, N) of fixes in radians, [0, 2π); NaN for a fix without one."""
-    gnss, (periods, count) = scenario.world.gnss, heading_rad.shape
-    if not gnss.heading:
-        return np.full((periods, count), np.nan)
-    seed = scenario.run.seed
-    normal = np.stack([stream(seed, "heading", n).standard_normal(periods) for n in range(count)], axis=1)
-    sigma_rad: Array | float = gnss.heading_sigma_rad
-    depends_on_speed = bool(gnss.heading_speed_sigma_mps or gnss.heading_min_speed_mps)
-    speed = speed_mps(position_m, scenario.period_ns, moves) if depends_on_speed else None
-    if speed is not None and gnss.heading_speed_sigma_mps:
-        by_speed = gnss.heading_speed_sigma_mps / np.maximum(speed, SLOWEST_MPS)
-        sigma_rad = np.minimum(np.hypot(sigma_rad, by_speed), math.pi)
-    heading = np.mod(heading_rad + sigma_rad * normal, 2 * np.pi)
-    if speed is not None:
-        heading[speed < gnss.heading_min_speed_mps] = np.nan
-    return np.asarray(heading)
+class MotionSensors:
+    """Headings and speeds as receivers tell them: the truth with noise that is drawn in advance.
+
+    `rows` are the periods of the truth that is given: all at once, or one after the other as vehicles drive.
+    """
+
+    def __init__(self, scenario: Scenario, periods: int, count: int) -> None:
+        self._gnss, seed = scenario.world.gnss, scenario.run.seed
+
+        def normal(name: str, is_needed: bool) -> Array | None:
+            if not is_needed:
+                return None
+            return np.stack([stream(seed, name, n).standard_normal(periods) for n in range(count)], axis=1)
+
+        self._heading_normal = normal("heading", self._gnss.heading)
+        self._speed_normal = normal("speed", self._gnss.speed_sigma_mps > 0)
+
+    def heading_rad(self, heading_rad: Array, speed: Array, rows: slice = EVERY) -> Array:
+        """Return the headings (k, N) of fixes in radians, [0, 2π); NaN for a fix without one."""
+        gnss = self._gnss
+        if self._heading_normal is None:
+            return np.full(heading_rad.shape, np.nan)
+        sigma_rad: Array | float = gnss.heading_sigma_rad
+        if gnss.heading_speed_sigma_mps:
+            by_speed = gnss.heading_speed_sigma_mps / np.maximum(speed, SLOWEST_MPS)
+            sigma_rad = np.minimum(np.hypot(sigma_rad, by_speed), math.pi)
+        heading = np.mod(heading_rad + sigma_rad * self._heading_normal[rows], 2 * np.pi)
+        if gnss.heading_min_speed_mps:
+            heading[speed < gnss.heading_min_speed_mps] = np.nan
+        return np.asarray(heading)
+
+    def speed_mps(self, speed: Array, rows: slice = EVERY) -> Array:
+        """Return the speeds (k, N) of fixes in m/s, which are never negative; NaN for an absent vehicle."""
+        if self._speed_normal is None:
+            return speed
+        return np.asarray(np.abs(speed + self._gnss.speed_sigma_mps * self._speed_normal[rows]))
 
 
 def speed_mps(position_m: Array, period_ns: int, moves: bool) -> Array:

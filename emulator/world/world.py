@@ -24,7 +24,7 @@ from emulator.world.lateral import lateral_offsets_m
 from emulator.world.links import load_links
 from emulator.world.neighbours import Links, links_within
 from emulator.world.networks import Network, generate_network, load_network
-from emulator.world.receivers import further_error_m, heading_of_fixes_rad, noise_m
+from emulator.world.receivers import MotionSensors, further_error_m, noise_m, speed_mps
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
 from vnet.node import Fix
@@ -93,7 +93,12 @@ class World:
         if further_m is not None:
             self._noise_m += further_m
         self._fix_m = self.course_m[: self.periods] + self._common_m[: self.periods, None] + self._noise_m
-        self._fix_heading_rad = heading_of_fixes_rad(scenario, self.course_m, self._heading_rad, self.moves)
+        sensors, speed = (
+            MotionSensors(scenario, self.periods, count),
+            speed_mps(self.course_m, self.period_ns, self.moves),
+        )
+        self._fix_heading_rad = sensors.heading_rad(self._heading_rad, speed)
+        self._fix_speed_mps = sensors.speed_mps(speed)
 
     def present(self, period: int) -> NDArray[np.bool_]:
         """Return the mask (N,) of the vehicles that are present in `period`."""
@@ -137,7 +142,13 @@ class World:
         heading_rad: float = self._fix_heading_rad[period, node].item()
         # Copies: a program may do with its fix what it likes.
         fix_m, covariance_m2 = self._fix_m[period, node].copy(), self._covariance_m2.copy()
-        return Fix(period * self.period_ns, fix_m, covariance_m2, None if math.isnan(heading_rad) else heading_rad)
+        return Fix(
+            period * self.period_ns,
+            fix_m,
+            covariance_m2,
+            None if math.isnan(heading_rad) else heading_rad,
+            self._fix_speed_mps[period, node].item(),
+        )
 
 
 def _stated_variance_m2(gnss: Gnss) -> float:

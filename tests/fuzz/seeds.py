@@ -46,7 +46,7 @@ TRAFFIC = wire.Traffic(
     [wire.Note("v01", 5, "event", "info", "turned", {"left": True, "n": 1})],
 )
 PACKET = wire.WirePacket("v01", "v02", 5, 6, b"payload")
-FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5)
+FIX = wire.WireFix("v01", 5, (1.0, 2.0), (1.0, 0.0, 0.0, 1.0), 0.5, 13.9)
 TX: tuple[wire.AgentMessage, ...] = (
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", True, None, 2),
     wire.Hello("v01", "v01", b"n" * 16, 1, "host", False, "cannot import", 2),

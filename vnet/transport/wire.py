@@ -61,18 +61,19 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
     position_m: tuple[float, float]
     covariance_m2: tuple[float, float, float, float]
     heading_rad: float | None
+    speed_m_s: float | None = None
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:
         """Return the fix in its form on the wire."""
         x, y = fix.position_m.tolist()
         a, b, c, d = fix.covariance_m2.ravel().tolist()
-        return cls(node, fix.time_ns, (x, y), (a, b, c, d), fix.heading_rad)
+        return cls(node, fix.time_ns, (x, y), (a, b, c, d), fix.heading_rad, fix.speed_m_s)
 
     def fix(self) -> Fix:
         """Return the fix as the program sees it."""
         covariance = np.array(self.covariance_m2).reshape(2, 2)
-        return Fix(self.time_ns, np.array(self.position_m), covariance, self.heading_rad)
+        return Fix(self.time_ns, np.array(self.position_m), covariance, self.heading_rad, self.speed_m_s)
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):

@@ -183,3 +183,30 @@ def test_a_gradient_is_zero_in_the_middle_and_grows_with_the_distance() -> None:
 
 def test_without_them_fixes_are_as_before() -> None:
     assert np.array_equal(errors_m(world_of({})), errors_m(world_of({"multipath_tau_s": 5.0, "outlier_m": 9.0})))
+
+
+def test_fixes_tell_the_speed_with_its_noise(tmp_path: Path) -> None:
+    rows = [f"{time_s},v1,{20.0 * time_s},0" for time_s in range(101)]
+    trips = tmp_path / "trips.csv"
+    trips.write_text("\n".join(["time_s,id,x_m,y_m", *rows]))
+
+    def speeds(**gnss: float) -> Array:
+        network = {"kind": "trips", "path": trips}
+        world = world_of({"sigma_m": 0.0, **gnss}, 100.0, network=network)
+        told = [world.fix(period, 0).speed_m_s for period in range(world.periods - 1)]
+        return np.array(told, dtype=float)
+
+    assert_allclose(speeds(speed_sigma_mps=0.0), 20.0, rtol=1e-9)
+    error = speeds() - 20.0
+    assert error.std() == pytest.approx(0.1, rel=0.1)
+    assert abs(error.mean()) < 0.02
+    assert_allclose(speeds(speed_sigma_mps=0.2) - 20.0, 2 * error, atol=1e-9)
+
+
+def test_standing_vehicles_have_a_speed_without_sign_and_other_draws_stay() -> None:
+    world, other = world_of({}), world_of({"speed_sigma_mps": 5.0})
+    speed = np.array([world.fix(period, 3).speed_m_s for period in range(100)], dtype=float)
+    assert 0 <= speed.min() < speed.max() < 0.6
+    fix, same = world.fix(7, 3), other.fix(7, 3)
+    assert np.array_equal(fix.position_m, same.position_m)
+    assert fix.heading_rad == same.heading_rad

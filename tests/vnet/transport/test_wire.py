@@ -172,10 +172,11 @@ def test_what_an_error_quotes_is_one_short_line() -> None:
 
 
 def test_a_fix_survives_the_wire_bit_by_bit() -> None:
-    fix = Fix(5, np.array([0.1, -1e9 / 3]), np.array([[1.0, 0.1], [0.1, 2.0]]), 0.3)
+    fix = Fix(5, np.array([0.1, -1e9 / 3]), np.array([[1.0, 0.1], [0.1, 2.0]]), 0.3, 0.1 + 0.2)
     again = wire.WireFix.of("v1", fix).fix()
     assert again.time_ns == 5
     assert again.heading_rad == 0.3
+    assert again.speed_m_s == fix.speed_m_s
     assert np.array_equal(again.position_m, fix.position_m)
     assert np.array_equal(again.covariance_m2, fix.covariance_m2)
 
