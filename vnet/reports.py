@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, Struct
 from numpy.typing import ArrayLike
 
 from vnet.errors import shown
@@ -30,15 +29,14 @@ NoteDetail = bool | int | float | str
 """Value of a detail of an event."""
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True, gc=False):
     """A program's estimates at one time; see `Node.report`."""
 
     time_ns: int
     node: str
     estimate_m: tuple[float, float] | None
     covariance_m2: tuple[float, float, float, float] | None
-    values: dict[str, Value] = field(default_factory=dict)
+    values: dict[str, Value] = {}
 
 
 def checked_detail(name: str, value: object) -> NoteDetail:
@@ -71,12 +69,14 @@ def checked_numbers(name: str, value: ArrayLike, size: int | None = None) -> lis
 def checked_covariance(name: str, value: ArrayLike) -> list[float]:
     """Return a covariance matrix (2, 2) in row-major order; errors of rounding are allowed."""
     flat = checked_numbers(name, value, 4)
-    (a, b, c, d), margin = flat, COVARIANCE_TOLERANCE * max(map(abs, flat))
-    if not all(map(math.isfinite, flat)):
+    a, b, c, d = flat
+    largest = max(abs(a), abs(b), abs(c), abs(d))
+    margin = COVARIANCE_TOLERANCE * largest
+    if not math.isfinite(a + b + c + d) and not all(map(math.isfinite, flat)):
         reason = "not finite"
     elif abs(b - c) > margin:
         reason = "not symmetric"
-    elif min(a, d) < -margin or a * d - b * c < -margin * max(map(abs, flat)):
+    elif a < -margin or d < -margin or a * d - b * c < -margin * largest:
         reason = "not positive semidefinite"
     else:
         return flat
