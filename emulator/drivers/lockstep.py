@@ -277,12 +277,11 @@ class Lockstep:
                 del process.packets[node][:-INBOX_LIMIT]
         self._crowded.clear()
         node_ids = self._emulation.world.node_ids
-        inboxes: dict[int, list[Packet]] = {}
-        for receiver, sender, sent_ns, arrival_ns, payload in self._emulation.engine.foresee(time_ns).entries():
-            if (inbox := inboxes.get(receiver)) is None:
-                inbox = inboxes[receiver] = self._inbox(node_ids[receiver])
-            inbox.append(Packet(sender, sent_ns, arrival_ns, payload))
-        self._crowded.update(node_ids[node] for node, inbox in inboxes.items() if len(inbox) > INBOX_LIMIT)
+        for receiver, packets in self._emulation.engine.foresee(time_ns).by_receiver():
+            inbox = self._inbox(node_ids[receiver])
+            inbox += packets
+            if len(inbox) > INBOX_LIMIT:
+                self._crowded.add(node_ids[receiver])
 
     def _inbox(self, node: str) -> list[Packet]:
         """Return the packets that a node has yet to be granted."""

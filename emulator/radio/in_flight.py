@@ -6,6 +6,7 @@ program takes a packet.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import overload
@@ -66,16 +67,24 @@ class Deliveries(Sequence[Delivery]):
             self._built = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
         return self._built
 
-    def entries(self) -> Iterator[tuple[int, str, int, int, bytes]]:
-        """Yield receiver, sender's name, times of sending and arrival in ns, and payload of each, as it stands.
+    def by_receiver(self) -> Iterator[tuple[int, list[Packet]]]:
+        """Yield each receiver's number and its packets, as they stand: by receiver, and in their order for each.
 
-        No object is kept of them, which is what takes time where there are many.
+        Nothing is kept of them, which is what takes time where there are many.
         """
-        frames = self._frames
-        for arrival_ns, receiver, _, number in zip(*self._table[:, self._order()].tolist(), strict=True):
-            frame = frames[number]
-            payload = frame.altered.get(receiver, frame.payload) if frame.altered else frame.payload
-            yield receiver, frame.name, frame.sent_ns, arrival_ns, payload
+        table = self._table[:, self._order()]
+        arrivals_ns, receivers, _, numbers = table[:, np.argsort(table[_RECEIVER], kind="stable")].tolist()
+        frames = [self._frames[number] for number in numbers]
+        packets = [
+            Packet(frame.name, frame.sent_ns, arrival_ns, frame.altered.get(receiver, frame.payload))
+            if frame.altered
+            else Packet(frame.name, frame.sent_ns, arrival_ns, frame.payload)
+            for frame, arrival_ns, receiver in zip(frames, arrivals_ns, receivers, strict=True)
+        ]
+        first = 0
+        for receiver, count in Counter(receivers).items():
+            yield receiver, packets[first : first + count]
+            first += count
 
     def _order(self) -> NDArray[np.intp]:
         order = np.argsort(self._table[_ARRIVAL], kind="stable")
