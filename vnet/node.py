@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
+from vnet.driving import Action, checked_action
 from vnet.errors import PayloadTooLargeError, shown
 from vnet.mailbox import Mailbox
 from vnet.reports import (
@@ -51,7 +52,9 @@ class Fix:
 
     The covariance is that of the receiver's own noise, without the common error of all receivers. A receiver has no
     heading where the scenario says so, for example while the vehicle stands. `speed_m_s` is the vehicle's own speed
-    as its receiver measures it, with noise; None if the emulator does not tell it.
+    as its receiver measures it, with noise; None if the emulator does not tell it. Where `[world.ranging]` says
+    so, driven vehicles measure at the same instant `gap_m`, the clear distance to the vehicle ahead in their lane,
+    and its rate of change `gap_rate_m_s`, negative while it closes; None where nobody is ahead in range.
     """
 
     time_ns: int
@@ -59,6 +62,8 @@ class Fix:
     covariance_m2: Array
     heading_rad: float | None
     speed_m_s: float | None = None
+    gap_m: float | None = None
+    gap_rate_m_s: float | None = None
 
 
 class NodeTransport(Protocol):
@@ -78,6 +83,10 @@ class NodeTransport(Protocol):
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         """Send a line of the log (kind "log"), or an event named `text` (kind "event")."""
+        ...
+
+    def send_action(self, action: Action) -> None:
+        """Send what the program asks its vehicle to do."""
         ...
 
 
@@ -158,6 +167,7 @@ class Node:
             source of randomness that is reproducible.
         options: the scenario's `[program.options]`.
         period_ns: time between two fixes in nanoseconds.
+        control_ns: time between two control instants in nanoseconds; 0 where programs do not drive.
         incarnation: number of restarts of the program so far.
     """
 
@@ -172,6 +182,7 @@ class Node:
         period_ns: int,
         max_payload: int,
         incarnation: int = 0,
+        control_ns: int = 0,
         disk: Callable[[], Path] | None = None,
     ) -> None:
         self._is_text: dict[str, bool] = {}  # by the name of each reported value
@@ -183,6 +194,7 @@ class Node:
         self.options = options
         self.period_ns = period_ns
         self.incarnation = incarnation
+        self.control_ns = control_ns
         self._transport = transport
         self._disk = disk
 
@@ -203,6 +215,16 @@ class Node:
         if self._disk is None:
             raise OSError(f"{self.id}: this node has no disk")
         return self._disk()
+
+    def drive(self, acceleration_m_s2: float | None = None, lane: int = 0) -> None:
+        """Ask the vehicle for an acceleration, and with `lane` 1 or -1 for a change to the left or right lane.
+
+        It holds from the first control instant that is not before the present one (there is one every `control_ns`)
+        until another is asked for, or 0 once the program has ended. The vehicle follows with the lag of its
+        actuators. What it cannot do is limited, with an event `drive_limited`. Raise ValueError for what is no
+        number, for another `lane`, and unless the scenario has `[network] kind = "driven"`.
+        """
+        self._transport.send_action(checked_action(self.id, self.control_ns > 0, acceleration_m_s2, lane))
 
     def disconnect(self) -> None:
         """Disconnect the rest of the program from the world, after the vehicle's process has ended."""
@@ -294,4 +316,7 @@ class _Disconnected:
         pass
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
+        pass
+
+    def send_action(self, action: Action) -> None:
         pass

@@ -12,12 +12,14 @@ from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
+from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import ARRAYS
 from emulator.records.reported import MOST_COLUMNS
 from emulator.records.states import STATES
+from emulator.world.driven.vehicles import Log
 from vnet.units import unit_of
 
 INTRODUCTION = """
@@ -34,6 +36,7 @@ FOLDER = {
     "trace.parquet": "[a row for each frame and receiver in range](#traceparquet)",
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
+    "driven.parquet": "[a row for each control instant and vehicle](#drivenparquet), where programs drive",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
     "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
@@ -109,6 +112,15 @@ BUSY = {
     "node": "id of the vehicle",
     "busy_ratio": "the share of them in which it sent, or sensed `radio.mac.carrier_sense_dbm` or more",
 }
+DRIVEN = {
+    "time_ns": "the control instant",
+    "node": "id of the vehicle",
+    "along_m": "truth: position of its centre along the road; on a ring it goes on counting. NaN once it has left",
+    "left_m": "truth: its distance to the left of the rightmost lane's centre",
+    "speed_m_s": "truth: its speed",
+    "acceleration_m_s2": "truth: its acceleration",
+    "command_m_s2": "the acceleration that it was told from this instant on, within its limits",
+}
 STATE = {
     "period": "counts from 0",
     "time_ns": "start of the period",
@@ -167,6 +179,12 @@ EVENTS = {
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
     "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
     "left": ("vehicle", "", "it is not in the network any more"),
+    "drive_limited": (
+        "vehicle",
+        "`acceleration_m_s2`, `limit_m_s2` or `lane`, `reason`",
+        "`node.drive` asked for what the vehicle cannot do; of an acceleration the first time in a row",
+    ),
+    "collision": ("vehicle", "`with`, `closing_m_s`", "a driven vehicle has run into another, which was ahead"),
     "rule_failed": (
         "",
         "`fault`, `rule`, `sender`, `error`, `where`",
@@ -212,6 +230,7 @@ VERDICT = {
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
     "figures": "means of some metrics, after the first fifth of the run",
+    "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
     "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
@@ -239,6 +258,7 @@ def page() -> str:
     parts += ["## `states.parquet`", columns(STATES, STATE), STATES_ABOUT]
     parts += ["## `payloads.parquet`", "No hash depends on it.", columns(PAYLOADS, PAYLOAD)]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
+    parts += ["## `driven.parquet`", columns(driven_table(Log(), ["v01"]).schema, DRIVEN)]
     parts += [
         "## `metrics.parquet`",
         docstring(PeriodFigures),

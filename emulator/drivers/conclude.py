@@ -25,6 +25,7 @@ from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
 from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
+from emulator.records.driven_table import driving_figures
 from emulator.records.metrics import summarize
 from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
@@ -33,6 +34,7 @@ from emulator.records.run import Run
 from emulator.records.run_folder import (
     AGAIN,
     BUSY_FILE,
+    DRIVEN_FILE,
     FORMAT,
     METRICS_FILE,
     PAYLOADS_FILE,
@@ -67,6 +69,7 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         emulation.metrics.metrics_table(),
         folder.events,
         busy=_busy(emulation),
+        driven=emulation.driving.table(),
         world=RecordedWorld.of(emulation.world),
     )
 
@@ -114,6 +117,7 @@ def conclude(
         "vehicles": len(emulation.world.node_ids),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
+        "driving": driving_figures(recorded.driven, recorded.events),
         "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
         "cost": asdict(cost),
         "reproduce": reproduce,
@@ -135,6 +139,7 @@ def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
         STATES_FILE: recorded.states,
         METRICS_FILE: recorded.metrics,
         BUSY_FILE: recorded.busy,
+        DRIVEN_FILE: recorded.driven,
     }
     for name, table in tables.items():
         if table is not None:

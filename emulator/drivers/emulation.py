@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.drivers.driving import Driving
 from emulator.drivers.log_book import LogBook
 from emulator.drivers.orders import Orders
 from emulator.drivers.presence import Presence
@@ -105,6 +106,7 @@ class Emulation:
         self._next_change_ns = self._find_next_change_ns()
         self.metrics = Metrics(world.node_ids, self._component(0), world.period_ns)
         self.number = {node: number for number, node in enumerate(world.node_ids)}
+        self.driving = Driving(world, folder, self.number)
         for node, up in self.up.items():
             self.engine.set_up(self.number[node], up)
         self._watchers: list[Callable[[PeriodView], None]] = []
@@ -167,6 +169,7 @@ class Emulation:
             not self.presence.has_ended(node),
             wire.VERSION,
             self.orders.of_node(node, incarnation),
+            self.driving.control_ns,
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -176,6 +179,7 @@ class Emulation:
         """
         if self._finished:
             return
+        self.drive_to(time_ns)
         frames: dict[str, list[bytes]] = {}
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
@@ -188,6 +192,7 @@ class Emulation:
             unhandled.extend(part.unhandled)
             notes.extend(part.notes)
             self.orders.take(part.deviations)
+            self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
         if frames:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
@@ -223,6 +228,18 @@ class Emulation:
         if self.presence.end(node):
             self.folder.event(time_ns, kind, node, **details)
             self.engine.set_up(self.number[node], False)
+            self.driving.release(time_ns, node)
+
+    # Vehicles that programs drive.
+
+    def next_control_ns(self) -> int | None:
+        """Return the next control instant; None where programs do not drive, and after the last."""
+        return self.driving.next_ns
+
+    def drive_to(self, time_ns: int) -> None:
+        """Have vehicles drive to the last control instant until `time_ns`; what they do before has been taken."""
+        if self.driving.advance_to(time_ns):
+            self._next_change_ns = self._find_next_change_ns()
 
     # Faults, and vehicles that enter and leave.
 
@@ -240,6 +257,7 @@ class Emulation:
         Returns what is to be done to processes. The caller has taken all that arrived before `time_ns`. Without
         `starts_at_once` nodes that start are up only when it says that they `come_back`.
         """
+        self.drive_to(time_ns)
         self.close_periods(time_ns)
         self._acted_ns = time_ns
         self._next_change_ns = self._find_next_change_ns()
@@ -251,6 +269,7 @@ class Emulation:
         changes = self.presence.change(self._nodes_under(active, lambda fault: fault.ends), absent)
         for node in changes.stopped:
             self.engine.set_up(self.number[node], False)
+            self.driving.release(time_ns, node)
         for node in changes.left:
             self.folder.event(time_ns, "left", node)
         if starts_at_once:
@@ -356,6 +375,7 @@ class Emulation:
         """End of the run at `time_ns`: close the periods and decide what is still in flight. Only once."""
         if not self._finished:
             self._finished = True
+            self.drive_to(time_ns)
             self.close_periods(time_ns)
             self.engine.drain()
 

@@ -217,7 +217,10 @@ class Lockstep:
         while True:
             next_ns = self._next_instant_ns()
             change_ns = emulation.next_change_ns()
-            if self._hold(next_ns if change_ns is None else min(next_ns, change_ns)):
+            first_ns = next_ns if change_ns is None else min(next_ns, change_ns)
+            if self._drive(first_ns):
+                continue
+            if self._hold(first_ns):
                 return {}
             if change_ns is None or change_ns > next_ns or change_ns >= emulation.duration_ns:
                 break
@@ -228,6 +231,14 @@ class Lockstep:
         self._open_window(next_ns)
         return self._grant(self._wakes_in_window())
 
+    def _drive(self, next_ns: int) -> bool:
+        """Have vehicles drive to a control instant that is not after `next_ns`; returns whether there was one."""
+        control_ns, horizon_ns = self._emulation.next_control_ns(), self.horizon_ns
+        if control_ns is None or control_ns > next_ns or (horizon_ns is not None and control_ns >= horizon_ns):
+            return False
+        self._emulation.drive_to(control_ns)
+        return True
+
     def _next_instant_ns(self) -> int:
         """Return the next instant at which a process has something to do, or the end of the run.
 
@@ -235,9 +246,8 @@ class Lockstep:
         far nobody will but for those whom an arrival wakes.
         """
         emulation = self._emulation
-        stops_ns = (emulation.duration_ns, self._next_planned_ns())
-        next_ns = min(time_ns for time_ns in stops_ns if time_ns is not None)
-        until_ns = [next_ns, emulation.next_change_ns(), self.horizon_ns]
+        next_ns = min(ns for ns in (emulation.duration_ns, self._next_planned_ns()) if ns is not None)
+        until_ns = [next_ns, emulation.next_change_ns(), emulation.next_control_ns(), self.horizon_ns]
         listening = np.flatnonzero(self._listens)
         emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
         if len(listening):
@@ -259,7 +269,8 @@ class Lockstep:
         emulation = self._emulation
         period_ns = emulation.world.period_ns
         ends_ns = [time_ns + self._lookahead_ns, (time_ns // period_ns + 1) * period_ns, emulation.duration_ns]
-        ends_ns += [end_ns for end_ns in (emulation.next_change_ns(), self.horizon_ns) if end_ns is not None]
+        more_ns = emulation.next_change_ns(), emulation.next_control_ns(), self.horizon_ns
+        ends_ns += [end_ns for end_ns in more_ns if end_ns is not None]
         self.now_ns, self._end_ns = time_ns, min(ends_ns)
         self._quiet_ns = min([(time_ns // period_ns + 2) * period_ns, *ends_ns[2:]])
         self._show(self._end_ns - 1)

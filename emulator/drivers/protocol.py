@@ -15,11 +15,14 @@ class ProtocolError(VnetError):
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    kinds = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations)
+    told = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations)
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
-    for node in [part.node for parts in kinds for part in parts] + [*waiting]:
+    for node in [part.node for parts in (*told, traffic.actions) for part in parts] + [*waiting]:
         if node not in own:
             raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")
+    for action in traffic.actions:
+        if not action.is_sound:
+            raise ProtocolError(f"{action.node} asks for an acceleration that is no number")
 
 
 def wire_packet(node: str, packet: Packet) -> wire.WirePacket:

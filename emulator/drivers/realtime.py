@@ -68,6 +68,7 @@ class RealTime:
             self._emulation.engine.next_time(),
             self._emulation.fix_time_ns(self._next_period),
             self._emulation.next_change_ns(),
+            self._emulation.next_control_ns(),
         ]
         due = [time_ns for time_ns in candidates if time_ns is not None]
         return min(due) if due else None
@@ -111,6 +112,7 @@ class RealTime:
 
     def due(self, now_ns: int) -> dict[str, wire.Batch]:
         """Return what has become due by `now_ns`, by process."""
+        self._emulation.drive_to(now_ns)
         while (change_ns := self._emulation.next_change_ns()) is not None and change_ns <= now_ns:
             self._collect(change_ns - 1)
             self._act(change_ns)

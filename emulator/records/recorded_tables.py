@@ -48,6 +48,8 @@ class RecordedTables:
     """busy.parquet, where there is a MAC."""
     world: RecordedWorld | None = None
     """world.npz, where the scenario takes its links from a file."""
+    driven: pa.Table | None = None
+    """driven.parquet, where programs drive."""
 
     # Nodes and where they are.
 

@@ -104,6 +104,14 @@ class Run:
         return self._judged.figures
 
     @property
+    def driving(self) -> dict[str, float | None]:
+        """Figures of driven vehicles by name; empty where programs do not drive.
+
+        Raises VnetError within a check.
+        """
+        return self._judged.driving
+
+    @property
     def reproduce(self) -> str:
         """Command that runs the run again. Raises VnetError within a check."""
         return self._judged.reproduce
@@ -124,6 +132,11 @@ class Run:
     def states(self) -> pa.Table:
         """Table of vehicles: a row for each vehicle and period, with truth, fix and report."""
         return self._recorded.states
+
+    @property
+    def driven(self) -> pa.Table | None:
+        """Table of driven vehicles: a row for each control instant and vehicle; None where no program drives."""
+        return self._recorded.driven
 
     @property
     def metrics(self) -> pa.Table:

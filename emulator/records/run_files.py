@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from emulator.radio.trace import Trace
 from emulator.records.busy import busy_table
+from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
 from emulator.records.payloads import PAYLOADS, KeptPayloads
 from emulator.records.period_figures import PeriodFigures
@@ -27,6 +28,7 @@ from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
     BUSY_FILE,
+    DRIVEN_FILE,
     EVENTS_FILE,
     FORMAT,
     METRICS_FILE,
@@ -44,6 +46,7 @@ from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.recorded import parse_recorded_scenario
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
+from emulator.world.driven.vehicles import Log
 from emulator.world.world import build_world
 from vnet.bounded import read_bounded
 from vnet.errors import ScenarioError, VnetError, printable
@@ -59,6 +62,7 @@ TABLES: dict[str, pa.Schema] = {
     METRICS_FILE: METRICS,
     PAYLOADS_FILE: PAYLOADS,
     BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
+    DRIVEN_FILE: driven_table(Log(), ["v01"]).schema,
 }
 """The tables, with the columns that they must have."""
 Columns = Mapping[str, Collection[str]]
@@ -151,6 +155,11 @@ class RunFiles:
     def busy(self) -> pa.Table | None:
         """A row for each vehicle and 100 ms; None where there is no MAC."""
         return None if self.scenario.radio.mac is None else self._table(BUSY_FILE)
+
+    @cached_property
+    def driven(self) -> pa.Table | None:
+        """A row for each control instant and vehicle; None where programs do not drive."""
+        return self._table(DRIVEN_FILE) if self.scenario.network.kind == "driven" else None
 
     @cached_property
     def payloads(self) -> KeptPayloads | None:

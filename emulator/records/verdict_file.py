@@ -40,6 +40,7 @@ class Record:
     start_up_s: float | None = None
     metrics_sha256: str = ""
     reported: dict[str, ReportedFigure] = field(default_factory=dict)
+    driving: dict[str, float | None] = field(default_factory=dict)
     cost: RunCost | None = None
     versions: dict[str, str] = field(default_factory=dict)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from emulator.report.drawing import Chart, Drawing, draw_charts
+from emulator.report.driving_figures import speeds
 from emulator.report.error_figures import common_error, consensus, consistency, position
 from emulator.report.map_figures import map_charts
 from emulator.report.network_figures import degrees, links, weights
@@ -17,6 +18,7 @@ from emulator.report.source import Source
 FIGURES: dict[str, tuple[str, Callable[[Source], Drawing]]] = {
     "common-error": ("Common error", common_error),
     "position": ("Position", position),
+    "speeds": ("Speed of driven vehicles", speeds),
     "outcomes": ("Outcomes over time", outcomes),
     "totals": ("Outcomes in total", totals),
     "busy": ("Channel busy ratio", busy),

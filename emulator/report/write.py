@@ -186,6 +186,8 @@ def key_figures(record: Record) -> dict[str, str]:
     if (delivered := record.share_of("delivered")) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
         found["attempted receptions"] = f"{record.in_range:,}"
+    if record.driving:
+        found["collisions"] = f"{record.driving.get('collisions') or 0:g}"
     found["emulated time"] = f"{record.emulated_s:.1f} s"
     found["wall-clock time"] = f"{record.wall_s:.1f} s"
     if record.real_time_factor is not None:

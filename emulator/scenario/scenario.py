@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from emulator.scenario.driven import Driven
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
 from emulator.scenario.modules import with_rules
@@ -25,7 +26,7 @@ from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
 from emulator.scenario.toml import check_plain, read_toml
-from emulator.scenario.world import WorldSection
+from emulator.scenario.world import WorldSection, check_driving
 from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
@@ -79,6 +80,8 @@ class Run(Section):
     """Megabytes of a vehicle's files (`node.folder`) that are kept in the run's folder, and 1000 files at most."""
     keep_payloads: bool = False
     """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
+    control_hz: float = Field(10.0, ge=10, le=100)
+    """Control instants a second of vehicles that programs drive: a whole multiple of `world.gnss.rate_hz`."""
 
     @model_validator(mode="after")
     def _orders_are_of_lockstep(self) -> Run:
@@ -98,9 +101,10 @@ OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field
 class Network(Section):
     """`[network]`: which vehicles there are and where they are, or how they drive."""
 
-    kind: Literal["generated", "file", "trips", "sumo", "city"] = "generated"
+    kind: Literal["generated", "file", "trips", "sumo", "city", "driven"] = "generated"
     """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive,
-    `sumo` has SUMO drive, and in a `city`, a generated one or that of `[map]`, `vehicles` drive anywhere."""
+    `sumo` has SUMO drive, and in a `city`, a generated one or that of `[map]`, `vehicles` drive anywhere; `driven`
+    ones are driven by their programs."""
     path: Path | None = None
     """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
     CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
@@ -131,18 +135,23 @@ class Network(Section):
     """Trips: a vehicle with many steps that no vehicle can make is left out, which one line says, or the run is
     refused. If most vehicles are so, units or ids are wrong, and the run is refused in any case."""
 
+    driven: Driven | None = None
+    """Road and dynamics of driven vehicles; `kind = "driven"` has them by default."""
+
     @property
     def moves(self) -> bool:
         """True if vehicles drive, enter and leave."""
-        return self.kind in ("trips", "sumo", "city")
+        return self.kind in ("trips", "sumo", "city", "driven")
 
     @model_validator(mode="after")
     def _keys_go_with_their_kind(self) -> Network:
-        if (self.kind not in ("generated", "city")) != (self.path is not None):
+        if (self.kind not in ("generated", "city", "driven")) != (self.path is not None):
             raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
         given = [name for name in OF_TRIPS if getattr(self, name) is not None]
         if given and self.kind not in ("trips", "sumo"):
             raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
+        if self.driven is not None and self.kind != "driven":
+            raise ValueError(f'driven goes with kind = "driven", not with "{self.kind}"')
         return self
 
 
@@ -274,9 +283,19 @@ class Scenario(Section):
 
     @model_validator(mode="after")
     def _roads_are_for_those_who_drive(self) -> Scenario:
-        if self.map is not None and not self.network.moves:
-            raise ValueError(f'map goes with vehicles that drive, not with network.kind = "{self.network.kind}"')
+        kind = self.network.kind
+        if self.map is not None and (not self.network.moves or kind == "driven"):
+            raise ValueError(f'map goes with vehicles that drive on it, not with network.kind = "{kind}"')
+        if kind == "driven":
+            check_driving(self.driven, self.run.control_hz, self.period_ns, self.world)
+        elif self.world.ranging is not None:
+            raise ValueError(f'world.ranging goes with network.kind = "driven", not with "{kind}"')
         return self
+
+    @property
+    def driven(self) -> Driven:
+        """Road and dynamics of driven vehicles."""
+        return self.network.driven or Driven()
 
     @property
     def healed_s(self) -> float:

@@ -7,8 +7,10 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
+from emulator.scenario.driven import Driven, Ranging, control_step_ns
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
 from emulator.scenario.sections import Section
+from vnet.units import NS_PER_S
 
 
 class CommonError(Section):
@@ -88,3 +90,21 @@ class WorldSection(Section):
     common_error: CommonError = CommonError()
     gnss: Gnss = Gnss()
     lateral: Lateral = Lateral()
+    ranging: Ranging | None = None
+    """Sensor of driven vehicles for the one ahead."""
+
+
+def check_driving(driven: Driven, control_hz: float, period_ns: int, world: WorldSection) -> None:
+    """Raise ValueError unless control instants, dynamics and GNSS errors fit together."""
+    if period_ns % control_step_ns(control_hz):
+        raise ValueError(
+            f"run.control_hz = {control_hz:g}: must be a whole multiple of world.gnss.rate_hz = "
+            f"{NS_PER_S / period_ns:g}, with intervals of whole nanoseconds"
+        )
+    if driven.max_speed_mps / control_hz >= 2 * driven.vehicle_length_m:
+        raise ValueError(
+            f"network.driven.max_speed_mps = {driven.max_speed_mps:g}: vehicles could pass through one another "
+            f"between two control instants; less than {2 * driven.vehicle_length_m * control_hz:g} is needed"
+        )
+    if world.common_error.gradient_m_per_km:
+        raise ValueError('world.common_error.gradient_m_per_km goes not with network.kind = "driven"')

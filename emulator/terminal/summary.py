@@ -198,6 +198,8 @@ def _figures(verdict: dict[str, Any]) -> Table:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")
     table.add_row("wall-clock time of the run", f"{verdict['wall_s']:.1f} s")
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
+    if verdict.get("driving"):
+        table.add_row("collisions", str(verdict["driving"]["collisions"]))
     for title, value in shown_figures(verdict["figures"]).items():
         table.add_row(f"{title} (mean after the first fifth)", f"{value:.3f} m")
     return table

@@ -39,6 +39,11 @@ class Field:
         compare: dict[str, Callable[[float, float], bool]] = {"<": lambda a, b: a < b, ">": lambda a, b: a > b}
         return inside and all(compare[sign](number, _number(limit)) for sign, limit in _LIMIT.findall(self.bounds))
 
+    def range(self) -> tuple[int, int]:
+        """The least and the greatest integer of the bounds, or of a range to draw from where there are none."""
+        pairs = [(_number(low), _number(high)) for low, high in _RANGE.findall(self.bounds)]
+        return max([-(2**62), *(low for low, _ in pairs)]), min([2**62, *(high for _, high in pairs)])
+
     def edges(self) -> tuple[list[int], list[int]]:
         """Integers at the edges of the bounds that are allowed, and that are not."""
         limits = [_number(text) for pair in _RANGE.findall(self.bounds) for text in pair]
@@ -163,7 +168,8 @@ class Layouts:
             return st.dictionaries(st.text(max_size=5), self._value(each, field), max_size=3)
         if type_.startswith('"'):
             return st.just(type_.strip('"'))
-        integers = st.integers(-(2**62), 2**62) | st.sampled_from(field.edges()[0] or [0])
+        low, high = field.range()
+        integers = st.integers(low, high) | st.sampled_from(field.edges()[0] or [0])
         simple: dict[str, st.SearchStrategy[Any]] = {
             "any": _ANY,
             "nil": st.none(),
@@ -171,7 +177,7 @@ class Layouts:
             "bytes": st.binary(max_size=20),
             "bool": st.booleans(),
             "int": integers.filter(field.allows),
-            "float": st.floats(-(2.0**60), 2.0**60).filter(field.allows),
+            "float": st.floats(max(low, -(2.0**60)), min(high, 2.0**60)).filter(field.allows),
         }
         return simple[type_] if type_ in simple else self.values(type_)
 

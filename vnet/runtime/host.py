@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from vnet.driving import Action
 from vnet.node import Fix, Node
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
@@ -28,6 +29,7 @@ from vnet.runtime.log_handler import NodeLogHandler
 from vnet.runtime.mail import Mail
 from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.node_clocks import NodeClocks
+from vnet.runtime.outbox import Outbox
 from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
@@ -67,12 +69,9 @@ class Host:
         self._clock = clock
         self._on_traffic = on_traffic
         self._on_line = on_line
-        self._notes: list[wire.Note] = []
+        self._outbox = Outbox()
         self._lines: Counter[str] = Counter()
         self._log_handler = NodeLogHandler(lambda node: self.nodes.get(node.id) is node)
-        self._frames: list[wire.Frame] = []
-        self._reports: list[Report] = []
-        self._endings: list[wire.Ending] = []
         self._window = Window()
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
@@ -80,7 +79,6 @@ class Host:
         self._clocks = NodeClocks(clock)
         self._orders = {welcome.node: welcome.order for welcome in welcomes}
         self.mail = MailDelivery(self.nodes, self._clocks)
-        self._deviations: list[Deviation] = []
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
@@ -97,6 +95,7 @@ class Host:
             period_ns=welcome.period_ns,
             max_payload=welcome.max_payload,
             incarnation=welcome.incarnation,
+            control_ns=welcome.control_ns,
             disk=partial(self._disks.of, welcome.node),
         )
 
@@ -109,22 +108,29 @@ class Host:
     def send_frame(self, node: str, payload: bytes) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
         if self._active[node]:
-            self._frames.append(wire.Frame(node, payload))
+            self._outbox.frames.append(wire.Frame(node, payload))
             self._on_traffic()
 
     def send_report(self, report: Report) -> None:
         """Take a report."""
         if self._active[report.node]:
-            self._reports.append(report)
+            self._outbox.reports.append(report)
             self._on_traffic()
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         """Take a line of a log or an event of a program; the line is written at once."""
-        self._notes.append(wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details))  # type: ignore[arg-type]
+        note = wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
+        self._outbox.notes.append(note)
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
         line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip()
         self._line(node, level, line.replace("\n", "\n    "))
         self._on_traffic()
+
+    def send_action(self, action: Action) -> None:
+        """Take what a program asks its vehicle to do."""
+        if self._active[action.node]:
+            self._outbox.actions.append(action)
+            self._on_traffic()
 
     def _line(self, node: str, level: str, text: str) -> None:
         """Write a line to a node's log, unless there were too many."""
@@ -226,19 +232,16 @@ class Host:
 
     def _deviated(self, node: Node, deviation: Deviation) -> None:
         if self._runs(node):
-            self._deviations.append(deviation)
+            self._outbox.deviations.append(deviation)
 
     @property
     def has_traffic(self) -> bool:
         """True if nodes have enqueued anything since `take_traffic`."""
-        return bool(self._frames or self._reports or self._endings or self._notes or self._unhandled.has_any)
+        return self._outbox.has_any or self._unhandled.has_any
 
     def take_traffic(self) -> wire.Traffic:
         """Return everything that the nodes have enqueued since the last call."""
-        unhandled = self._unhandled.take()
-        traffic = wire.Traffic(self._frames, self._reports, self._endings, unhandled, self._notes, self._deviations)
-        self._frames, self._reports, self._endings, self._notes, self._deviations = [], [], [], [], []
-        return traffic
+        return self._outbox.take(self._unhandled.take())
 
     def take_final(self) -> wire.Traffic:
         """Return what the emulator has not been told when the process ends: exceptions and notes."""
@@ -288,7 +291,7 @@ class Host:
         if not self._active[node]:
             return
         self._active[node] = False
-        self._endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        self._outbox.endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         for task in self._tasks_of(self.nodes[node]):
             if task is not asyncio.current_task(self._loop):

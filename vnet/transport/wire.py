@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
+from vnet.driving import Action
 from vnet.errors import WireError, printable
 from vnet.node import Fix, Packet
 from vnet.reports import Report
@@ -62,18 +63,23 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
     covariance_m2: tuple[float, float, float, float]
     heading_rad: float | None
     speed_m_s: float | None = None
+    gap_m: float | None = None
+    gap_rate_m_s: float | None = None
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:
         """Return the fix in its form on the wire."""
         x, y = fix.position_m.tolist()
         a, b, c, d = fix.covariance_m2.ravel().tolist()
-        return cls(node, fix.time_ns, (x, y), (a, b, c, d), fix.heading_rad, fix.speed_m_s)
+        covariance = (a, b, c, d)
+        seen = fix.heading_rad, fix.speed_m_s, fix.gap_m, fix.gap_rate_m_s
+        return cls(node, fix.time_ns, (x, y), covariance, *seen)
 
     def fix(self) -> Fix:
         """Return the fix as the program sees it."""
         covariance = np.array(self.covariance_m2).reshape(2, 2)
-        return Fix(self.time_ns, np.array(self.position_m), covariance, self.heading_rad, self.speed_m_s)
+        seen = self.heading_rad, self.speed_m_s, self.gap_m, self.gap_rate_m_s
+        return Fix(self.time_ns, np.array(self.position_m), covariance, *seen)
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
@@ -126,11 +132,12 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
     unhandled: Sequence[Unhandled] = ()
     notes: Sequence[Note] = ()
     deviations: Sequence[Deviation] = ()
+    actions: Sequence[Action] = ()
 
     def __bool__(self) -> bool:
         """Return true if there is anything in it."""
         told = self.frames or self.reports or self.endings or self.unhandled or self.notes
-        return bool(told or self.deviations)
+        return bool(told or self.deviations or self.actions)
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True):
@@ -231,6 +238,7 @@ class Welcome(Message, frozen=True):
     runs: bool = True
     version: Count = 1
     order: Order | None = None
+    control_ns: Count = 0
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):

@@ -155,7 +155,7 @@ def test_a_map_is_for_those_who_drive(tmp_path: Path) -> None:
     path = tmp_path / "s.toml"
     path.write_text(f'[map]\npath = "{write_cross(tmp_path / "cross.geojson")}"\n')
     with pytest.raises(
-        ScenarioError, match=r'map goes with vehicles that drive, not with network.kind = "generated"'
+        ScenarioError, match=r'map goes with vehicles that drive on it, not with network.kind = "generated"'
     ):
         load_scenario(path)
 

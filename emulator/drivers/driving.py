@@ -1,0 +1,60 @@
+"""Driving in a run: actions of programs on their way to the vehicles, and events of the vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import pyarrow as pa
+
+from emulator.records.driven_table import driven_table
+from emulator.records.run_folder import RunFolder
+from emulator.world.driven.vehicles import Happening
+from emulator.world.driven.world import DrivenWorld
+from emulator.world.world import World
+from vnet.driving import Action
+
+
+class Driving:
+    """Vehicles of a run and their programs' actions; nothing in a world whose truth is known from the start."""
+
+    def __init__(self, world: World, folder: RunFolder, number: Mapping[str, int]) -> None:
+        self._world = world if isinstance(world, DrivenWorld) else None
+        self._node_ids = world.node_ids
+        self._folder = folder
+        self._number = number
+
+    @property
+    def next_ns(self) -> int | None:
+        """The next control instant within the run; None if there is none."""
+        return None if self._world is None else self._world.next_control_ns()
+
+    @property
+    def control_ns(self) -> int:
+        """Time between two control instants; 0 where programs do not drive."""
+        return 0 if self._world is None else self._world.vehicles.step_ns
+
+    def table(self) -> pa.Table | None:
+        """Return what vehicles did at each control instant; None where programs do not drive."""
+        return None if self._world is None else driven_table(self._world.vehicles.finished_log(), self._node_ids)
+
+    def take(self, time_ns: int, actions: Iterable[Action]) -> None:
+        """Take what programs of vehicles that are up ask for at `time_ns`."""
+        if self._world is not None:
+            for action in actions:
+                self._tell(self._world.vehicles.take(time_ns, self._number[action.node], action))
+
+    def release(self, time_ns: int, node: str) -> None:
+        """Let a vehicle whose program has ended keep its speed."""
+        self.take(time_ns, [Action(node, 0.0)])
+
+    def advance_to(self, time_ns: int) -> bool:
+        """Let vehicles drive to the last control instant until `time_ns`; returns whether they have moved."""
+        moved = False
+        while self._world is not None and (next_ns := self.next_ns) is not None and next_ns <= time_ns:
+            self._tell(self._world.advance())
+            moved = True
+        return moved
+
+    def _tell(self, happened: Iterable[Happening]) -> None:
+        for each in happened:
+            self._folder.event(each.time_ns, each.kind, self._node_ids[each.number], **each.details)

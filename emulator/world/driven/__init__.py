@@ -1,0 +1,1 @@
+"""Vehicles that their programs drive: dynamics, road, traffic, and the truth that comes of it."""

@@ -1,0 +1,36 @@
+"""Outbox: what the nodes of a process have enqueued for the emulator and the transport has not taken yet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from vnet.driving import Action
+from vnet.reports import Report
+from vnet.transport import wire
+from vnet.transport.orders import Deviation
+
+
+@dataclass
+class Outbox:
+    """Traffic in the order in which it was made, by kind."""
+
+    frames: list[wire.Frame] = field(default_factory=list)
+    reports: list[Report] = field(default_factory=list)
+    endings: list[wire.Ending] = field(default_factory=list)
+    notes: list[wire.Note] = field(default_factory=list)
+    deviations: list[Deviation] = field(default_factory=list)
+    actions: list[Action] = field(default_factory=list)
+
+    @property
+    def has_any(self) -> bool:
+        """True if there is anything that the emulator must be told at this instant."""
+        return bool(self.frames or self.reports or self.endings or self.notes or self.actions)
+
+    def take(self, unhandled: Sequence[wire.Unhandled]) -> wire.Traffic:
+        """Remove and return all of it, with exceptions that nobody handled."""
+        frames, reports, endings, notes = self.frames, self.reports, self.endings, self.notes
+        deviations, actions = self.deviations, self.actions
+        self.frames, self.reports, self.endings, self.notes = [], [], [], []
+        self.deviations, self.actions = [], []
+        return wire.Traffic(frames, reports, endings, unhandled, notes, deviations, actions)
