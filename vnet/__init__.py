@@ -7,7 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vnet.node import Fix, Node, Packet
+    from vnet.node import Fix, Node
+    from vnet.radio import Packet
 
 __all__ = ["Fix", "Node", "Packet"]
 
@@ -15,4 +16,4 @@ __all__ = ["Fix", "Node", "Packet"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module("vnet.node"), name)
+    return getattr(import_module("vnet.radio" if name == "Packet" else "vnet.node"), name)

@@ -90,6 +90,8 @@ TRACE = {
     "copy": "0; 1, 2, … for what a fault sends, or lets arrive, again",
     "on_air_ns": "with `[radio.mac]` only: when its transmission began; null if it never did",
     "left_ns": "with `[radio.mac]` only: when its transmission ended, or it was given up",
+    "rssi_dbm": "with `[radio.path_loss]` only: received power; null if the frame was never on air",
+    "snr_db": "with `[radio.path_loss]` only: received power over noise and interference, the mean of the payload",
 }
 WORLD = {
     "node_ids": "ids of the vehicles, in the order of the scenario's network and of the tables' rows",
@@ -244,7 +246,7 @@ VERDICT = {
 
 def page() -> str:
     """The whole page. Raises LookupError where a text is missing, or speaks of what is not there."""
-    trace = Trace(["v01"], knows_air=True).to_table().schema
+    trace = Trace(["v01"], knows_air=True, knows_power=True).to_table().schema
     parts = [INTRODUCTION, table(["file", "what"], ([f"`{name}`", what] for name, what in FOLDER.items()))]
     parts += [
         "## `trace.parquet`",

@@ -14,7 +14,8 @@ from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
 from vnet.errors import PayloadTooLargeError
 from vnet.mailbox import INBOX_LIMIT
-from vnet.node import GnssReceiver, Radio
+from vnet.node import GnssReceiver
+from vnet.radio import Radio
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.units import unit_of

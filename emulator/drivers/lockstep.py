@@ -26,7 +26,8 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
 from emulator.radio.stages import least_latency_ns
 from vnet.mailbox import INBOX_LIMIT
-from vnet.node import Fix, Packet
+from vnet.node import Fix
+from vnet.radio import Packet
 from vnet.runtime.mail import Mail
 from vnet.transport import wire
 

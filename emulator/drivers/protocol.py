@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from vnet.errors import VnetError
-from vnet.node import Packet
+from vnet.radio import Packet
 from vnet.transport import wire
 
 
@@ -27,4 +27,5 @@ def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequen
 
 def wire_packet(node: str, packet: Packet) -> wire.WirePacket:
     """Encode a packet for its receiver `node`."""
-    return wire.WirePacket(node, packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
+    sender, sent_ns, received_ns, payload = packet.sender, packet.sent_ns, packet.received_ns, packet.payload
+    return wire.WirePacket(node, sender, sent_ns, received_ns, payload, packet.rssi_dbm, packet.snr_db)

@@ -85,17 +85,18 @@ class Engine:
         self._rules = rules or OwnRules(seed, node_ids)
         self._links = LinkFaults(seed, self._mac, count, self._rules)
         self._senders = SenderFaults(self._node_ids, self._next_copy, self._ask_sender)
+        self._reception = Reception(radio, signals) if signals is not None else None
         self.chain: list[Stage] = [
             in_range,
             sender_side,
             peer_cap,
             lose_by_faults,
-            *([Reception(radio, signals)] if signals is not None else []),
+            *([self._reception] if self._reception is not None else []),
             Loss(seed, radio.loss),
             Latency(seed, radio),
             change_by_faults,
         ]
-        self._trace = Trace(node_ids, knows_air=self._csma is not None)
+        self._trace = Trace(node_ids, self._csma is not None, knows_power=radio.path_loss is not None)
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
         self._copies: Counter[tuple[int, int]] = Counter()
@@ -236,10 +237,13 @@ class Engine:
         """
         columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
         digests = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
-        first = self._trace.append(
-            {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns
-        )
         frame_index = np.repeat(np.arange(len(frames)), each)
+        powers_db = None
+        if self._reception is not None and self._trace.knows_power:
+            powers_db = self._reception.powers_db(frames, frame_index, receiver)
+        first = self._trace.append(
+            {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns, powers_db
+        )
         for number, frame in enumerate(frames):
             for node, payload in frame.altered.items():
                 for row in np.flatnonzero((frame_index == number) & (receiver == node)).tolist():

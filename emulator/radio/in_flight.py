@@ -12,11 +12,12 @@ from dataclasses import dataclass, field
 from typing import overload
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from emulator.radio.frames import Frame
 from emulator.radio.trace import Trace
-from vnet.node import Packet
+from vnet.radio import Packet
 from vnet.types import IntArray
 
 NO_ARRIVAL_NS = np.iinfo(np.int64).max
@@ -64,7 +65,9 @@ class Deliveries(Sequence[Delivery]):
 
     def _all(self) -> list[Delivery]:
         if self._built is None:
-            self._built = [self._delivery(*entry) for entry in self._table[:, self._order()].T.tolist()]
+            table = self._table[:, self._order()]
+            receivers, rows = table[_RECEIVER].tolist(), table[_ROW].tolist()
+            self._built = [*map(Delivery, receivers, self._packets(table), rows)]
         return self._built
 
     def by_receiver(self) -> Iterator[tuple[int, list[Packet]]]:
@@ -73,7 +76,16 @@ class Deliveries(Sequence[Delivery]):
         Nothing is kept of them, which is what takes time where there are many.
         """
         table = self._table[:, self._order()]
-        arrivals_ns, receivers, _, numbers = table[:, np.argsort(table[_RECEIVER], kind="stable")].tolist()
+        table = table[:, np.argsort(table[_RECEIVER], kind="stable")]
+        packets = self._packets(table)
+        first = 0
+        for receiver, count in Counter(table[_RECEIVER].tolist()).items():
+            yield receiver, packets[first : first + count]
+            first += count
+
+    def _packets(self, table: IntArray) -> list[Packet]:
+        """Return the packets of these columns (4, n) of the table, as they stand."""
+        arrivals_ns, receivers, _, numbers = table.tolist()
         frames = [self._frames[number] for number in numbers]
         packets = [
             Packet(frame.name, frame.sent_ns, arrival_ns, frame.altered.get(receiver, frame.payload))
@@ -81,10 +93,10 @@ class Deliveries(Sequence[Delivery]):
             else Packet(frame.name, frame.sent_ns, arrival_ns, frame.payload)
             for frame, arrival_ns, receiver in zip(frames, arrivals_ns, receivers, strict=True)
         ]
-        first = 0
-        for receiver, count in Counter(receivers).items():
-            yield receiver, packets[first : first + count]
-            first += count
+        if not self._trace.knows_power:
+            return packets
+        powers = zip(packets, *self._trace.powers(table[_ROW]), strict=True)
+        return [replace(packet, rssi_dbm=rssi_dbm, snr_db=snr_db) for packet, rssi_dbm, snr_db in powers]
 
     def _order(self) -> NDArray[np.intp]:
         order = np.argsort(self._table[_ARRIVAL], kind="stable")
@@ -96,11 +108,6 @@ class Deliveries(Sequence[Delivery]):
             rows = self._trace.rows(row)
             order[tied] = some[np.lexsort((row, rows["copy"], receiver, rows["seq"], rows["sender"], arrival))]
         return order
-
-    def _delivery(self, arrival_ns: int, receiver: int, row: int, number: int) -> Delivery:
-        frame = self._frames[number]
-        payload = frame.altered.get(receiver, frame.payload)
-        return Delivery(receiver, Packet(frame.name, frame.sent_ns, arrival_ns, payload), row)
 
 
 class InFlight:

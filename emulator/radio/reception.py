@@ -72,6 +72,29 @@ class Reception:
             collided[[sent[number] for number in interfered]] = lost
             receptions.decide(collided, Outcome.collided)
 
+    def powers_db(self, frames: Sequence[Frame], frame_index: IntArray, receiver: IntArray) -> Array:
+        """Return received powers in dBm, and their ratios to noise and interference in dB, as an array (2, n).
+
+        `frame_index` and `receiver` (n,) name the receptions, which are in range. Interference is averaged over the
+        payload. Both are NaN for a frame that was not sent.
+        """
+        own_mw, others_mw = np.full((2, len(frames), self._signals.count), np.nan)
+        for index, frame in enumerate(frames):
+            if frame.sender_outcome == Outcome.pending:
+                signal = self._signal(frame)
+                own_mw[index] = signal.power_mw
+                others_mw[index] = self._threshold.noise_mw + self._interference_mw(frame, signal)
+        power_mw = own_mw[frame_index, receiver]
+        return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
+
+    def _interference_mw(self, frame: Frame, signal: Signal) -> Array | float:
+        """Return the mean power (N,) of all other signals during a frame's payload."""
+        if not (pieces := [*self._pieces(frame)]):
+            return 0.0
+        lengths_ns = np.array([length_ns for length_ns, _ in pieces])
+        others_mw = np.maximum(np.array([total_mw for _, total_mw in pieces]) - signal.power_mw, 0.0)
+        return np.asarray(lengths_ns @ others_mw / lengths_ns.sum())
+
     def _signal(self, frame: Frame) -> Signal:
         if frame.signal is None:  # without a shared medium nothing needed it before
             frame.signal = self._signals.of(frame)

@@ -48,11 +48,11 @@ class Signals:
     def __init__(self, seed: int, fading: Fading | None, count: int) -> None:
         self._draws = Draws(seed, "radio")
         self.nakagami = Nakagami(fading)
-        self._count = count
+        self.count = count
 
     def of(self, frame: Frame) -> Signal:
         """Return the signal of a frame."""
-        random_draws = self._draws.words(frame.sender, frame.seq, self._count, frame.draw)
+        random_draws = self._draws.words(frame.sender, frame.seq, self.count, frame.draw)
         topology, sender = frame.topology, frame.sender
         assert topology.power_mw is not None
         assert topology.fading is not None

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emulator.radio.frames import NO_CAUSE
 from emulator.radio.outcomes import PENDING, Outcome
+from vnet.types import Array, IntArray
 
 NOT_ARRIVING = -1
 """Arrival time of a reception that does not arrive."""
@@ -66,6 +67,14 @@ ROW = np.dtype(
         ("left_ns", "<i8"),
     ]
 )
+_POWER = np.dtype([("rssi_dbm", "<i2"), ("snr_db", "<i2")])
+"""Power of a reception, in hundredths of a decibel."""
+POWER_STEPS_DB = 100
+"""Steps of a decibel to which powers are rounded."""
+UNKNOWN_POWER = -(1 << 15)
+"""Power of a reception of a frame that was never on air."""
+UNHASHED = ("rssi_dbm", "snr_db")
+"""Columns that the hash leaves out. What decides a reception is in others, and powers have been added later."""
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
@@ -104,15 +113,18 @@ class Trace:
     """The growing trace of a run. `node_ids` are indexed by the numbers in `sender` and `receiver`.
 
     The columns that the rows of a frame share are stored once a frame. `knows_air` says that the MAC models when
-    frames start and end on air; without it a frame leaves its sender at the time it is sent.
+    frames start and end on air; without it a frame leaves its sender at the time it is sent. `knows_power` says
+    that receptions have a power.
     """
 
-    def __init__(self, node_ids: Sequence[str], knows_air: bool = False) -> None:
+    def __init__(self, node_ids: Sequence[str], knows_air: bool = False, knows_power: bool = False) -> None:
         self._node_ids = list(node_ids)
         self._knows_air = knows_air
         self._causes = [""]
         self._receptions = _Table(_RECEPTION, INITIAL_RECEPTIONS)
         self._frames = _Table(_FRAME, INITIAL_FRAMES)
+        self._powers = _Table(_POWER, INITIAL_RECEPTIONS if knows_power else 0)
+        self.knows_power = knows_power
         self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -126,12 +138,14 @@ class Trace:
         outcome: NDArray[np.uint8],
         cause: ArrayLike,
         arrival_ns: ArrayLike,
+        powers_db: Array | None = None,
     ) -> int:
         """Append the rows of K frames; return the number of the first.
 
         `frames` are the columns (K,) that all rows of a frame share; the other columns are (n,). `each` (K,) is the
         number of rows of each frame, in order. `cause` are numbers of faults named by `name_cause`; `arrival_ns` is
-        used only where the outcome is pending.
+        used only where the outcome is pending. `powers_db` (2, n) are received powers in dBm and
+        their ratios to noise and interference in dB, NaN where the frame was not on air.
         """
         first, first_frame = self._receptions.count, self._frames.count
         new = self._frames.add(len(each))
@@ -144,7 +158,17 @@ class Trace:
         rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
         rows["cause"] -= NO_CAUSE
         rows["arrival_ns"] = np.where(outcome == PENDING, arrival_ns, NOT_ARRIVING)
+        if powers_db is not None:
+            powers = self._powers.add(len(outcome))
+            for name, power_db in zip(UNHASHED, powers_db, strict=True):
+                steps = np.clip(np.rint(power_db * POWER_STEPS_DB), UNKNOWN_POWER + 1, -UNKNOWN_POWER - 1)
+                powers[name] = np.nan_to_num(steps, nan=UNKNOWN_POWER)
         return first
+
+    def powers(self, rows: IntArray) -> tuple[list[float], list[float]]:
+        """Return received powers in dBm, and their ratios to noise and interference in dB, of rows (n,)."""
+        powers = self._powers.records[rows]
+        return (powers["rssi_dbm"] / POWER_STEPS_DB).tolist(), (powers["snr_db"] / POWER_STEPS_DB).tolist()
 
     def alter(self, row: int, payload_digest: int) -> None:
         """Set the digest of the altered payload that arrives in this row."""
@@ -186,7 +210,8 @@ class Trace:
         """Return the trace as a table in canonical order: (sent_ns, sender number, seq, receiver number, copy).
 
         With `[radio.mac]` there are two more columns: `on_air_ns`, the start of a frame's transmission (null if it
-        never started), and `left_ns`, the time at which it ended or the frame was dropped.
+        never started), and `left_ns`, the time at which it ended or the frame was dropped. With a path loss there
+        are `rssi_dbm` and `snr_db`, null for a frame that was never on air.
         """
         rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -199,6 +224,7 @@ class Trace:
             )
 
         times = ("arrival_ns", "on_air_ns")
+        powers = self._powers.records[order] if self.knows_power else None
         arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
         return pa.table(
             {
@@ -213,6 +239,7 @@ class Trace:
                 "arrival_ns": arrival,
                 "copy": pa.array(rows["copy"]),
                 **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
+                **({} if powers is None else {name: _in_db(powers[name]) for name in UNHASHED}),
             }
         )
 
@@ -225,10 +252,14 @@ class Trace:
         pq.write_table(self.to_table(), path, compression="zstd")
 
 
+def _in_db(power: NDArray[np.int16]) -> pa.Array:
+    return pa.array(power / POWER_STEPS_DB, mask=power == UNKNOWN_POWER)
+
+
 def sha256_of_table(table: pa.Table) -> str:
     """SHA-256 of a trace's content in the order of its rows, independent of how it was stored."""
     digest = hashlib.sha256()
-    for column in table.column_names:
+    for column in (name for name in table.column_names if name not in UNHASHED):
         array = table.column(column).combine_chunks()
         if column in _NAMED:
             codes, names = _canonical_codes(array)

@@ -56,8 +56,10 @@ MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
 """A folder with any of these is a run's."""
 WITH_MAC = ("on_air_ns", "left_ns")
 """Columns that the trace has where there is a MAC."""
+WITH_POWER = ("rssi_dbm", "snr_db")
+"""Columns that the trace has where there is a path loss, but for traces of vnet 0.2 and before."""
 TABLES: dict[str, pa.Schema] = {
-    TRACE_FILE: Trace(["v01"], knows_air=True).to_table().schema,
+    TRACE_FILE: Trace(["v01"], knows_air=True, knows_power=True).to_table().schema,
     STATES_FILE: STATES,
     METRICS_FILE: METRICS,
     PAYLOADS_FILE: PAYLOADS,
@@ -139,7 +141,7 @@ class RunFiles:
     @cached_property
     def trace(self) -> pa.Table:
         """A row for each frame and receiver in range."""
-        return self._table(TRACE_FILE, left_out=WITH_MAC if self.scenario.radio.mac is None else ())
+        return self._table(TRACE_FILE, left_out=WITH_POWER + (WITH_MAC if self.scenario.radio.mac is None else ()))
 
     @cached_property
     def states(self) -> pa.Table:

@@ -94,9 +94,8 @@ def test_every_event_is_there() -> None:
 
 
 def test_every_file_column_and_key_of_a_run_is_there(tmp_path: Path) -> None:
-    scenario = Scenario.model_validate(
-        {"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "radio": {"range_m": 1e5, "mac": {}}}
-    )
+    radio = {"path_loss": {"kind": "free_space"}, "mac": {}}
+    scenario = Scenario.model_validate({"run": {"duration_s": 1.0}, "network": {"vehicles": 3}, "radio": radio})
     emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
     conclude(emulation, simulate(emulation)[0], "simulate")
     left = {path.name + "/" * path.is_dir() for path in (tmp_path / "run").iterdir()}

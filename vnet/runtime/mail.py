@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from vnet.node import Fix, Packet
+from vnet.node import Fix
+from vnet.radio import Packet
 from vnet.transport import wire
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from msgspec.structs import replace
 
 from vnet.mailbox import Mailbox
-from vnet.node import Node, Packet
+from vnet.node import Node
+from vnet.radio import Packet
 from vnet.runtime.mail import Mail
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.ready_queue import OrderedQueue

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Collection
 from operator import itemgetter
 
-from vnet.node import Packet
+from vnet.radio import Packet
 from vnet.transport import wire
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from vnet.driving import Action
 from vnet.errors import WireError, printable
-from vnet.node import Fix, Packet
+from vnet.node import Fix
+from vnet.radio import Packet
 from vnet.reports import Report
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
 
@@ -48,10 +49,12 @@ class WirePacket(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: TimeNs
     received_ns: TimeNs
     payload: bytes
+    rssi_dbm: float | None = None
+    snr_db: float | None = None
 
     def packet(self) -> Packet:
         """Return the packet as the program sees it."""
-        return Packet(self.sender, self.sent_ns, self.received_ns, self.payload)
+        return Packet(self.sender, self.sent_ns, self.received_ns, self.payload, self.rssi_dbm, self.snr_db)
 
 
 class WireFix(msgspec.Struct, frozen=True, array_like=True):
