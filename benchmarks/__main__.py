@@ -273,6 +273,13 @@ def bench_startup() -> Figures:
     return startup.measure()
 
 
+def bench_driving() -> Figures:
+    """A hundred vehicles that programs drive, simulated."""
+    from benchmarks import driving
+
+    return driving.measure()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
     "city_rbpf": bench_city_rbpf,
@@ -283,6 +290,7 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "quadratic_programs": bench_quadratic_programs,
     "simulate": bench_simulate,
     "lockstep": bench_lockstep,
+    "driving": bench_driving,
     "demo": bench_demo,
     "realtime": bench_realtime,
     "awaiting": bench_awaiting,

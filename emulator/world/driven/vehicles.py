@@ -62,6 +62,8 @@ class DrivenVehicles:
         self._state = np.array([along_m, speed, np.zeros(count)])
         self.left_m: Array = self.lane * np.float64(driven.lane_width_m)
         self._from_left_m = self.left_m.copy()
+        self._before_m = along_m
+        """Positions (N,) at the last control instant: a collision puts nobody further back."""
         self._change_steps = max(1, round(driven.lane_change_s * NS_PER_S / step_ns))
         self._changing = np.full(count, self._change_steps)
         """Control intervals (N,) since the last lane change began."""
@@ -70,7 +72,7 @@ class DrivenVehicles:
         self._pending: deque[tuple[int, int, Action]] = deque()
         self._collided: set[tuple[int, int]] = set()
         self.log = Log()
-        if crashed := self._collisions():
+        if crashed := self._overlapping():
             raise ScenarioError(
                 f"network.driven: {node_ids[crashed[0][0]]} and {node_ids[crashed[0][1]]} overlap at the start"
             )
@@ -124,11 +126,12 @@ class DrivenVehicles:
         """Let all drive to the next control instant; returns what happens."""
         happened, command = self._told()
         self._record(command)
+        self._before_m = self._state[0]
         self._state = self._motion.advance(self._state, command)
         self.now_ns += self.step_ns
         self._move_sideways()
-        for rear, front in self._collisions():
-            happened.append(self._collide(rear, front))
+        for rear, front in self._overlapping():
+            happened += self._collide(rear, front)
         return happened
 
     def finished_log(self) -> Log:
@@ -186,24 +189,35 @@ class DrivenVehicles:
         lasts_s = self._change_steps * self.step_ns / NS_PER_S
         return np.where(self.is_wreck, 0.0, way_m * 30 * done**2 * (1 - done) ** 2 / lasts_s)
 
-    def _collisions(self) -> list[tuple[int, int]]:
-        """Return the pairs, rear and front, that overlap and have not collided before."""
+    def _overlapping(self) -> list[tuple[int, int]]:
+        """Return the pairs, rear and front, that overlap, the foremost first."""
         length_m, width_m = self._driven.vehicle_length_m, self._driven.vehicle_width_m
         ahead = self.road.ahead(self.along_m, self.left_m, width_m, length_m)
         close = np.flatnonzero(ahead >= 0)
         way_m = self.road.distance_m(self.along_m[close], self.along_m[ahead[close]])
-        pairs = zip(close[way_m < length_m].tolist(), ahead[close][way_m < length_m].tolist(), strict=True)
-        return [pair for pair in pairs if pair not in self._collided and pair[::-1] not in self._collided]
+        rear = close[way_m < length_m]
+        rear = rear[np.argsort(-self.along_m[rear], kind="stable")]
+        return list(zip(rear.tolist(), ahead[rear].tolist(), strict=True))
 
-    def _collide(self, rear: int, front: int) -> Happening:
-        """Let two vehicles go on at their mean speed, as equal masses do; from now on both brake."""
-        self._collided.add((rear, front))
+    def _collide(self, rear: int, front: int) -> list[Happening]:
+        """Let two that overlap go on at their mean speed, as equal masses do, from where they touched.
+
+        From now on both brake. Only the first time of each pair is told.
+        """
         closing = float(self.speed[rear] - self.speed[front])
-        self._state[1, [rear, front]] = (self.speed[rear] + self.speed[front]) / 2
-        self._state[2, [rear, front]] = 0.0
-        self.is_wreck = self.is_wreck | np.isin(np.arange(len(self.is_wreck)), [rear, front])
+        if closing > 0:
+            way_m = float(self.road.distance_m(self.along_m[[rear]], self.along_m[[front]])[0])
+            overlap_m = self._driven.vehicle_length_m - way_m
+            self._state[0, rear] = max(self._state[0, rear] - overlap_m, self._before_m[rear])
+            self._state[1, [rear, front]] = (self.speed[rear] + self.speed[front]) / 2
+            self._state[2, [rear, front]] = 0.0
+        pair = (min(rear, front), max(rear, front))
+        if pair in self._collided:
+            return []
+        self._collided.add(pair)
+        self.is_wreck = self.is_wreck | np.isin(np.arange(len(self.is_wreck)), pair)
         details = {"with": self._node_ids[front], "closing_m_s": closing}
-        return Happening(self.now_ns, COLLISION, rear, details)
+        return [Happening(self.now_ns, COLLISION, rear, details)]
 
     def _record(self, command: Array) -> None:
         there = self.present

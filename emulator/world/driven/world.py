@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 
 import numpy as np
 
@@ -119,9 +119,10 @@ class DrivenWorld(World):
         """Return the fix of vehicle number `node`, which must be present, with the gap that it measures."""
         fix = super().fix(period, node)
         gap_m = self._gap_m[period, node].item()
-        if np.isnan(gap_m):
+        if math.isnan(gap_m):
             return fix
-        return replace(fix, gap_m=gap_m, gap_rate_m_s=self._gap_rate_mps[period, node].item())
+        seen = fix.heading_rad, fix.speed_m_s, gap_m, self._gap_rate_mps[period, node].item()
+        return Fix(fix.time_ns, fix.position_m, fix.covariance_m2, *seen)
 
 
 def _nothing(periods: int, count: int) -> tuple[Array, Array]:

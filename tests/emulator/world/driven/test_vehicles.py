@@ -106,9 +106,18 @@ def test_whoever_runs_into_another_is_told_once_and_both_brake() -> None:
     assert collision.details == {"with": "v01", "closing_m_s": 10.0}
     assert collision.time_ns == 11 * STEP_NS, "10 m at 10 m/s, and a step for the overlap"
     assert vehicles.speed.tolist() == [0.0, 0.0]
+    assert vehicles.along_m[0] - vehicles.along_m[1] >= 4.5 - 1e-9, "bumper to bumper"
     ask(vehicles, 1, 3.0)
     drive(vehicles, 5)
     assert vehicles.speed.tolist() == [0.0, 0.0], "wrecks do not drive"
+
+
+def test_in_a_pile_up_each_pair_collides_once_and_nobody_gets_through() -> None:
+    vehicles = vehicles_of(5, gap_m=6.0, speed_mps=(0.0, 20.0, 20.0, 20.0, 20.0), lag_s=0.0)
+    pairs = {(each.number, each.details["with"]) for each in drive(vehicles, 80) if each.kind == COLLISION}
+    assert pairs == {(1, "v01"), (2, "v02"), (3, "v03"), (4, "v04")}
+    assert not vehicles.speed.any()
+    assert (-np.diff(vehicles.along_m) > 3.5).all()
 
 
 def test_lanes_pass_each_other_and_a_change_into_somebody_is_a_collision() -> None:
