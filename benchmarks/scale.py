@@ -20,8 +20,14 @@ from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+import emulator
 from benchmarks import hosts
 from benchmarks.__main__ import ROOT, event, vnet
+from vnet import Node
 
 PAGE = ROOT / "docs" / "scale.md"
 BEGIN, END = "<!-- measured: python -m benchmarks scale --write -->", "<!-- end -->"
@@ -202,6 +208,42 @@ def realtime_200(runs: int) -> str:
     return realtime(runs, 200)
 
 
+def environment(runs: int, agents: int = 20, steps: int = 500) -> str:
+    """Return the agent-steps a second of `emulator.environment`; each agent drives and sends a frame a step."""
+    return f"{median_of(runs, lambda: _agent_steps_a_second(agents, steps)):.0f}"
+
+
+def _agent_steps_a_second(agents: int, steps: int) -> float:
+    road = {"road": "ring", "length_m": 50.0 * agents}
+    scenario = {
+        "network": {"kind": "driven", "vehicles": agents, "driven": road},
+        "world": {"ranging": {}},
+        "run": {"duration_s": steps / 10 + 1, "settle_s": 0.0},
+    }
+    space = Box(-3, 3, (1,), np.float32)
+    env = emulator.environment(
+        scenario,
+        observe=lambda node, fix, packets: np.array([fix.speed_m_s, len(packets)]),
+        act=_drive_and_tell,
+        reward=lambda agent, moment: moment.speed_m_s[agent],
+        observation_space=Box(0, np.inf, (2,)),
+        action_space=space,
+    )
+    env.reset(seed=1)
+    started_s = time.monotonic()
+    for step in range(steps):
+        acceleration = np.array([1.0 if step % 20 < 10 else -1.0])
+        env.step(dict.fromkeys(env.agents, acceleration))
+    took_s = time.monotonic() - started_s
+    env.close()
+    return agents * steps / took_s
+
+
+async def _drive_and_tell(node: Node, action: NDArray[np.float64]) -> None:
+    node.drive(acceleration_m_s2=float(action[0]))
+    await node.radio.broadcast(action.tobytes())
+
+
 ROWS: dict[str, Row] = {
     "start": Row("start of 50 / 200 / 1000 processes", "1.5 / 6 / 30 s", "0.8 / 3 / 12 s", start),
     "memory": Row("memory a process, USS / PSS, of 50", "10 / 15 MB", "6 / 8 MB", memory),
@@ -229,6 +271,7 @@ ROWS: dict[str, Row] = {
         three_hosts_awaiting,
     ),
     "realtime": Row("real time, 100 beacons × 10 Hz, 30 s", "0 gaps, p99 ≤ 20 ms", "10 ms", realtime),
+    "environment": Row("agent-steps a second with 20 agents that drive and send", "2000", "", environment),
     "realtime_200": Row("real time, 200 beacons", "4 of 5 not unknown, p99 ≤ 50 ms", "", realtime_200),
 }
 """The rows by the name that `--only` takes; another row needs an entry here and nothing else."""

@@ -13,17 +13,21 @@ if TYPE_CHECKING:
     from emulator.api import run, simulate
     from emulator.cells.sweep import sweep
     from emulator.checks.own import Result
+    from emulator.learning.environment import environment
+    from emulator.learning.episode import Moment
     from emulator.radio.own_rules import RadioFrame
     from emulator.radio.rule_answers import Answer
     from emulator.report.notebook import Run
 
-__all__ = ["Answer", "RadioFrame", "Result", "Run", "run", "simulate", "sweep"]
+__all__ = ["Answer", "Moment", "RadioFrame", "Result", "Run", "environment", "run", "simulate", "sweep"]
 
 _PUBLIC = {
     "Answer": "emulator.radio.rule_answers",
+    "Moment": "emulator.learning.episode",
     "RadioFrame": "emulator.radio.own_rules",
     "Result": "emulator.checks.own",
     "Run": "emulator.report.notebook",
+    "environment": "emulator.learning.environment",
     "run": "emulator.api",
     "simulate": "emulator.api",
     "sweep": "emulator.cells.sweep",

@@ -28,7 +28,7 @@ LAYERS = (
     ("emulator.viewer", "emulator.report"),
     ("emulator.drivers",),
     ("emulator.cells",),
-    ("emulator.terminal", "emulator.testing", "emulator.api"),
+    ("emulator.terminal", "emulator.testing", "emulator.learning", "emulator.api"),
     ("emulator.experiments",),
     ("emulator.cli",),
     ("emulator.__main__",),

@@ -96,6 +96,11 @@ class World:
         """Corners (2, 2) of the box in which vehicles are during the run."""
         return np.array([np.nanmin(self.course_m, axis=(0, 1)), np.nanmax(self.course_m, axis=(0, 1))])
 
+    @property
+    def last_known_period(self) -> int:
+        """The last period at whose start it is known where vehicles are."""
+        return self.periods - 1
+
     def position_m(self, period: int) -> Array:
         """Return the positions (N, 2) at the start of `period`; NaN for an absent vehicle."""
         return np.asarray(self.course_m[period])

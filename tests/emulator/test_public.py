@@ -40,7 +40,17 @@ def not_a_program(node: Node) -> None:
 
 
 def test_the_public_names_are_these_and_no_more() -> None:
-    assert emulator.__all__ == ["Answer", "RadioFrame", "Result", "Run", "run", "simulate", "sweep"]
+    assert emulator.__all__ == [
+        "Answer",
+        "Moment",
+        "RadioFrame",
+        "Result",
+        "Run",
+        "environment",
+        "run",
+        "simulate",
+        "sweep",
+    ]
     for name in emulator.__all__:
         assert inspect.getdoc(getattr(emulator, name)), name
         assert name in dir(emulator)

@@ -67,6 +67,11 @@ class DrivenWorld(World):
         """Return the mask (N,) of the vehicles that are present in `period`."""
         return np.asarray(np.isfinite(self.position_m(period)[:, 0]))
 
+    @property
+    def last_known_period(self) -> int:
+        """The last period that vehicles have come to."""
+        return self._known - 1
+
     def position_m(self, period: int) -> Array:
         """Return the positions (N, 2) at the start of `period`; NaN for an absent vehicle.
 

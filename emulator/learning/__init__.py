@@ -1,0 +1,1 @@
+"""Learning: a run as an environment of PettingZoo, whose agents are vehicles."""

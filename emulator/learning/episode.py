@@ -1,0 +1,207 @@
+"""Episodes: runs whose vehicles await what agents outside of the run have them do.
+
+The run is simulated on a thread of its own. A microsecond after the fixes of a period it stops, in the midst of
+emulated time, with what all agents have observed, and goes on when it is told what each is to do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextvars import Context
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.simulate import simulate
+from emulator.records.run_folder import Event, RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import build_world
+from vnet.node import Fix, Node
+from vnet.radio import Packet
+from vnet.runtime.programs import given_programs
+from vnet.types import Array
+from vnet.units import NS_PER_S
+
+Observe = Callable[[Node, Fix, Sequence[Packet]], Any]
+Act = Callable[[Node, Any], Awaitable[None] | None]
+Reward = Callable[[str, "Moment"], float]
+Ends = Callable[[str, "Moment"], bool]
+
+ENTRY = "emulator.learning.episode:vehicle"
+"""Entry by which a scenario names the program of agents."""
+THINKING_S = 1e-6
+"""Emulated time from the fixes of a period to what agents do."""
+NO_REPLAY = "not warranted: what vehicles did was decided outside of the run"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The truth at the end of a step, from which rewards are made; programs never see it.
+
+    time_s: emulated seconds since the start of the run.
+    position_m: (2,) in m east-north, by node; NaN for a vehicle that is not there.
+    speed_m_s: speed by node, from the way since the step before (0 in the first); NaN as above.
+    events: what has happened since the step before, such as `collision`.
+    actions: what each agent did in this step.
+    """
+
+    time_s: float
+    position_m: Mapping[str, Array]
+    speed_m_s: Mapping[str, float]
+    events: Sequence[Event]
+    actions: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """The functions that the user gives."""
+
+    observe: Observe
+    act: Act
+    reward: Reward
+    terminated: Ends
+
+
+@dataclass(frozen=True)
+class Turn:
+    """Observations of agents at one instant, by node; or that the run is over, and by which error."""
+
+    time_ns: int
+    observed: Mapping[str, Any]
+    over: bool = False
+    error: BaseException | None = None
+
+
+class Episode:
+    """One run: `next_turn` waits for agents to have observed, `answer` lets them act, `close` ends it."""
+
+    def __init__(self, scenario: Scenario, behaviour: Behaviour, out: Path | None) -> None:
+        self._behaviour = behaviour
+        self._scratch = TemporaryDirectory(prefix="vnet-episode-") if out is None else None
+        scenario = with_order_steps(scenario)
+        if self._scratch is None:
+            folder = RunFolder.prepare(out, scenario)
+        else:
+            folder = RunFolder.scratch(Path(self._scratch.name))
+        self.emulation = Emulation(scenario, build_world(scenario), folder)
+        if out is not None:
+            folder.open(scenario)
+        self._keeps = out is not None
+        self._asking: dict[str, tuple[Any, asyncio.Future[Any]]] = {}
+        self._turns: SimpleQueue[Turn] = SimpleQueue()
+        self._answers: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
+        self._stop = threading.Event()
+        self.finished: set[str] = set()
+        """Agents whose episode is over: their programs await nothing any more."""
+        self._thread = threading.Thread(target=self._run, name="vnet episode", daemon=True)
+        self._thread.start()
+
+    # On the caller's thread.
+
+    @staticmethod
+    def agents_of(scenario: Scenario, node_ids: Sequence[str]) -> list[str]:
+        """Return the ids of the vehicles that are agents, present or not."""
+        return [node for node in node_ids if scenario.program.of(node).entry == ENTRY]
+
+    def next_turn(self) -> Turn:
+        """Return what agents have observed, or that the run is over. Raises what has ended it."""
+        turn = self._turns.get()
+        if turn.error is not None:
+            raise turn.error
+        return turn
+
+    def answer(self, actions: Mapping[str, Any]) -> None:
+        """Let the agents that have observed act; those without an action do nothing in this step."""
+        self._answers.put(actions)
+
+    def close(self) -> None:
+        """End the run, wherever it is."""
+        self._stop.set()
+        self._answers.put(None)
+        self._thread.join()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+
+    # On the run's thread.
+
+    def _run(self) -> None:
+        try:
+            with given_programs({ENTRY: self._vehicle}):
+                wall_s, _ = simulate(self.emulation, stop=self._stop)
+            if self._keeps:
+                conclude(self.emulation, wall_s, "simulate", NO_REPLAY)
+        except BaseException as error:
+            self._turns.put(Turn(0, {}, over=True, error=error))
+        else:
+            self._turns.put(Turn(self.emulation.emulated_ns, {}, over=True))
+
+    async def _vehicle(self, node: Node) -> None:
+        """The program of an agent."""
+        async for fix in node.gnss:
+            if node.id in self.finished:
+                return
+            try:
+                observation = self._behaviour.observe(node, fix, node.radio.drain())
+                answered, action = await self._await_action(node.id, fix.time_ns, observation)
+                if answered and (doing := self._behaviour.act(node, action)) is not None:
+                    await doing
+            except Exception as error:  # whoever learns is to know, and not only the run's verdict
+                self._turns.put(Turn(fix.time_ns, {}, over=True, error=error))
+                raise
+
+    async def _await_action(self, node: str, fix_time_ns: int, observation: Any) -> tuple[bool, Any]:
+        """Return whether the agent does anything, and what."""
+        loop = asyncio.get_running_loop()
+        if not self._asking:  # a timer of nobody's: no fault stops it
+            loop.call_later(THINKING_S, self._take_turn, fix_time_ns, context=Context())
+        future: asyncio.Future[tuple[bool, Any]] = loop.create_future()
+        self._asking[node] = observation, future
+        return await future
+
+    def _take_turn(self, time_ns: int) -> None:
+        """Stop emulated time until the caller has answered."""
+        asking, self._asking = self._asking, {}
+        asking = {node: each for node, each in asking.items() if not each[1].done()}  # not of killed programs
+        observed = {node: observation for node, (observation, _) in asking.items()}
+        self._turns.put(Turn(time_ns, observed))
+        answers = self._answers.get()
+        if answers is None:
+            return
+        for node, (_, future) in asking.items():
+            future.set_result((node in answers, answers.get(node)))
+
+
+class Scenes:
+    """The truth of an episode from step to step."""
+
+    def __init__(self, emulation: Emulation) -> None:
+        self._emulation = emulation
+        self._events = 0
+        self._period = 0
+        self._speed = np.zeros(len(emulation.world.node_ids))
+
+    def moment(self, time_ns: int, actions: Mapping[str, Any]) -> Moment:
+        """Return the moment of a step that ends at `time_ns`."""
+        world, events = self._emulation.world, list(self._emulation.folder.events)
+        period = min(time_ns // world.period_ns, world.last_known_period)
+        if period > self._period:
+            way_m = world.position_m(period) - world.position_m(self._period)
+            passed_s = (period - self._period) * world.period_ns / NS_PER_S
+            self._speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
+        new, self._events = events[self._events :], len(events)
+        return Moment(
+            period * world.period_ns / NS_PER_S,
+            dict(zip(world.node_ids, world.position_m(period), strict=True)),
+            dict(zip(world.node_ids, self._speed.tolist(), strict=True)),
+            new,
+            actions,
+        )

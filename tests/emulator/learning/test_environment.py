@@ -1,0 +1,194 @@
+"""`emulator.environment`: PettingZoo's own tests, what agents see and do, and how episodes end."""
+
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+import emulator
+from emulator import Moment
+from vnet import Fix, Node, Packet
+from vnet.errors import VnetError
+
+ROAD = {"road": "ring", "length_m": 1000.0, "gap_m": 40.0, "speed_mps": 10.0}
+
+
+def see(node: Node, fix: Fix, packets: Sequence[Packet]) -> Any:
+    """Observe the receiver's speed, and the number of packets."""
+    assert fix.speed_m_s is not None
+    return np.array([fix.speed_m_s, len(packets)], np.float32)
+
+
+async def drive_and_tell(node: Node, action: Any) -> None:
+    """Accelerate, and say so."""
+    node.drive(acceleration_m_s2=float(action[0]))
+    await node.radio.broadcast(b"driving")
+
+
+def speed_of(agent: str, moment: Moment) -> float:
+    """Reward for speed."""
+    return moment.speed_m_s[agent]
+
+
+def make(road: dict[str, Any] | None = None, duration_s: float = 2.0, **more: Any) -> Any:
+    """Return an environment of four driven vehicles."""
+    scenario = {
+        "network": {"kind": "driven", "vehicles": 4, "driven": ROAD | (road or {})},
+        "run": {"duration_s": duration_s, "settle_s": 0.0},
+        **more.pop("sections", {}),
+    }
+    given: dict[str, Any] = {"observe": see, "act": drive_and_tell, "reward": speed_of} | more
+    given["observation_space"] = Box(-np.inf, np.inf, (2,), np.float32)
+    given["action_space"] = Box(-3, 3, (1,), np.float32)
+    return emulator.environment(scenario, **given)
+
+
+def threads() -> int:
+    """Return the number of episodes whose thread is there."""
+    return sum(thread.name == "vnet episode" for thread in threading.enumerate())
+
+
+def play(env: Any, acceleration: float = 1.0, seed: int = 1) -> list[Any]:
+    """Play an episode with one action for all; returns what each step has returned."""
+    steps = [env.reset(seed=seed)]
+    while env.agents:
+        steps.append(env.step({agent: np.array([acceleration]) for agent in env.agents}))
+    return steps
+
+
+def test_it_passes_pettingzoo_s_test_of_parallel_environments(capsys: pytest.CaptureFixture[str]) -> None:
+    env = make()
+    parallel_api_test(env, num_cycles=40)
+    env.close()
+    assert "Passed Parallel API test" in capsys.readouterr().out
+    assert threads() == 0
+
+
+def test_it_passes_pettingzoo_s_test_of_seeds() -> None:
+    parallel_seed_test(make, num_cycles=30)
+
+
+def test_actions_drive_vehicles_and_frames_are_heard() -> None:
+    steps = play(make(duration_s=3.0))
+    assert len(steps) == 1 + 30
+    last, rewards, terminated, truncated, infos = steps[-1]
+    for agent in ("v01", "v02", "v03", "v04"):
+        speed, heard = last[agent].tolist()
+        assert speed == pytest.approx(10 + 2.6, abs=0.5)  # 2.9 s of 1 m/s², less a lag of 0.3 s
+        assert heard == 3
+        assert rewards[agent] == pytest.approx(speed, abs=0.5)
+        assert (terminated[agent], truncated[agent], infos[agent]) == (False, True, {})
+
+
+def test_an_agent_without_an_action_does_nothing() -> None:
+    env = make()
+    env.reset(seed=1)
+    for _ in range(15):
+        observed, *_ = env.step({"v01": np.array([2.0])})
+    env.close()
+    assert observed["v01"][0] > 11
+    assert observed["v02"].tolist() == pytest.approx([10, 1], abs=0.5)
+    assert observed["v01"][1] == 0
+
+
+def test_each_episode_has_the_next_seed() -> None:
+    env = make()
+    first, second, third = (env.reset(seed=seed)[0]["v01"].tolist() for seed in (5, None, 5))
+    other = make(set={"run.seed": 6})
+    assert first == third != second == other.reset()[0]["v01"].tolist()
+    env.close()
+    other.close()
+
+
+def test_a_vehicle_that_leaves_is_terminated() -> None:
+    road = {"road": "straight", "length_m": 200.0, "start_m": [195.0, 100.0, 60.0, 20.0]}
+    steps = play(make(road), acceleration=0.0)
+    left = next(step for step in steps[1:] if step[2]["v01"])
+    assert [step is left for step in steps].index(True) == 6  # 195 m and 0.6 s of 10 m/s
+    assert "v01" not in steps[-1][0]
+    assert all(steps[-1][3][agent] for agent in ("v02", "v03", "v04"))
+
+
+def test_a_killed_program_s_agent_is_terminated_and_not_revived() -> None:
+    fault = {"kind": "kill", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
+    steps = play(make(sections={"fault": [fault]}))
+    assert ["v02" in step[0] for step in steps] == [True] * 6 + [False] * (len(steps) - 6)
+    assert steps[5][2]["v02"]
+
+
+def test_a_paused_vehicle_s_agent_has_its_last_observation() -> None:
+    fault = {"kind": "pause", "nodes": ["v02"], "at_s": 0.5, "duration_s": 0.3}
+    steps = play(make(sections={"fault": [fault]}))
+    assert all("v02" in step[0] for step in steps)
+    assert steps[5][0]["v02"].tolist() == steps[6][0]["v02"].tolist() != steps[9][0]["v02"].tolist()
+
+
+def test_a_function_may_end_an_agent_s_episode() -> None:
+    env = make({"start_m": [40.0, 30.0, 200.0, 300.0]}, terminated=collided)
+    env.reset(seed=1)
+    over: dict[str, bool] = {}
+    for _ in range(15):
+        given = {agent: np.array([3.0 if agent == "v02" else -8.0]) for agent in env.agents}
+        over |= {agent: True for agent, ended in env.step(given)[2].items() if ended}
+    assert env.agents == ["v01", "v03", "v04"]
+    assert over == {"v02": True}
+    env.close()
+
+
+def collided(agent: str, moment: Moment) -> bool:
+    """Tell whether the agent's vehicle has run into another."""
+    return any(event.kind == "collision" and event.node == agent for event in moment.events)
+
+
+def test_nothing_is_kept_but_in_the_folder_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    play(make())
+    assert list(tmp_path.iterdir()) == []
+    env = make(out="episodes")
+    play(env)
+    play(env)
+    runs = [emulator.Run.open(tmp_path / "episodes" / number) for number in ("1", "2")]
+    assert [run.trace.num_rows for run in runs] == [4 * 3 * 20] * 2
+    (why,) = [each.reason for each in runs[0].not_applicable if each.name == "replay"]
+    assert why == "not warranted: what vehicles did was decided outside of the run"
+
+
+def test_an_error_of_the_user_s_function_is_raised_and_ends_the_episode() -> None:
+    def stumble(node: Node, fix: Fix, packets: Sequence[Packet]) -> Any:
+        return {0: 0}[fix.time_ns]
+
+    env = make(observe=stumble)
+    env.reset(seed=1)
+    with pytest.raises(KeyError, match="100000000"):
+        env.step({})
+    assert threads() == 0
+    with pytest.raises(VnetError, match=r"step: the episode is over, or has not begun: reset\(\)"):
+        env.step({})
+
+
+def test_what_is_wrong_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make()
+    env.reset()
+    with pytest.raises(VnetError, match="step: v09 is no living agent; there are: v01, v02, v03, v04"):
+        env.step({"v09": 0})
+    with pytest.raises(VnetError, match="agent 'v09': there are v01, v02, v03, v04"):
+        env.action_space("v09")
+    env.close()
+    monkeypatch.setitem(sys.modules, "emulator.learning.vehicle_environment", None)
+    monkeypatch.setitem(sys.modules, "pettingzoo", None)
+    with pytest.raises((VnetError, ModuleNotFoundError)):
+        make()
+
+
+def test_an_environment_that_is_dropped_ends_its_episode() -> None:
+    env = make()
+    env.reset()
+    assert threads() == 1
+    del env
+    assert threads() == 0
