@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
 
@@ -50,6 +51,12 @@ class Format(StrEnum):
     PCAPNG = "pcapng"
     MCAP = "mcap"
     CSV = "csv"
+
+
+class Payloads(StrEnum):
+    """Kinds of payloads for which a capture has headers of its own."""
+
+    ITS = "its"
 
 
 def radio(
@@ -115,15 +122,22 @@ def export(
         Path | None,
         typer.Option(help="File, or for csv folder, that does not exist yet; by default in the run's folder."),
     ] = None,
+    payloads: Annotated[
+        Payloads | None,
+        typer.Option(help="Of pcapng: its for CAM and DENM, which then have headers of GeoNetworking and BTP."),
+    ] = None,
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
         chosen = _format(to, out)
+        if payloads is not None and chosen is not Format.PCAPNG:
+            raise VnetError(f"--payloads {payloads.value}: of pcapng, and not of {chosen.value}")
         recorded = RecordedRun.open(run)
         match chosen:
             case Format.PCAPNG:
                 path = out or run / "frames.pcapng"
-                print(f"{_write(path, recorded, write_pcapng):,} packets in {path}")
+                writer = partial(write_pcapng, as_its=payloads is not None)
+                print(f"{_write(path, recorded, writer):,} packets in {path}")
             case Format.MCAP:
                 path = out or run / "run.mcap"
                 print(f"{_write(path, recorded, write_mcap):,} messages in {path}")

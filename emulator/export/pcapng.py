@@ -3,9 +3,10 @@
 Each vehicle is an interface, with the frames that it sent (outbound, at the time they were enqueued or, with
 `[radio.mac]`, went on air) and those delivered to it (inbound, at their arrival). A packet consists of radiotap, a
 QoS data frame of 802.11 outside a BSS (as in 802.11p), LLC and SNAP with the ethertype 0x88B5 for local
-experiments, and the payload. Payloads that the run has not kept, or that a fault has altered, are truncated
-(captured length < length); the digest is in the packet's comment. Frames without a node in range have no rows in
-the trace and are missing. Times are nanoseconds from the start of the run.
+experiments, and the payload; a CAM or DENM may have the headers and the ethertype that it has on air. Payloads that
+the run has not kept, or that a fault has altered, are truncated (captured length < length); the digest is in the
+packet's comment. Frames without a node in range have no rows in the trace and are missing. Times are nanoseconds
+from the start of the run.
 
 Formats: draft-ietf-opsawg-pcapng; radiotap.org. Link type 127 is 802.11 with radiotap.
 """
@@ -21,7 +22,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from emulator.export import geonetworking
+from emulator.export.geonetworking import Router
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from vnet.errors import VnetError
 
 LINKTYPE_RADIOTAP = 127
 """Link type of the interfaces: 802.11 with radiotap."""
@@ -53,8 +57,15 @@ class _Packet:
     row: int
 
 
-def write_pcapng(recorded: OpenedRun, file: BinaryIO) -> int:
-    """Write a run's frames; return the number of packets."""
+def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> int:
+    """Write a run's frames; return the number of packets.
+
+    With `as_its` payloads that are a CAM or a DENM have the headers of GeoNetworking and BTP. Raises VnetError if
+    the run has kept no payloads.
+    """
+    if as_its and recorded.payloads is None:
+        raise VnetError("--payloads its: the run has kept no payloads; run it with --set run.keep_payloads=true")
+    routers = Router() if as_its else None
     file.write(_block(_SECTION, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1) + _option(_APPLICATION, b"vnet")))
     for node in recorded.node_ids:
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
@@ -66,11 +77,16 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO) -> int:
     count = 0
     for packet in _packets(recorded):
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
-        header = radiotap + _frame_header(sender, seq)
         kept = recorded.payloads
         payload = None
         if kept is not None:
             payload = kept.of(recorded.node_ids[sender], seq, comments.digests(packet))
+        ethertype, routed = ETHERTYPE, None
+        if routers is not None and payload is not None:
+            routed = routers.packet(sender, seq, int(recorded.sent_ns[packet.row]), payload)
+        if routed is not None:
+            ethertype, payload, size_bytes = geonetworking.ETHERTYPE, routed, len(routed)
+        header = radiotap + _frame_header(sender, seq, ethertype)
         file.write(_packet_block(packet, header, payload or b"", size_bytes, comments.of(packet)))
         count += 1
     return count
@@ -150,12 +166,12 @@ def _radiotap(bitrate_mbps: float) -> bytes:
     return struct.pack("<BxHI", 0, 8 + len(fields), present) + fields
 
 
-def _frame_header(sender: int, seq: int) -> bytes:
+def _frame_header(sender: int, seq: int, ethertype: int) -> bytes:
     """Return a QoS data header from `sender` to all stations, outside a BSS, without acknowledgement; LLC, SNAP."""
     address = b"\x02\x00" + struct.pack(">I", sender + 1)  # locally administered
     control = struct.pack("<HH", 0x0088, 0)
     mac = control + _BROADCAST + address + _BROADCAST + struct.pack("<HH", (seq & 0xFFF) << 4, 0x0020)
-    return mac + b"\xaa\xaa\x03\x00\x00\x00" + struct.pack(">H", ETHERTYPE)
+    return mac + b"\xaa\xaa\x03\x00\x00\x00" + struct.pack(">H", ethertype)
 
 
 def _packet_block(packet: _Packet, header: bytes, payload: bytes, size_bytes: int, comment: str) -> bytes:
