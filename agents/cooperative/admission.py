@@ -87,12 +87,13 @@ class Admission(Generic[F]):
             except FrameError as error:
                 self.rejected[str(error)] += 1
         admitted = []
+        period_ns = now_ns - now_ns % self._period_ns
         for node, frame in frames:
             sender = short_name(node)
             reason = self._objection(sender, frame, now_ns)
             if reason:
                 self.rejected[reason] += 1
-            elif frame.fix_time_ns > now_ns - now_ns % self._period_ns:
+            elif frame.fix_time_ns > period_ns:
                 self._early[sender, frame.fix_time_ns] = node, frame
             else:
                 self.ids[sender] = node
@@ -110,8 +111,8 @@ class Admission(Generic[F]):
             return "absurd"
         if sender not in self._newest_ns and len(self._newest_ns) + len(self._early) >= MAX_SENDERS:
             return "too_many_senders"
-        known = (sender, frame.fix_time_ns) in self._early or self._newest_ns.get(sender, -1) >= frame.fix_time_ns
-        if known and not self._several:
+        known = self._newest_ns.get(sender, -1) >= frame.fix_time_ns
+        if (known or (self._early and (sender, frame.fix_time_ns) in self._early)) and not self._several:
             return "duplicate"
         return None if self.claim(sender, frame.fix_time_ns, frame.fingerprint) else "replayed"
 

@@ -6,6 +6,7 @@ It has neither input nor output of its own: `program` brings the packets and the
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -247,8 +248,9 @@ class Estimator:
 
 def usable(fix: Fix) -> bool:
     """Tell whether a fix can be filtered and sent: receivers fail, too."""
-    numbers = [*fix.position_m, *fix.covariance_m2.ravel(), fix.heading_rad or 0.0]
-    return bool(np.isfinite(numbers).all() and np.abs(fix.position_m).max() <= POSITION_LIMIT_M)
+    position_m = fix.position_m.tolist()
+    numbers = (*position_m, *fix.covariance_m2.ravel().tolist(), fix.heading_rad or 0.0)
+    return all(map(math.isfinite, numbers)) and max(map(abs, position_m)) <= POSITION_LIMIT_M
 
 
 def _known(sender: str, frame: CooperativeFrame) -> frozenset[str]:

@@ -9,6 +9,7 @@ share that the pooled priors do not hold.
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -26,6 +27,8 @@ from agents.cooperative.information_frame import (
     InformationFrame,
     decode,
     encode,
+    packed_numbers,
+    passed_record,
     room,
 )
 from agents.cooperative.options import Options
@@ -35,6 +38,7 @@ from vnet.cmm.information import Information
 from vnet.cmm.own_vehicle import own_vehicle
 from vnet.cmm.plausibility import (
     INCREMENT_FACTOR,
+    MAX_ORIGINS,
     PRIOR_FACTOR,
     SELF_SHARE,
     SPREAD_GATE,
@@ -42,7 +46,6 @@ from vnet.cmm.plausibility import (
     cut_to,
     matrices,
     median_belief,
-    prior_moments,
     priors_agree,
     scaled_down,
     spread_limit_m,
@@ -65,10 +68,16 @@ MAX_FORGED_SHARE = 0.5
 """Share of the increments that are known first-hand, beyond which a frame that passes on others is forged."""
 
 
+_SENT = struct.Struct("<5f")
+_NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0)
+_ROW = 15
+"""Numbers of a vehicle: prior, increment, and the prior's mean and covariance."""
+
+
 def as_sent(information: Information) -> tuple[float, ...]:
     """Return the five numbers of `information` with the precision in which frames carry them."""
     (a, b), (_, d) = information.matrix.tolist()
-    return tuple(np.array([a, b, d, *information.vector], dtype="<f4").tolist())
+    return _SENT.unpack(_SENT.pack(a, b, d, *information.vector.tolist()))
 
 
 class InformationEstimator:
@@ -106,11 +115,12 @@ class InformationEstimator:
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
         self._contradicted = 0
-        self._prior = np.array(as_sent(self.own.prior))
-        self._increment = np.zeros(5)
+        self._prior = as_sent(self.own.prior)
+        self._increment: tuple[float, ...] = _NOTHING
         self._largest_increment = 0.0
-        self._code = _code(self.name)
-        self._used = np.array([self._code], dtype=np.uint32), self._increment[None].astype(np.float16)
+        self._code = int(self.name, 16)
+        self._used = passed_record(self._code, self._increment)
+        self._passing = Passing()
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
     @property
@@ -146,9 +156,12 @@ class InformationEstimator:
             return
         dt_s, self._now_ns = (own.time_ns - self._now_ns) / NS_PER_S, own.time_ns
         fix = Observation(own.position_m, own.covariance_m2, own.heading_rad) if usable(own) else None
-        increment = np.array(as_sent(self.own.step(dt_s, fix)))
-        self._increment = increment * min(1.0, INCREMENT_LIMIT / max(np.abs(increment).max(), 1.0))
-        self._prior = np.array(as_sent(self.own.prior))
+        increment = as_sent(self.own.step(dt_s, fix))
+        largest = max(map(abs, increment))
+        if largest > INCREMENT_LIMIT:
+            increment = tuple(value * (INCREMENT_LIMIT / largest) for value in increment)
+        self._increment = increment
+        self._prior = as_sent(self.own.prior)
 
     def filter(self, own: Fix) -> None:
         """Take the vehicle's own fix, if that has not been done to compose a frame."""
@@ -161,29 +174,30 @@ class InformationEstimator:
         }
         self._frames = {}
         # What this vehicle says itself is the first row of all.
-        table = np.array(
-            [[*self._prior, *self._increment, *prior_moments(*self._prior.tolist())]]
-            + [frame.numbers for frame in frames.values()]
-        )
-        said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
-        believed = self._believed(list(frames), said, means_m, covariances_m2)
-        if not believed.all():
-            frames = {name: frames[name] for name, good in zip(frames, believed[1:].tolist(), strict=True) if good}
-            table = table[believed]
-            said, means_m, covariances_m2 = table[:, :10], table[:, 10:12], matrices(table[:, 12:])
-        names = list(frames)
-        priors, means_m, leaning = self._moderated(names, said[:, :5], means_m, table[:, 12:])
+        rows = [packed_numbers(self._prior, self._increment), *[frame.numbers for frame in frames.values()]]
+        table = np.frombuffer(b"".join(rows)).reshape(-1, _ROW)
+        codes = [frame.code for frame in frames.values()]
+        believed = self._believed(codes, table)
+        if believed is not None:
+            frames = {name: frames[name] for name, good in zip(frames, believed, strict=True) if good}
+            codes = [frame.code for frame in frames.values()]
+            table = table[[True, *believed]]
+        said, means_m = table[:, :10], table[:, 10:12]
+        priors, means_m, leaning = self._moderated(codes, said[:, :5], means_m, table[:, 12:])
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
-            self.mean_m = tracked_mean(means_m.sum(axis=0) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE)
+            self.mean_m = tracked_mean(
+                np.add.reduce(means_m) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE
+            )
         priors, increments = self._limited(priors, said[:, 5:])
-        weights = self._weigh(frames, means_m, covariances_m2, leaning)
-        pooled = weights @ priors + increments.sum(axis=0)
+        weights = self._weigh(frames, means_m, matrices(table[:, 12:]), leaning)
+        pooled = weights @ priors + np.add.reduce(increments)
         passed = self._passed_on(frames, weights)
-        pooled += passed.sum(axis=0)
-        self.imported = len(names) + len(passed)
-        self._used = np.array([self._code, *map(_code, names)], dtype=np.uint32), said[:, 5:].astype(np.float16)
+        pooled += np.add.reduce(passed)
+        self.imported = len(frames) + len(passed)
+        own = passed_record(self._code, self._increment)
+        self._used = b"".join([own, *[frame.record for frame in frames.values()]])
         if self.imported:
             self.own.absorb(Information(matrices(pooled[None])[0], pooled[3:]))
         self.fused_m = self.own.estimate_m
@@ -197,20 +211,25 @@ class InformationEstimator:
         self.rejected["late"] += 1
         return False
 
-    def _believed(self, names: list[str], said: Array, means_m: Array, covariances_m2: Array) -> NDArray[np.bool_]:
-        """Tell which rows (1 + n,) of priors and increments are plausible; the vehicle's own are the first."""
-        believed = np.ones(len(said), dtype=np.bool_)
-        if not self._options.defence or not names:
-            return believed
-        own = means_m[0], covariances_m2[0]
-        near = priors_agree(means_m[1:], covariances_m2[1:], *own)
-        agrees = self._origins.agree([_code(name) for name in names], said[1:, 5:], own, self._now_ns / NS_PER_S)
+    def _believed(self, codes: list[int], table: Array) -> list[bool] | None:
+        """Tell which of the senders `codes` (n,) are plausible, None if all are.
+
+        `table` (1 + n, 15) has what they say, and first what the vehicle says itself.
+        """
+        if not self._options.defence or not codes:
+            return None
+        own, others = table[0], table[1:]
+        own_m2 = matrices(own[None, 12:])[0]
+        near = priors_agree(others[:, 10:12], others[:, 12:], own[10:12], own[12:])
+        agrees = self._origins.agree(codes, others[:, 5:10], (own[10:12], own_m2), self._now_ns / NS_PER_S)
         agrees = unless_most_disagree(agrees)
-        self._notice_being_lost(near, said[1:, :5])
+        self._notice_being_lost(near, others[:, :5])
+        believed = near & agrees
+        if np.count_nonzero(believed) == len(codes):
+            return None
         self._reject("prior", ~near)
         self._reject("increment", near & ~agrees)
-        believed[1:] = near & agrees
-        return believed
+        return [bool(good) for good in believed]
 
     def _reject(self, reason: str, which: NDArray[np.bool_]) -> None:
         """Count what is not used."""
@@ -225,26 +244,24 @@ class InformationEstimator:
             self._contradicted = 0
             self._origins = Origins()
             self.own.restart(median_belief(priors))
-            self._prior = np.array(as_sent(self.own.prior))
-            self._increment = np.zeros(5)
+            self._prior, self._increment = as_sent(self.own.prior), _NOTHING
 
     def _moderated(
-        self, names: list[str], priors: Array, means_m: Array, variances_m2: Array
+        self, codes: list[int], priors: Array, means_m: Array, variances_m2: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the priors (1 + n, 5) of the vehicle and of `names`, and their means, none far from their median.
+        """Return the priors (1 + n, 5) of the vehicle and of `codes`, and their means, none far from their median.
 
         `variances_m2` (1 + n, 3) are those of the means (1 + n, 2). No vehicle is dropped: where a few hear what
         the others cannot know, they are always off, and right. The last value (1 + n,) tells which always are.
         """
         leaning = np.zeros(len(means_m), dtype=np.bool_)
-        if not self._options.defence or not names:
+        if not self._options.defence or not codes:
             self.limit_m = np.inf
             return priors, means_m, leaning
         median_m, self.limit_m = spread_limit_m(means_m)
         if self.limit_m == np.inf:
             median_m = means_m[0]
         off_m = means_m[1:] - median_m
-        codes = [_code(name) for name in names]
         now_s = self._now_ns / NS_PER_S
         less_m, leaning[1:] = self._origins.without_lean(codes, off_m, variances_m2[1:] + variances_m2[0], now_s)
         less_m = cut_to(less_m, self.limit_m)
@@ -264,7 +281,7 @@ class InformationEstimator:
         traces = (increments[:, 0] + increments[:, 2]).tolist()
         usual = INCREMENT_FACTOR * max(traces[0], sorted(traces)[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
-        largest = PRIOR_FACTOR * _trace(self._prior)
+        largest = PRIOR_FACTOR * (self._prior[0] + self._prior[2])
         return scaled_down(priors, largest), scaled_down(increments, self._largest_increment)
 
     def _weigh(
@@ -282,8 +299,9 @@ class InformationEstimator:
         degrees = [len(frame.heard) for frame in frames.values()]
         weights = self._rule.weights(means_m, covariances_m2, self.mean_m, degrees)
         if self._options.defence:
-            weights = np.where(leaning, 0.0, (1 - SELF_SHARE) * weights)
-            weights[0] += 1 - weights.sum()
+            weights = (1 - SELF_SHARE) * weights
+            weights[leaning] = 0.0
+            weights[0] += 1 - np.add.reduce(weights)
         ids = [self._node_id, *(self._admission.ids[name] for name in frames)]
         self.weights = dict(zip(ids, weights.tolist(), strict=True))
         return weights
@@ -292,49 +310,46 @@ class InformationEstimator:
 
     def _passed_on(self, frames: Mapping[str, InformationFrame], weights: Array) -> Array:
         """Return the increments (m, 5) of the last period from out of range, less what the pooled priors hold."""
-        own_codes, own_increments = self._used
-        counts = [len(own_codes), *(len(frame.passed) for frame in frames.values())]
-        if sum(counts) == len(own_codes):
+        said = [self._used, *[frame.passed_records for frame in frames.values()]]
+        counts = [len(records) // PASSED.itemsize for records in said]
+        joined = b"".join(said)
+        records = np.frombuffer(joined, dtype=PASSED)
+        if len(records) == counts[0]:
             return np.zeros((0, 5))
-        codes = np.concatenate([own_codes, *(frame.passed_codes for frame in frames.values())])
-        numbers = np.concatenate([own_increments, *(frame.passed_numbers for frame in frames.values())])
-        sender = np.repeat(np.arange(len(counts)), counts)
-        first, index = first_of_each(codes)
-        origin = codes[first]
-        forged = self._forged(numbers, sender, first[index], len(counts))
-        if forged.any():
-            weights = np.where(forged, 0.0, weights)
-        share = np.bincount(index, weights=weights[sender], minlength=len(origin))
-        new = (first >= len(own_codes)) & (share < 1) & ~forged[sender[first]]
-        if not new.any():
+        index = self._passing.index(records["name"])
+        origins = self._passing.codes
+        # The first row of each origin, 0 where it has none; the vehicle's own rows are the first of all.
+        first = np.zeros(len(origins), dtype=np.intp)
+        first[index[::-1]] = np.arange(len(records) - 1, -1, -1)
+        weight = np.repeat(weights, counts)
+        new = first >= counts[0]
+        if self._options.defence and (differs := _differing(joined, first.take(index))) is not None:
+            forged = self._forged(differs, np.repeat(np.arange(len(counts)), counts), first[index] < counts[0])
+            weight[forged] = 0.0
+            new &= ~forged[first]
+        share = np.bincount(index, weights=weight, minlength=len(origins))
+        rows = np.flatnonzero(new & (share < 1))
+        if not len(rows):
             return np.zeros((0, 5))
-        increments = numbers[first[new]] * (PASSED_SHARE * (1 - share[new]))[:, None]
+        numbers = records["information"][first.take(rows)].astype(np.float64)
+        increments = numbers * (PASSED_SHARE * (1 - share.take(rows)))[:, None]
         if not self._options.defence:
             return np.asarray(increments)
-        agrees = self._origins.agree(origin[new].tolist(), increments, self.own.belief, self._now_ns / NS_PER_S)
-        if not agrees.all():
+        origin = origins.take(rows).tolist()
+        agrees = self._origins.agree(origin, increments, self.own.belief, self._now_ns / NS_PER_S)
+        if np.count_nonzero(agrees) < len(rows):
             self._reject("passed", ~agrees)
             increments = increments[agrees]
         return scaled_down(increments, self._largest_increment)
 
     def _forged(
-        self, numbers: Array, sender: NDArray[np.intp], first: NDArray[np.intp], count: int
+        self, differs: NDArray[np.bool_], sender: NDArray[np.intp], known: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Tell which of `count` senders pass on false increments: most of those that are known first-hand differ.
-
-        `numbers` (m, 5) are the increments and `first` (m,) the first row of each one's origin; the vehicle's own
-        rows are the first.
-        """
-        if not self._options.defence:
-            return np.zeros(count, dtype=np.bool_)
-        known = first < len(self._used[0])
-        differs = known & (numbers != numbers[first]).any(axis=1)
-        if not differs.any():
-            return np.zeros(count, dtype=np.bool_)
-        false = np.bincount(sender[differs], minlength=count)
-        forged = np.asarray(false > MAX_FORGED_SHARE * np.bincount(sender[known], minlength=count))
+        """Tell which rows (m,) are of senders that forge: most of what they pass on that is `known` differs."""
+        false = np.bincount(sender[differs & known], minlength=sender[-1] + 1)
+        forged = np.asarray(false > MAX_FORGED_SHARE * np.bincount(sender[known], minlength=sender[-1] + 1))
         self._reject("forged", forged)
-        return forged
+        return np.asarray(forged[sender])
 
     # What goes out.
 
@@ -350,41 +365,45 @@ class InformationEstimator:
         share = self._share
         heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
         limit = min(self._options.relay_increments, room(len(heard), max_payload))
+        used = np.frombuffer(self._used, dtype=PASSED)
         return InformationFrame(
             name=self.name,
             fix_time_ns=fix.time_ns,
-            prior=tuple(self._prior.tolist()),
-            increment=tuple(self._increment.tolist()),
+            prior=self._prior,
+            increment=self._increment,
             epoch=share.epoch,
             running_sum=share.running_sum,
             heard=heard,
-            passed=_records(*self._used)[_in_turns(len(self._used[0]), limit, fix.time_ns // self._period_ns)],
+            passed=used[_in_turns(len(used), limit, fix.time_ns // self._period_ns)],
             largest_degree=min(self._rule.largest_degree, MAX_DEGREE),
         )
 
 
-def _code(name: str) -> int:
-    """Return the code of a short name; `name_of_code` is the inverse."""
-    return int(name, 16)
+class Passing:
+    """The origins of increments that are passed on.
+
+    codes: (n,), sorted; they are kept from period to period, because to find a code is less work than to sort.
+    """
+
+    def __init__(self) -> None:
+        self.codes = np.empty(0, dtype=np.uint32)
+
+    def index(self, codes: NDArray[np.uint32]) -> NDArray[np.intp]:
+        """Return the index (m,) of each of `codes` (m,) in `self.codes`; new ones are added."""
+        if len(self.codes):
+            index = np.minimum(self.codes.searchsorted(codes), len(self.codes) - 1)
+            if np.count_nonzero(self.codes.take(index) == codes) == len(codes):
+                return np.asarray(index)
+        kept = self.codes[: MAX_ORIGINS if len(self.codes) < MAX_ORIGINS else 0]
+        self.codes = np.unique(np.concatenate([kept, codes]))
+        return self.codes.searchsorted(codes)
 
 
-def _records(codes: NDArray[np.uint32], increments: NDArray[np.float16]) -> NDArray[np.void]:
-    """Return records (n,) of `PASSED` of the increments (n, 5) of these origins."""
-    records = np.empty(len(codes), dtype=PASSED)
-    records["name"] = codes
-    records["information"] = increments
-    return records
-
-
-def first_of_each(codes: NDArray[np.uint32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first row of each origin in `codes` (m,), by code, and the number (m,) of each row's origin."""
-    order = codes.argsort(kind="stable")
-    ordered = codes[order]
-    starts = np.ones(len(codes), dtype=np.bool_)
-    np.not_equal(ordered[1:], ordered[:-1], out=starts[1:])
-    index = np.empty(len(codes), dtype=np.intp)
-    index[order] = starts.cumsum() - 1
-    return order[starts], index
+def _differing(records: bytes, first: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+    """Tell which rows (m,) of `records` are not equal to their `first` (m,), None if there are none."""
+    entries = np.frombuffer(records, dtype=np.uint16).reshape(len(first), -1)
+    differs = entries != entries.take(first, axis=0)
+    return differs.any(axis=1) if np.count_nonzero(differs) else None
 
 
 def _in_turns(count: int, limit: int, period: int) -> NDArray[np.intp] | slice:
@@ -393,8 +412,3 @@ def _in_turns(count: int, limit: int, period: int) -> NDArray[np.intp] | slice:
         return slice(None)
     turned = 1 + (np.arange(limit - 1) + period * limit) % (count - 1)
     return np.append(0, turned)[:limit]
-
-
-def _trace(information: Array) -> float:
-    """Return the trace of the matrix of information (5,)."""
-    return float(information[0] + information[2])

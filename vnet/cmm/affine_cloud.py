@@ -8,6 +8,8 @@ the deviations that it had when it was last weighed; maps are composed, and one 
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 
 from vnet.cmm.common_error import systematic
@@ -18,7 +20,35 @@ DIFFUSING = 2
 LEAST_VARIANCE_M2 = 1e-4
 """Variance (m²) that is added to those of the coordinates that diffuse: so few particles may be left that their own
 is none, and nothing is known to a centimetre."""
+MAX_SHAPES = 32
+"""Number of shapes of which an array is kept: the number of particles may vary."""
 _ROOT_HALF = np.sqrt(0.5)
+
+
+class _Scratch(threading.local):
+    """An array of each shape that clouds of a thread write to in turns.
+
+    New arrays would be cleared pages, and one for each of many clouds would not stay in the processor's caches.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[int, ...], Array] = {}
+
+    def of(self, basis: Array) -> Array:
+        """Return an array of the shape of `basis` whose last row is ones."""
+        array = self._arrays.get(basis.shape)
+        if array is None:
+            if len(self._arrays) >= MAX_SHAPES:
+                self._arrays.clear()
+            array = self._arrays[basis.shape] = np.ones_like(basis)
+        return array
+
+    def keep(self, basis: Array) -> None:
+        """Keep `basis`, whose last row is ones, in place of what `of` has returned."""
+        self._arrays[basis.shape] = basis
+
+
+_scratch = _Scratch()
 
 
 class AffineCloud:
@@ -31,9 +61,8 @@ class AffineCloud:
     def __init__(self, points: Array, log_weight: Array) -> None:
         """Begin with `points` (n, K) and the logarithms (K,) of their weights."""
         self._size, count = points.shape
-        # Deviations from the origin, noise, a row of ones. Arrays are reserved: new ones would be cleared pages.
+        # Deviations from the origin, noise, a row of ones.
         self._basis = np.ones((self._size + DIFFUSING + 1, count))
-        self._spare = np.ones_like(self._basis)
         self._unmoved = np.eye(self._size, self._size + DIFFUSING + 2)
         self._linear = self._unmoved
         self.covariance = np.zeros((self._size, self._size))
@@ -96,18 +125,17 @@ class AffineCloud:
         self.weight = self._normalized()
         if count != len(self.weight) or 1 / self.weight.dot(self.weight) < count / 2:
             index = systematic(self.weight, count, rng)
-            taken = self._basis.take(index, axis=1)
-            if count != len(self.weight):
-                self._spare = np.ones_like(taken)
-            self._basis = taken
+            self._basis = self._basis.take(index, axis=1)
             self._log_weight = np.zeros(count)
             self.weight = np.full(count, 1 / count)
         self._take_moments(origin)
 
     def _carry_out(self, affine: Array) -> None:
         """Replace the first rows of the basis by `affine` times all of it."""
-        np.matmul(affine, self._basis, out=self._spare[: len(affine)])
-        self._basis, self._spare = self._spare, self._basis
+        spare = _scratch.of(self._basis)
+        np.matmul(affine, self._basis, out=spare[: len(affine)])
+        _scratch.keep(self._basis)
+        self._basis = spare
 
     def _normalized(self) -> Array:
         self._log_weight -= self._log_weight.max()
@@ -119,7 +147,7 @@ class AffineCloud:
         """Compute the moments of the deviations from `origin` (n,), near the mean, and forget all moves."""
         off = self._basis[: self._size]
         mean_off = off.dot(self.weight)
-        weighted = self._spare[: self._size]
+        weighted = _scratch.of(self._basis)[: self._size]
         for row, out in zip(off, weighted, strict=True):  # in half the time of one call for all rows
             np.multiply(row, self.weight, out=out)
         self.covariance = weighted.dot(off.T) - mean_off[:, None] * mean_off

@@ -96,37 +96,49 @@ class Peers:
     def __init__(self, node: str, silence_rounds: int) -> None:
         self._node = node
         self._silence_rounds = silence_rounds
-        self._silent: dict[str, int] = {}
+        self._round = 0
+        self._received: dict[str, int] = {}  # the round in which each was received last
         self._hears_us: dict[str, bool] = {}
+        self._heard: frozenset[str] | None = None
+        self._mutual: frozenset[str] | None = None
 
     @property
     def heard(self) -> frozenset[str]:
         """Peers received lately."""
-        return frozenset(self._silent)
+        if self._heard is None:
+            self._heard = frozenset(self._received)
+        return self._heard
 
     @property
     def mutual(self) -> frozenset[str]:
         """Peers received lately that receive this node as well."""
-        return frozenset(peer for peer, hears in self._hears_us.items() if hears)
+        if self._mutual is None:
+            self._mutual = frozenset(peer for peer, hears in self._hears_us.items() if hears)
+        return self._mutual
 
     def longest_silence(self, peers: Set[str]) -> int:
         """Number of rounds since the most silent of `peers` was received."""
-        return max((self._silent.get(peer, 0) for peer in peers), default=0)
+        return max([self._round - self._received.get(peer, self._round) for peer in peers], default=0)
 
     def drop(self, peer: str) -> None:
         """Forget a peer at once."""
-        self._silent.pop(peer, None)
+        self._received.pop(peer, None)
         self._hears_us.pop(peer, None)
+        self._heard = self._mutual = None
 
     def listen(self, shares: Mapping[str, Share]) -> None:
         """Take note of one round's shares."""
-        for peer in list(self._silent):
-            self._silent[peer] += 1
-            if self._silent[peer] > self._silence_rounds:
-                del self._silent[peer], self._hears_us[peer]
+        self._round += 1
+        oldest = self._round - self._silence_rounds
+        if min(self._received.values(), default=oldest) < oldest:
+            for peer in [peer for peer, received in self._received.items() if received < oldest]:
+                self.drop(peer)
         for peer, share in shares.items():
-            self._silent[peer] = 0
-            self._hears_us[peer] = self._node in share.heard
+            self._received[peer] = self._round
+            hears = self._node in share.heard
+            if self._hears_us.get(peer) is not hears:
+                self._hears_us[peer] = hears
+                self._heard = self._mutual = None
 
 
 class RatioConsensus:
@@ -169,7 +181,7 @@ class RatioConsensus:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
         shares = self._believed(value, shares)
         self._peers.listen(shares)
-        self._highest = max([self._highest, *(share.epoch for share in shares.values())])
+        self._highest = max([self._highest, *[share.epoch for share in shares.values()]])
         self._follow(value)
         for peer in sorted(shares):
             self._take(peer, shares[peer])
@@ -185,15 +197,16 @@ class RatioConsensus:
         Mass that such a peer has been given is lost until a new epoch starts without it; the ratio of what is left
         is the mean all the same.
         """
-        leak = 1 / self._config.forgive_rounds
-        self._penalties = {
-            p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
-        }
+        if self._penalties:
+            leak = 1 / self._config.forgive_rounds
+            self._penalties = {
+                p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
+            }
         self._penalize_new_epochs(shares)
         x, y = value.tolist()
         believed = {}
         for peer, share in shares.items():
-            if self._penalty(peer) > self._config.ban_penalty:
+            if self._penalties and self._penalty(peer) > self._config.ban_penalty:
                 self._rejected["banned"] += 1
             elif not self._is_plausible(peer, share, x, y):
                 self._rejected["implausible_mass"] += 1
@@ -207,7 +220,7 @@ class RatioConsensus:
 
         They share the penalty: the peer that starts an epoch brings it alone, peers that hand it on do so together.
         """
-        newest = max((share.epoch for share in shares.values()), default=0)
+        newest = max([share.epoch for share in shares.values()], default=0)
         if newest > self._highest > 0:  # a node that joins finds the others further on, which is no fault of theirs
             first = [peer for peer, share in shares.items() if share.epoch == newest]
             for peer in first:
@@ -279,8 +292,9 @@ class RatioConsensus:
         weight = w * (len(self._out_neighbours) + 1)  # before it was split
         self._usual_weight += (weight - self._usual_weight) / USUAL_ROUNDS
         settled = self.epoch and self._age >= self._config.settle_rounds
-        doubtful = self._peers.longest_silence(self._out_neighbours) >= DOUBTFUL_ROUNDS
-        if settled and not doubtful and weight >= MIN_WEIGHT_SHARE * self._usual_weight:
+        if not settled or weight < MIN_WEIGHT_SHARE * self._usual_weight:
+            return
+        if self._peers.longest_silence(self._out_neighbours) < DOUBTFUL_ROUNDS:
             self._mean, self._mean_rounds = np.array([s_x / w, s_y / w]), 0
 
     def _split(self) -> None:

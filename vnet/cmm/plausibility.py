@@ -76,7 +76,7 @@ def prior_moments(a: float, b: float, d: float, x: float, y: float) -> tuple[flo
 def scaled_down(information: Array, largest_trace: float) -> Array:
     """Return information (n, 5) with traces of at most `largest_trace`; means stay."""
     trace = information[:, 0] + information[:, 2]
-    if not len(trace) or trace.max() <= largest_trace:
+    if not len(trace) or np.maximum.reduce(trace) <= largest_trace:
         return information
     return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
 
@@ -84,6 +84,22 @@ def scaled_down(information: Array, largest_trace: float) -> Array:
 def deviation(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
     """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for information (n, 5) about c ~ N(x, P): (n,)."""
     return _squared(_compared(information, mean_m, covariance_m2))
+
+
+_LAYOUT = np.array(
+    [
+        [2, 3, 0, 0, 0],
+        [0, 2, 3, 0, 0],
+        [0, 4, 0, 0, 0],
+        [0, 0, 4, 0, 0],
+        [5, 6, 0, 1, 0],
+        [0, 5, 6, 0, 1],
+        [1, 0, 0, 0, 0],
+        [0, 1, 0, 0, 0],
+        [0, 0, 1, 0, 0],
+    ]
+)
+"""Indices into 0, 1, C (xx, yx, yy), −x: a row for each term of `_compared`, a column for each number."""
 
 
 def _compared(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
@@ -95,41 +111,40 @@ def _compared(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
     c_xx = math.sqrt(p)
     c_yx = q / c_xx
     c_yy = math.sqrt(max(r - c_yx * c_yx, 0.0))
-    factors = np.array(
-        [
-            [c_xx, c_yx, 0.0, 0.0, 0.0],
-            [0.0, c_xx, c_yx, 0.0, 0.0],
-            [0.0, c_yy, 0.0, 0.0, 0.0],
-            [0.0, 0.0, c_yy, 0.0, 0.0],
-            [-mean_x, -mean_y, 0.0, 1.0, 0.0],
-            [0.0, -mean_x, -mean_y, 0.0, 1.0],
-            [1.0, 0.0, 0.0, 0.0, 0.0],
-            [0.0, 1.0, 0.0, 0.0, 0.0],
-            [0.0, 0.0, 1.0, 0.0, 0.0],
-        ]
-    )
+    factors = np.array([0.0, 1.0, c_xx, c_yx, c_yy, -mean_x, -mean_y]).take(_LAYOUT)
     return np.asarray(factors.dot(information.T))
 
 
+_LEFT, _RIGHT = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5]), np.array([0, 1, 1, 2, 3, 3, 4, 5, 5])
+"""Rows of the factors of the products xx, xy, yy of both columns of Λ C and of r."""
+
+
 def _squared(compared: Array) -> Array:
-    """Return the squared deviations (n,) of terms (9, n)."""
-    squares = compared[:6] * compared[:6]
-    u_x, u_y, v_x, v_y, off_x, off_y, _, noise_xy, _ = compared
-    total = squares[:2] + squares[2:4] + compared[6::2]
-    total_xy = noise_xy + u_x * u_y + v_x * v_y
+    """Return the squared deviations (…, n) of terms (9, …, n)."""
+    products = compared.take(_LEFT, axis=0)
+    products *= compared.take(_RIGHT, axis=0)
+    total = products[:3]
+    total += products[3:6]
+    total += compared[6:9]
     # A lane says nothing along itself: rounding there is not counted.
-    total += 1e-4 * (total[0] + total[1]) + 1e-9
-    total_x, total_y = total
-    squared = total_y * squares[4] - 2 * total_xy * off_x * off_y + total_x * squares[5]
-    return np.asarray(squared / (total_x * total_y - total_xy * total_xy))
+    total[::2] += 1e-4 * (total[0] + total[2]) + 1e-9
+    x, xy, y = total
+    squared = products[6:]
+    squared *= total[::-1]
+    squared[0] += squared[2]
+    squared[0] -= 2 * squared[1]
+    return np.asarray(squared[0] / (x * y - xy * xy))
 
 
-def priors_agree(
-    mean_m: Array, covariance_m2: Array, own_mean_m: Array, own_covariance_m2: Array
-) -> NDArray[np.bool_]:
-    """Tell which priors with means (n, 2) and covariances (n, 2, 2) are near one's own."""
-    total, off = covariance_m2 + own_covariance_m2, mean_m - own_mean_m
-    a, b, d, x, y = total[:, 0, 0], total[:, 0, 1], total[:, 1, 1], off[:, 0], off[:, 1]
+def priors_agree(mean_m: Array, variance_m2: Array, own_mean_m: Array, own_variance_m2: Array) -> NDArray[np.bool_]:
+    """Tell which priors with means (n, 2) and covariances (n, 3), entries (xx, xy, yy), are near one's own."""
+    total, off = (variance_m2 + own_variance_m2).T, (mean_m - own_mean_m).T
+    (a, b, d), (x, y) = total, off
+    # Deviations that are small even where the least variance is: those of nearly all.
+    squares, determinant = off * off, a * d - b * b
+    near = (squares[0] + squares[1]) * (a + d) < PRIOR_GATE * determinant
+    if np.count_nonzero(near) == len(near):
+        return np.asarray(near)
     return np.asarray((d * x * x - 2 * b * x * y + a * y * y) < PRIOR_GATE * (a * d - b * b))
 
 
@@ -150,14 +165,15 @@ def spread_limit_m(means_m: Array) -> tuple[Array, float]:
 def cut_to(off_m: Array, limit_m: float) -> Array:
     """Return offsets (n, 2) with lengths of at most `limit_m`."""
     squared = off_m[:, 0] ** 2 + off_m[:, 1] ** 2
-    if squared.max() <= limit_m**2:
+    if max(squared.tolist()) <= limit_m**2:
         return off_m
     return np.asarray(off_m * np.minimum(1.0, limit_m / np.sqrt(np.maximum(squared, 1e-300)))[:, None])
 
 
 def _median(values: Array) -> Array:
     """Return the median of the rows of `values` (n, …): numpy's takes six times as long where they are few."""
-    ordered, count = np.sort(values, axis=0), len(values)
+    ordered, count = values.copy(), len(values)
+    ordered.sort(axis=0)
     return np.asarray((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)
 
 
@@ -173,8 +189,7 @@ class Memory:
 
     def __init__(self, size: int) -> None:
         self._row: dict[int, int] = {}
-        self._numbers = np.zeros((size, 0))
-        self._time_s = np.zeros(0)
+        self._numbers = np.zeros((size + 1, 0))  # the last is the time
 
     def __len__(self) -> int:
         """Number of origins."""
@@ -185,27 +200,34 @@ class Memory:
 
         New origins are added with zeros, and old ones forgotten when there are too many.
         """
-        new = [code for code in codes if code not in self._row]
-        if new:
-            self._add(new, now_s)
-        rows = np.array([self._row[code] for code in codes], dtype=np.intp)
-        return rows, self._numbers.take(rows, axis=1), np.exp((self._time_s.take(rows) - now_s) / MEMORY_S)
+        known = list(map(self._row.get, codes))
+        if None in known:
+            self._add([code for code in codes if code not in self._row], now_s)
+            known = list(map(self._row.get, codes))
+        rows = np.array(known, dtype=np.intp)
+        numbers = self._numbers.take(rows, axis=1)
+        return rows, numbers[:-1], np.exp((numbers[-1] - now_s) / MEMORY_S)
 
     def store(self, rows: NDArray[np.intp], numbers: Array, now_s: float) -> None:
         """Replace the numbers (size, n) of the rows (n,)."""
-        self._numbers[:, rows], self._time_s[rows] = numbers, now_s
+        self._numbers[:-1, rows], self._numbers[-1, rows] = numbers, now_s
 
     def _add(self, new: list[int], now_s: float) -> None:
         if len(self._row) + len(new) > MAX_ORIGINS:
-            kept = [code for code, row in self._row.items() if now_s - self._time_s[row] < MEMORY_S]
+            kept = [code for code, row in self._row.items() if now_s - self._numbers[-1, row] < MEMORY_S]
             kept = kept[-(MAX_ORIGINS // 2) :]
             rows = [self._row[code] for code in kept]
             self._row = {code: row for row, code in enumerate(kept)}
-            self._numbers, self._time_s = self._numbers[:, rows], self._time_s[rows]
+            self._numbers = self._numbers[:, rows]
         first = self._numbers.shape[1]
         self._row |= {code: first + index for index, code in enumerate(new)}
-        self._numbers = np.hstack([self._numbers, np.zeros((len(self._numbers), len(new)))])
-        self._time_s = np.append(self._time_s, np.full(len(new), now_s))
+        more = np.zeros((len(self._numbers), len(new)))
+        more[-1] = now_s
+        self._numbers = np.hstack([self._numbers, more])
+
+
+_LEAST_GATES = np.array([[INCREMENT_GATE], [SUM_GATE]])
+"""Gates of increments by themselves, and of sums of many."""
 
 
 class Origins:
@@ -225,18 +247,20 @@ class Origins:
         """
         if not codes:
             return np.zeros(0, dtype=np.bool_)
-        count = len(codes)
         rows, sums, keep = self._increments.recall(codes, now_s)
         sums *= keep
         sums[6:9] *= keep
-        said = np.ones((10, 2 * count))  # each by itself, then the sums; the last row counts
-        said[:9, :count] = _compared(increments, *belief)
-        np.add(sums, said[:, :count], out=said[:, count:])
-        self._increments.store(rows, said[:, count:], now_s)
+        said = np.empty((10, 2, len(codes)))  # each by itself, then the sums; the last row counts
+        said[:9, 0] = _compared(increments, *belief)
+        said[9, 0] = 1.0
+        np.add(sums, said[:, 0], out=said[:, 1])
+        self._increments.store(rows, said[:, 1], now_s)
         squared = _squared(said[:9])
-        of_many = np.minimum(1.0, said[9, count:] / MANY)
-        limit = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * of_many
-        return np.asarray((squared[:count] < INCREMENT_GATE) & (squared[count:] < limit))
+        good = squared < _LEAST_GATES
+        if np.count_nonzero(good) < good.size:  # a sum of few may deviate by more
+            limit = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * np.minimum(1.0, said[9, 1] / MANY)
+            good[1] = squared[1] < limit
+        return np.asarray(good[0] & good[1])
 
     def without_lean(
         self, codes: Sequence[int], off_m: Array, variance_m2: Array, now_s: float
@@ -258,7 +282,7 @@ class Origins:
         self._priors.store(rows, lean, now_s)
         squared = lean[0] * lean[0] + lean[1] * lean[1]
         leans = squared > LEAN_LIMIT**2
-        if not leans.any():
+        if not np.count_nonzero(leans):
             return off_m, leans
         x, y = lean * np.maximum(0.0, 1 - LEAN_LIMIT / np.sqrt(np.maximum(squared, 1e-300)))
         return off_m - np.stack([root_xx * x, root_yx * x + root_yy * y], axis=1), leans

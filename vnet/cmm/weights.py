@@ -6,6 +6,7 @@ ridge that says how uncertain each estimate is itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -51,8 +52,8 @@ class OptimizedWeights:
         hessian = self._hessian(estimates_m, covariances_m2, mean_m)
         weights = self._minimize(hessian)
         weights = np.minimum(np.maximum(weights, 0.0), 1.0)
-        total = float(weights.sum())
-        return np.asarray(weights / total) if np.isfinite(total) and total > 0 else no_fusion_weights(count)
+        total = float(np.add.reduce(weights))
+        return np.asarray(weights / total) if math.isfinite(total) and total > 0 else no_fusion_weights(count)
 
     def _hessian(self, estimates_m: Array, covariances_m2: Array, mean_m: Array) -> Array:
         count = len(estimates_m)
@@ -63,7 +64,8 @@ class OptimizedWeights:
             ridge = np.full(count, self._ridge_m2)
         hessian = offset.dot(offset.T)
         hessian *= 2
-        hessian.ravel()[:: count + 1] += 2 * ridge
+        ridge *= 2
+        hessian.ravel()[:: count + 1] += ridge
         return np.asarray(hessian)
 
     def _minimize(self, hessian: Array) -> Array:
@@ -176,8 +178,8 @@ def largest_remainder(weights: Array, total: int) -> Array:
 def check_covariances(covariances_m2: Array) -> None:
     """Raise VnetError unless all of (n, 2, 2) are positive definite."""
     a, b, d = covariances_m2[:, 0, 0], covariances_m2[:, 0, 1], covariances_m2[:, 1, 1]
-    good = (a > 0) & (a * d - b * b > 0)
-    if not np.all(good):
+    good = (a > 0) & (a * d > b * b)
+    if np.count_nonzero(good) < len(good):
         first = int(np.argmin(good))
         raise VnetError(f"covariance {first} = {covariances_m2[first].tolist()}: not positive definite")
 

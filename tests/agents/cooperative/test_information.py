@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from agents.cooperative.attack import Attack, Lie
 from agents.cooperative.frame import FrameError, name_of_code, short_name
 from agents.cooperative.information_attacker import InformationAttacker
-from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator, first_of_each
+from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator, Passing
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
+from vnet.cmm.plausibility import MAX_ORIGINS
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
@@ -134,12 +135,23 @@ def test_what_pooled_priors_hold_is_not_added_again() -> None:
     assert {e.imported for e in network.estimators} == {5}
 
 
-@given(st.lists(st.integers(0, 20), max_size=40))
-def test_origins_are_told_apart(codes: list[int]) -> None:
-    first, index = first_of_each(np.array(codes, dtype=np.uint32))
-    assert codes == [codes[first[origin]] for origin in index]
-    assert [codes[row] for row in first] == sorted(set(codes))
-    assert all(codes.index(codes[row]) == row for row in first)
+@given(st.lists(st.lists(st.integers(0, 20), min_size=1, max_size=40), max_size=4))
+def test_origins_are_told_apart(periods: list[list[int]]) -> None:
+    passing, seen = Passing(), set[int]()
+    for codes in periods:
+        seen |= set(codes)
+        index = passing.index(np.array(codes, dtype=np.uint32))
+        assert passing.codes[index].tolist() == codes
+        assert passing.codes.tolist() == sorted(seen)
+
+
+def test_origins_without_end_are_forgotten() -> None:
+    passing = Passing()
+    for first in range(0, 10 * MAX_ORIGINS, 200):
+        passing.index(np.arange(first, first + 200, dtype=np.uint32))
+        assert len(passing.codes) < MAX_ORIGINS + 200
+    index = passing.index(np.array([7], dtype=np.uint32))
+    assert passing.codes[index].tolist() == [7]
 
 
 def test_a_frame_holds_as_many_increments_as_there_is_room_for() -> None:

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 
 from vnet.cmm.information import Information, gained, inverse, square_root, transport
 from vnet.cmm.plausibility import (
+    PRIOR_GATE,
     Origins,
     cut_to,
     deviation,
@@ -188,8 +189,23 @@ def test_only_so_many_origins_are_kept() -> None:
 
 
 def test_priors_agree_within_what_both_claim() -> None:
-    means, covariances_m2 = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0]]), np.tile(0.5 * np.eye(2), (3, 1, 1))
-    assert priors_agree(means, covariances_m2, np.zeros(2), 0.5 * np.eye(2)).tolist() == [True, True, False]
+    means, variances_m2 = np.array([[0.0, 0.0], [1.5, 0.0], [9.0, 0.0]]), np.tile([0.5, 0.0, 0.5], (3, 1))
+    assert priors_agree(means, variances_m2, np.zeros(2), np.array([0.5, 0.0, 0.5])).tolist() == [True, True, False]
+
+
+def test_priors_agree_as_the_distance_of_mahalanobis_says() -> None:
+    rng = np.random.default_rng(1)
+    roots, means = rng.normal(size=(200, 2, 2)), 2 * rng.normal(size=(200, 2))
+    covariances_m2 = roots @ roots.transpose(0, 2, 1)
+    own_m, own_m2 = np.array([0.3, -0.2]), np.array([[0.2, 0.1], [0.1, 0.3]])
+    off_m = means - own_m
+    squared = np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariances_m2 + own_m2), off_m)
+    entries = covariances_m2.reshape(-1, 4)[:, [0, 1, 3]]
+    agrees = priors_agree(means, entries, own_m, np.array([0.2, 0.1, 0.3]))
+    assert np.array_equal(agrees, squared < PRIOR_GATE)
+    near = squared < 0.5
+    assert agrees.any() and not agrees.all()
+    assert priors_agree(means[near], entries[near], own_m, np.array([0.2, 0.1, 0.3])).all()
 
 
 def test_the_median_belief_is_not_moved_by_one_liar() -> None:
