@@ -35,6 +35,8 @@ def write_csv(recorded: OpenedRun, folder: Path) -> list[str]:
     }
     if recorded.busy is not None:
         tables["busy"] = recorded.busy
+    if recorded.driven is not None:
+        tables["driven"] = recorded.driven
     if recorded.payloads is not None:
         kept = recorded.payloads.table
         payloads = pa.array([payload.hex() for payload in kept["payload"].to_pylist()], pa.string())

@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 import emulator
 from emulator.checks.judge import check_run
 from emulator.drivers.emulation import Emulation
+from emulator.export.tables import write_csv
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
@@ -81,6 +82,8 @@ def test_a_run_is_judged_and_shown_from_its_folder(tmp_path: Path) -> None:
     assert done.driving["hardest_braking_m_s2"] == pytest.approx(8.0, abs=0.01)
     assert check_run(tmp_path / "run").verdict is not Verdict.INVALID
     again = RecordedRun.open(tmp_path / "run")
+    (tmp_path / "tables").mkdir()
+    assert "driven.csv" in write_csv(again, tmp_path / "tables")
     assert again.driven is not None
     speed = np.array(again.driven["speed_m_s"]).reshape(-1, 3)
     along_m = np.array(again.driven["along_m"]).reshape(-1, 3)
