@@ -32,6 +32,8 @@ from vnet import Node
 PAGE = ROOT / "docs" / "scale.md"
 BEGIN, END = "<!-- measured: python -m benchmarks scale --write -->", "<!-- end -->"
 BEACON, COOPERATIVE = "scenarios/beacon.toml", "scenarios/quickstart.toml"
+COOPERATE = ("--program", "agents.cooperative:main")
+"""The cooperative program with its default options, on the beacons' network: about 12 neighbours for any number."""
 SAMPLE_S = 0.5
 """Time between two samples of the processes' memory."""
 PARTS = 2
@@ -139,6 +141,24 @@ def simulated_thousand(runs: int) -> str:
     return f"{median_of(runs, lambda: _factor('simulate', BEACON, *options)):.2g}"
 
 
+def simulated_cooperative(runs: int) -> str:
+    """Real-time factors of 50, 200 and 1000 cooperative vehicles in one process."""
+    factors = []
+    for count, duration_s in ((50, 20), (200, 10), (1000, 5)):
+        options = [*COOPERATE, *_vehicles(count), "--duration", str(duration_s)]
+        factors.append(median_of(runs, lambda options=options: _factor("simulate", BEACON, *options)))  # type: ignore[misc]
+    return " / ".join(f"{factor:.2g}" for factor in factors)
+
+
+def estimator(runs: int) -> str:
+    """CPU of the estimator a vehicle and period, with 50 and with 1000 vehicles: less what a beacon takes."""
+    few, many = [], []
+    for _ in range(runs):
+        few.append(_cpu_us(50, 20, *COOPERATE) - _cpu_us(50, 20))
+        many.append(_cpu_us(1000, 2, *COOPERATE) - _cpu_us(1000, 2))
+    return f"{statistics.median(few):.0f} / {statistics.median(many):.0f} µs"
+
+
 def density(runs: int) -> str:
     """CPU a vehicle and period at 1000 vehicles by that at 100, in turns; start and end of the runs left out."""
     pairs = [(_cpu_us(100, 40), _cpu_us(1000, 5)) for _ in range(runs)]
@@ -147,15 +167,15 @@ def density(runs: int) -> str:
     return f"{ratio:.2f} ({many_us:.0f} : {few_us:.0f} µs)"
 
 
-def _cpu_us(count: int, duration_s: int) -> float:
+def _cpu_us(count: int, duration_s: int, *options: str) -> float:
     """Return the CPU time of a vehicle and period in µs: of a longer run less that of a shorter one."""
-    shorter_s, longer_s = (_cpu_s(count, part * duration_s) for part in (1, PARTS))
+    shorter_s, longer_s = (_cpu_s(count, part * duration_s, *options) for part in (1, PARTS))
     return (longer_s - shorter_s) * 1e6 / (count * 10 * duration_s * (PARTS - 1))
 
 
-def _cpu_s(count: int, duration_s: int) -> float:
+def _cpu_s(count: int, duration_s: int, *options: str) -> float:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    vnet("simulate", BEACON, *_vehicles(count), "--duration", str(duration_s))
+    vnet("simulate", BEACON, *options, *_vehicles(count), "--duration", str(duration_s))
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
@@ -253,6 +273,18 @@ ROWS: dict[str, Row] = {
         "50 cooperative vehicles (`estimates`), live : simulated; live", "1.2; 1.1", "1.6; 1.5", cooperative
     ),
     "simulated": Row("1000 beacons simulated in one process, real-time factor", "1.5", "2.5", simulated_thousand),
+    "simulated_cooperative": Row(
+        "50 / 200 / 1000 cooperative vehicles simulated in one process, real-time factor",
+        "4 / 1 / 0.2",
+        "6 / 1.5 / 0.3",
+        simulated_cooperative,
+    ),
+    "estimator": Row(
+        "CPU of the cooperative program a vehicle and period, with 50 / 1000 vehicles, less that of a beacon",
+        "400 / 400 µs ± 20 %",
+        "250 µs",
+        estimator,
+    ),
     "thousand": Row("1000 beacons live, 1000 processes, real-time factor", "0.4", "0.6", live_thousand),
     "density": Row("CPU a vehicle and period at 1000 : at 100 vehicles, simulated", "1.2", "1.05", density),
     "ns3": Row(
