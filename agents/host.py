@@ -242,6 +242,7 @@ class _RealTimeAgent:
             self._loop.call_later(head_start_s, self._host.start, self._loop, self._programs)
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
+        self._host.busy.add(batch.busy)
         for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))

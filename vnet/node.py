@@ -254,6 +254,9 @@ class _Disconnected:
     def send_frame(self, node: str, payload: bytes) -> None:
         pass
 
+    def busy_ratio(self, node: str) -> float | None:
+        return None
+
     def send_report(self, report: Report) -> None:
         pass
 

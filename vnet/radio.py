@@ -32,6 +32,10 @@ class RadioTransport(Protocol):
         """Enqueue a frame at the emulated radio, at the present time."""
         ...
 
+    def busy_ratio(self, node: str) -> float | None:
+        """Return the channel busy ratio that `node` knows now; None if no medium is shared."""
+        ...
+
 
 class Radio:
     """The vehicle's radio: sends broadcasts to all nodes in range, and receives theirs.
@@ -61,6 +65,17 @@ class Radio:
         if len(content) > self.max_payload:
             raise PayloadTooLargeError(len(content), self.max_payload)
         self._transport.send_frame(self._node_id, content)
+
+    @property
+    def busy_ratio(self) -> float | None:
+        """Channel busy ratio: the share of 100 ms in which this vehicle's medium was busy (ETSI TS 102 687).
+
+        The medium is busy while the vehicle transmits, or senses `radio.mac.carrier_sense_dbm` or more. The 100 ms
+        end at the last multiple of 10 ms that is at least `radio.latency_ms` past. In real time the value is as old
+        as the last message of the emulator. None where the scenario has no `[radio.mac]`.
+        """
+        self.inbox.refill()
+        return self._transport.busy_ratio(self._node_id)
 
     def drain(self) -> list[Packet]:
         """Return all packets received since the last call, oldest first, without waiting."""

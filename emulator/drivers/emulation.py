@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.drivers.busy_feed import BusyFeed
 from emulator.drivers.driving import Driving
 from emulator.drivers.log_book import LogBook
 from emulator.drivers.orders import Orders
@@ -23,6 +24,7 @@ from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.engine import Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
+from emulator.radio.stages import least_latency_ns
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
@@ -117,6 +119,7 @@ class Emulation:
         self.costs = Costs()
         self.log_book = LogBook(folder, self.number)
         self.orders = Orders(scenario)
+        self.busy = BusyFeed(self.engine, world.node_ids, least_latency_ns(scenario.radio))
 
     def _nodes_at(self, period: int) -> Nodes:
         """Nodes as the selectors of faults see them in a period."""

@@ -400,17 +400,16 @@ class Lockstep:
     # Grants.
 
     def _grant(self, wakes: Mapping[str, int]) -> dict[str, wire.Grant]:
-        return {
-            process_id: self._grant_one(self._processes[process_id], time_ns)
-            for process_id, time_ns in wakes.items()
-        }
+        processes = self._processes
+        return {each: self._grant_one(processes[each], time_ns) for each, time_ns in wakes.items()}
 
     def _grant_one(self, process: _Process, time_ns: int) -> wire.Grant:
         self._woken.discard(process.id)
         process.granted_ns = time_ns
         fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
-        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks)
+        busy = self._emulation.busy.of(process.nodes, time_ns, self._end_ns)
+        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy)
         if self._hosts_all:
             self._mail = Mail(packets, fixes)
         else:

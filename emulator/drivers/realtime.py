@@ -51,6 +51,7 @@ class RealTime:
         self._affected: set[str] = set()
         self._next_period = 0
         self._origin_ns = 0
+        self._collected_ns = 0
         self.gaps = 0
 
     def start(self, origin_ns: int) -> dict[str, wire.Batch]:
@@ -158,6 +159,7 @@ class RealTime:
 
     def _collect(self, time_ns: int) -> None:
         """Take what arrives, and the fixes that are due, by then."""
+        self._collected_ns = time_ns
         node_ids = self._emulation.world.node_ids
         for delivery in self._emulation.advance(time_ns):
             process_id = self._process_of[node_ids[delivery.receiver]]
@@ -180,7 +182,8 @@ class RealTime:
         clocks, self._clocks[process_id] = self._clocks[process_id], []
         held = process_id in self._was_paused
         self._was_paused.discard(process_id)
-        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks)
+        busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
+        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""

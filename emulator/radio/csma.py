@@ -39,10 +39,11 @@ from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.frames import Frame
 from emulator.radio.mac import Throttle
-from emulator.radio.medium import Medium
+from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.radio.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
+from emulator.radio.stages import least_latency_ns
 from emulator.scenario.radio import Mac, Receiver
 from emulator.scenario.scenario import Radio
 from vnet.units import NS_PER_MS
@@ -107,7 +108,8 @@ class Csma:
         self._bitrate_mbps = radio.bitrate_mbps
         self._limit = radio.queue_frames
         threshold = Threshold(radio.receiver or Receiver())
-        self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold)
+        remembered_ns = 2 * least_latency_ns(radio) + 2 * WINDOW_NS  # what programs may ask for, and more
+        self.medium = Medium(count, milliwatts(mac.carrier_sense_dbm), threshold, remembered_ns)
         self._congestion = congestion_control_of(radio.congestion, count, seed)
         if self._congestion is not None:
             self.medium.listen(self._congestion.observe)

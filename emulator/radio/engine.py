@@ -337,6 +337,19 @@ class Engine:
         self._csma.medium.count(time_ns)
         return self._csma.medium.windows[: time_ns // WINDOW_NS]
 
+    @property
+    def shares_medium(self) -> bool:
+        """True if the vehicles share a medium, which they sense."""
+        return self._csma is not None
+
+    def busy_ratios_at(self, time_ns: int) -> NDArray[np.float64]:
+        """Return the channel busy ratios (N,) of the 100 ms before `time_ns`, a multiple of `SLICE_NS`.
+
+        All events before it have been processed, and it lies no more than a lookahead and a window back.
+        """
+        assert self._csma is not None
+        return self._csma.medium.busy_ratios_at(time_ns)
+
     def lose(self, delivery: Delivery) -> None:
         """Change a delivery that never reached its process (real time only) to `transport`; call once for each."""
         self._trace.decide([delivery.row], Outcome.transport)

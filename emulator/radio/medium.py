@@ -5,6 +5,7 @@ All arrays cover all vehicles at once. The access rules are in `csma`.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -18,7 +19,7 @@ from vnet.types import Array
 WINDOW_NS = 100_000_000
 """Measurement window of the channel busy ratio (ETSI TS 102 687)."""
 SLICE_NS = WINDOW_NS // 10
-"""Interval at which a listener gets the busy time, so that its windows may begin at any multiple of it."""
+"""Interval at which busy time is summed, so that windows of measurement may begin at any multiple of it."""
 LONG_AGO_NS = -(1 << 60)
 """Initial time of the last change of the medium's state."""
 
@@ -31,10 +32,12 @@ class Medium:
 
     `sensed` (N,) marks the vehicles at which the medium is busy: those that transmit, and those at which the sum of
     all powers is at least `carrier_sense_mw`. It is None if nothing is on air. `idle_ns` (N,) is the time at which
-    the medium last became idle.
+    the medium last became idle. Busy times of the last `remembered_ns` are kept.
     """
 
-    def __init__(self, count: int, carrier_sense_mw: float, threshold: Threshold) -> None:
+    def __init__(
+        self, count: int, carrier_sense_mw: float, threshold: Threshold, remembered_ns: int = WINDOW_NS
+    ) -> None:
         self._carrier_sense_mw = carrier_sense_mw
         self._threshold = threshold
         self._frames: list[Frame] = []
@@ -45,7 +48,8 @@ class Medium:
         self.idle_ns = np.full(count, LONG_AGO_NS)
         self._counted_ns = 0
         self._spans: list[tuple[NDArray[np.bool_], int]] = []
-        self._slice_ns = self._slice_ends_ns = WINDOW_NS
+        self._slice_ends_ns = SLICE_NS
+        self._slices: deque[NDArray[np.int64]] = deque(maxlen=max(remembered_ns, WINDOW_NS) // SLICE_NS)
         self._window_ns = np.zeros(count, np.int64)
         self._listener: Listener | None = None
         self.windows: list[Array] = []
@@ -150,15 +154,27 @@ class Medium:
             self._spans.clear()
         if self._listener is not None:
             self._listener(self._slice_ends_ns // SLICE_NS - 1, busy_ns)
+        self._slices.append(busy_ns)
         self._window_ns += busy_ns
         if self._slice_ends_ns % WINDOW_NS == 0:
             self.windows.append(self._window_ns / WINDOW_NS)
             self._window_ns[:] = 0
-        self._slice_ends_ns += self._slice_ns
+        self._slice_ends_ns += SLICE_NS
+
+    def busy_ratios_at(self, time_ns: int) -> Array:
+        """Return the channel busy ratios (N,) of the 100 ms before `time_ns`, a past multiple of `SLICE_NS`.
+
+        Before time 0 the medium was idle.
+        """
+        self.count(time_ns)
+        begin, end = (time_ns - WINDOW_NS) // SLICE_NS, time_ns // SLICE_NS
+        first = self._slice_ends_ns // SLICE_NS - 1 - len(self._slices)
+        some = [self._slices[number - first] for number in range(max(begin, 0), end)]
+        return np.asarray(np.sum(some, axis=0) / WINDOW_NS) if some else np.zeros(len(self._window_ns))
 
     def listen(self, listener: Listener) -> None:
         """Call `listener` at the end of each slice with its number and the busy time (N,) in ns."""
-        self._listener, self._slice_ns, self._slice_ends_ns = listener, SLICE_NS, SLICE_NS
+        self._listener = listener
 
 
 def _signal(frame: Frame) -> Signal:

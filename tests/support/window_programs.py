@@ -32,7 +32,9 @@ async def improvises(node: Node) -> None:
     async def answers() -> None:
         while True:
             packet = await node.radio.receive()
-            said = diary.note("packet", packet.sender, packet.sent_ns, packet.received_ns, packet.payload)
+            said = diary.note(
+                "packet", packet.sender, packet.sent_ns, packet.received_ns, packet.payload, packet.snr_db
+            )
             draw = node.rng.random()
             if draw < 0.2:
                 await node.radio.broadcast(said + filling)
@@ -51,7 +53,7 @@ async def improvises(node: Node) -> None:
         while True:
             await asyncio.sleep(float(node.rng.uniform(0.0001, 0.05)))
             heard = [(p.sender, p.sent_ns, p.received_ns, p.payload) for p in node.radio.drain()]
-            said = diary.note("heard", heard)
+            said = diary.note("heard", heard, node.radio.busy_ratio)
             if node.rng.random() < 0.3:
                 await node.radio.broadcast(said + bytes(int(node.rng.integers(0, 300))))
 
@@ -77,7 +79,7 @@ async def improvises(node: Node) -> None:
 
     def strike(number: int) -> None:
         """A timer of the loop's, without a task, that fires a few times within a millisecond."""
-        diary.note("strike", number)
+        diary.note("strike", number, node.radio.busy_ratio)
         asyncio.get_running_loop().call_later(0.0003 if number % 5 else 0.05, strike, number + 1)
 
     asyncio.get_running_loop().call_later(0.01, strike, 1)

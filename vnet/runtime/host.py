@@ -12,7 +12,6 @@ import contextvars
 import logging
 import traceback
 import weakref
-from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -22,10 +21,11 @@ from vnet.node import Fix, Node
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
+from vnet.runtime.busy_ratios import MeasuredBusyRatios
 from vnet.runtime.current_node import current_node
 from vnet.runtime.disks import Disks
 from vnet.runtime.event_order import Chooser, chooser_of
-from vnet.runtime.log_handler import NodeLogHandler
+from vnet.runtime.log_handler import NodeLines, NodeLogHandler
 from vnet.runtime.mail import Mail
 from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.node_clocks import NodeClocks
@@ -36,15 +36,12 @@ from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError,
 from vnet.runtime.window import Window
 from vnet.transport import wire
 from vnet.transport.orders import Deviation, Order
-from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:  # pdb, which few runs need
     from vnet.runtime.debugger import NodeDebugger
 
 LONGEST_NOTE = 4000
 """Characters of a line of a log that are told to the emulator."""
-MOST_LINES = 100_000
-"""Lines of a node's log that are written by one process, so that a flood fills no disk."""
 
 
 class Host:
@@ -70,7 +67,7 @@ class Host:
         self._on_traffic = on_traffic
         self._on_line = on_line
         self._outbox = Outbox()
-        self._lines: Counter[str] = Counter()
+        self._lines = NodeLines(on_line, clock)
         self._log_handler = NodeLogHandler(lambda node: self.nodes.get(node.id) is node)
         self._window = Window()
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
@@ -79,6 +76,7 @@ class Host:
         self._clocks = NodeClocks(clock)
         self._orders = {welcome.node: welcome.order for welcome in welcomes}
         self.mail = MailDelivery(self.nodes, self._clocks)
+        self.busy = MeasuredBusyRatios([*self.nodes], clock)
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
@@ -111,6 +109,10 @@ class Host:
             self._outbox.frames.append(wire.Frame(node, payload))
             self._on_traffic()
 
+    def busy_ratio(self, node: str) -> float | None:
+        """Return the channel busy ratio that a node knows now."""
+        return self.busy.of(node)
+
     def send_report(self, report: Report) -> None:
         """Take a report."""
         if self._active[report.node]:
@@ -123,7 +125,7 @@ class Host:
         self._outbox.notes.append(note)
         said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
         line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip()
-        self._line(node, level, line.replace("\n", "\n    "))
+        self._lines.add(node, level, line.replace("\n", "\n    "))
         self._on_traffic()
 
     def send_action(self, action: Action) -> None:
@@ -131,14 +133,6 @@ class Host:
         if self._active[action.node]:
             self._outbox.actions.append(action)
             self._on_traffic()
-
-    def _line(self, node: str, level: str, text: str) -> None:
-        """Write a line to a node's log, unless there were too many."""
-        self._lines[node] += 1
-        if self._lines[node] <= MOST_LINES:
-            self._on_line(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {text}")
-        elif self._lines[node] == MOST_LINES + 1:
-            self._on_line(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
 
     # What the transport asks of the host.
 
@@ -256,6 +250,7 @@ class Host:
         """
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
+        self.busy.add(grant.busy)
         self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 

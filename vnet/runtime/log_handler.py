@@ -1,12 +1,17 @@
-"""The standard `logging` of programs: a record becomes a line of the log of the node on whose behalf it is made."""
+"""Logs of nodes. A record of the standard `logging` becomes a line of the node on whose behalf it is made."""
 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 
 from vnet.node import Node
 from vnet.runtime.current_node import current_node
+from vnet.units import NS_PER_S
+
+MOST_LINES = 100_000
+"""Lines of a node's log that are written by one process, so that a flood fills no disk."""
 
 
 class NodeLogHandler(logging.Handler):
@@ -36,6 +41,23 @@ class NodeLogHandler(logging.Handler):
                 node.log(f"{record.name}: {self.format(record)}", level_name(record.levelno))
             except Exception:
                 self.handleError(record)
+
+
+class NodeLines:
+    """Lines of nodes' logs, with the emulated time that `clock` gives in ns, up to `MOST_LINES` of each node."""
+
+    def __init__(self, write: Callable[[str, str], None], clock: Callable[[], int]) -> None:
+        self._write = write
+        self._clock = clock
+        self._count: Counter[str] = Counter()
+
+    def add(self, node: str, level: str, text: str) -> None:
+        """Write a line to a node's log, unless there were too many."""
+        self._count[node] += 1
+        if self._count[node] <= MOST_LINES:
+            self._write(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {text}")
+        elif self._count[node] == MOST_LINES + 1:
+            self._write(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
 
 
 _NAMES = (

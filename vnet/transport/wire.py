@@ -266,12 +266,19 @@ class ClockError(msgspec.Struct, frozen=True, array_like=True):
         return self.since_ns + round((shown_ns - self.since_ns - self.offset_ns) / (1 + self.rate))
 
 
+class BusyRatios(msgspec.Struct, frozen=True, array_like=True):
+    """Channel busy ratios of the nodes of a process, in their order, as they know them from `from_ns` on."""
+
+    from_ns: TimeNs
+    ratios: Sequence[Annotated[float, msgspec.Meta(ge=0, le=1)]]
+
+
 class Grant(Message, frozen=True):
     """Lockstep: the window from `time_ns` to just before `end_ns`. Grant 0 starts a process.
 
     `time_ns` is the first instant at which the process has something to do. `packets` are those that arrive before
     the end, each at its `received_ns`; `fixes` are due at the first instant. `clocks` are the clock errors that
-    have changed.
+    have changed, `busy` the channel busy ratios of the window if vehicles share a medium.
 
     Instants before `quiet_ns` may be passed beyond the window as long as they are quiet; `next_fixes`, at
     `next_fixes_ns`, belong to such an instant. They are given only to processes that have said `ahead`.
@@ -286,6 +293,7 @@ class Grant(Message, frozen=True):
     quiet_ns: TimeNs = 0
     next_fixes: Sequence[WireFix] = ()
     next_fixes_ns: TimeNs | None = None
+    busy: Sequence[BusyRatios] = ()
 
 
 class Batch(Message, frozen=True):
@@ -303,6 +311,7 @@ class Batch(Message, frozen=True):
     start_ns: TimeNs = 0
     held: bool = False
     clocks: Sequence[ClockError] = ()
+    busy: Sequence[BusyRatios] = ()
 
 
 class StackRequest(Message, frozen=True):
