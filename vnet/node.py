@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from vnet.driving import Action, checked_action
 from vnet.mailbox import Mailbox
-from vnet.radio import Radio, RadioTransport
+from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SendOptions
 from vnet.reports import (
     NoteDetail,
     Report,
@@ -125,11 +125,12 @@ class Node:
         max_payload: int,
         incarnation: int = 0,
         control_ns: int = 0,
+        abilities: RadioAbilities = NO_ABILITIES,
         disk: Callable[[], Path] | None = None,
     ) -> None:
         self._is_text: dict[str, bool] = {}  # by the name of each reported value
         self.id = node_id
-        self.radio = Radio(node_id, transport, max_payload)
+        self.radio = Radio(node_id, transport, max_payload, abilities)
         self.gnss = GnssReceiver()
         self.map = lane_map
         self.rng = np.random.default_rng(seed)
@@ -251,7 +252,7 @@ class _Disconnected:
     def now_ns(self, node: str) -> int:
         return self._now_ns
 
-    def send_frame(self, node: str, payload: bytes) -> None:
+    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
         pass
 
     def busy_ratio(self, node: str) -> float | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 from msgspec import Struct
 
@@ -25,10 +27,24 @@ class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a data
     snr_db: float | None = None
 
 
+class RadioAbilities(NamedTuple):
+    """Limits of a choice for a frame: the largest power in dBm, or None, and the bit rates in Mbit/s."""
+
+    max_power_dbm: float | None = None
+    rates_mbps: Sequence[float] = ()
+
+
+class SendOptions(NamedTuple):
+    """Choices of a program for a frame; None: the scenario's power or bit rate."""
+
+    power_dbm: float | None = None
+    rate_mbps: float | None = None
+
+
 class RadioTransport(Protocol):
     """Interface of a radio to the process that hosts its node."""
 
-    def send_frame(self, node: str, payload: bytes) -> None:
+    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
         """Enqueue a frame at the emulated radio, at the present time."""
         ...
 
@@ -37,24 +53,51 @@ class RadioTransport(Protocol):
         ...
 
 
+MIN_POWER_DBM = -100.0
+"""Least transmit power that a frame can have."""
+NO_ABILITIES = RadioAbilities()
+"""A radio with which nothing can be chosen."""
+
+
+def _number(value: float) -> float:
+    """Return a number as a float; NaN for what is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
 class Radio:
     """The vehicle's radio: sends broadcasts to all nodes in range, and receives theirs.
 
     Attributes:
         max_payload: largest payload of a frame in bytes.
+        max_power_dbm: largest transmit power in dBm, which is the default; None where the radio has no powers.
+        rates_mbps: bit rates in Mbit/s that a frame may have; none where they cannot be chosen.
     """
 
-    def __init__(self, node_id: str, transport: RadioTransport, max_payload: int) -> None:
+    def __init__(
+        self, node_id: str, transport: RadioTransport, max_payload: int, abilities: RadioAbilities = NO_ABILITIES
+    ) -> None:
         self.max_payload = max_payload
+        self.max_power_dbm = abilities.max_power_dbm
+        self.rates_mbps = tuple(abilities.rates_mbps)
         self.inbox: Mailbox[Packet] = Mailbox()
         self._node_id = node_id
         self._transport = transport
 
-    async def broadcast(self, payload: bytes) -> None:
-        """Send one frame to all nodes in range.
+    async def broadcast(
+        self, payload: bytes, *, power_dbm: float | None = None, rate_mbps: float | None = None
+    ) -> None:
+        """Send one frame to all nodes in range, with the scenario's power and bit rate or others.
 
-        Raise `PayloadTooLargeError` above `max_payload` bytes, and TypeError for what is not bytes.
+        `power_dbm` is at most `max_power_dbm`, and `rate_mbps` one of `rates_mbps`. Less power reaches less far; a
+        higher rate keeps the medium busy for a shorter time, but needs a better signal.
+
+        Raise `PayloadTooLargeError` above `max_payload` bytes, TypeError for what is not bytes, and ValueError for
+        a power or a rate that the radio does not have.
         """
+        options = SendOptions(self._checked_power(power_dbm), self._checked_rate(rate_mbps))
         try:
             content = bytes(memoryview(payload))
         except TypeError:
@@ -64,7 +107,34 @@ class Radio:
             ) from None
         if len(content) > self.max_payload:
             raise PayloadTooLargeError(len(content), self.max_payload)
-        self._transport.send_frame(self._node_id, content)
+        self._transport.send_frame(self._node_id, content, options)
+
+    def _checked_power(self, power_dbm: float | None) -> float | None:
+        """Return a power as a float. Raise ValueError for one that the radio does not have."""
+        if power_dbm is None:
+            return None
+        if self.max_power_dbm is None:
+            raise ValueError(
+                f"broadcast(power_dbm={shown(power_dbm)}): only with [radio.path_loss] a frame has a power"
+            )
+        number = _number(power_dbm)
+        if not MIN_POWER_DBM <= number <= self.max_power_dbm:
+            text = f"{MIN_POWER_DBM:g} to {self.max_power_dbm:g} dBm; radio.path_loss.tx_power_dbm is the largest"
+            raise ValueError(f"broadcast(power_dbm={shown(power_dbm)}): allowed are {text}")
+        return number
+
+    def _checked_rate(self, rate_mbps: float | None) -> float | None:
+        """Return a bit rate as a float. Raise ValueError for one that the radio does not have."""
+        if rate_mbps is None:
+            return None
+        if not self.rates_mbps:
+            text = "only with [radio.path_loss] or [radio.mac] a frame has a rate of its own"
+            raise ValueError(f"broadcast(rate_mbps={shown(rate_mbps)}): {text}")
+        number = _number(rate_mbps)
+        if number not in self.rates_mbps:
+            rates = ", ".join(f"{rate:g}" for rate in self.rates_mbps)
+            raise ValueError(f"broadcast(rate_mbps={shown(rate_mbps)}): 802.11p has {rates}")
+        return number
 
     @property
     def busy_ratio(self) -> float | None:

@@ -62,6 +62,10 @@ Two sections are not the scenario's own: they hold SHA-256 of what the run has r
   If either has changed, `vnet run FOLDER/scenario.toml` says so in one line, records it (the event `code_changed`,
   and the new digests), and goes on. The hash of the trace does not depend on them.
 """
+CHOICES = """
+Where programs have [chosen powers or bit rates](../radio.md#power-and-bit-rate-of-a-frame), there are two more:
+`gain_db`, the power of the frame above that of the scenario, and `bitrate_mbps`.
+"""
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
 """
@@ -253,6 +257,7 @@ def page() -> str:
         "In the order of `sent_ns`, sender, `seq`, receiver, `copy`.",
         columns(trace, TRACE),
     ]
+    parts.append(CHOICES)
     parts += ["### Outcomes", "Each pair of a frame and a receiver has exactly one."]
     public = [outcome for outcome in Outcome if outcome is not Outcome.pending]
     parts.append(table(["outcome", "what"], ([f"`{outcome.name}`", outcome.facts.meaning] for outcome in public)))

@@ -130,11 +130,10 @@ def _episodes(recorded: RecordedRun, plan: list[PlannedFault], sender: IntArray,
 
 def _bitrates(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Array]:
     """The fastest and the slowest bitrate that each row's frame may have had."""
-    base_mbps = recorded.scenario.radio.bitrate_mbps
-    fast, slow = np.full(len(recorded.trace), base_mbps), np.full(len(recorded.trace), base_mbps)
+    fast, slow = recorded.bitrate_mbps.copy(), recorded.bitrate_mbps.copy()
     for planned in plan:
         if isinstance(planned.fault, Throttle):
-            chosen, limit_mbps = planned.nodes[recorded.sender], min(base_mbps, planned.fault.bitrate_mbps)
+            chosen, limit_mbps = planned.nodes[recorded.sender], planned.fault.bitrate_mbps
             for rate, widen_ns in ((fast, -recorded.guard_ns), (slow, recorded.guard_ns)):
                 when = chosen & recorded.acting(planned, recorded.sent_ns, widen_ns)
                 rate[when] = np.minimum(rate[when], limit_mbps)

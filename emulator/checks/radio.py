@@ -78,7 +78,7 @@ def _unlike_their_law(
 def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Array:
     """Return the probabilities (n,) that receptions arrive if no other vehicle sends."""
     sender, receiver, sent_ns = recorded.sender[rows], recorded.receiver[rows], recorded.sent_ns[rows]
-    power_mw = recorded.places.pair_powers_mw(sender, receiver, sent_ns)
+    power_mw = recorded.places.pair_powers_mw(sender, receiver, sent_ns) * 10 ** (recorded.gain_db[rows] / 10)
     shape = np.zeros(len(rows), np.intp)
     shapes: tuple[float, ...] = (np.inf,)
     if radio.fading is not None:
@@ -89,21 +89,22 @@ def _survival(recorded: RecordedRun, radio: Radio, rows: NDArray[np.intp]) -> Ar
     power_db *= 10
     survives = np.zeros(len(rows))
     heard = power_mw > 0
-    airtime_ns = recorded.airtime_ns[rows]
+    airtime_ns, rate_mbps = recorded.airtime_ns[rows], recorded.bitrate_mbps[rows]
+    kinds, kind = np.unique(np.column_stack([airtime_ns, rate_mbps]), axis=0, return_inverse=True)
     for number, m in enumerate(shapes):
-        for length_ns in np.unique(airtime_ns).tolist():
-            some = heard & (shape == number) & (airtime_ns == length_ns)
+        for index, (length_ns, mbps) in enumerate(kinds.tolist()):
+            some = heard & (shape == number) & (kind.ravel() == index)
             if some.any():
-                survives[some] = _arrives(radio, m, length_ns, power_db[some])
+                survives[some] = _arrives(radio, m, int(length_ns), mbps, power_db[some])
     return survives
 
 
-def _arrives(radio: Radio, m: float, airtime_ns: int, power_db: Array) -> Array:
-    """The probability that frames of this length arrive alone, by mean power; without fading m is infinite."""
+def _arrives(radio: Radio, m: float, airtime_ns: int, rate_mbps: float, power_db: Array) -> Array:
+    """Return the probability that frames arrive alone, by mean power; without fading m is infinite."""
     threshold = Threshold(radio.receiver or Receiver())
 
     def of(power_mw: Array) -> Array:
-        arrives = arrival_probability(power_mw / threshold.noise_mw, airtime_ns, radio.bitrate_mbps)
+        arrives = arrival_probability(power_mw / threshold.noise_mw, airtime_ns, rate_mbps)
         return np.asarray(np.where(power_mw >= threshold.alone_mw, arrives, 0.0))
 
     if np.isinf(m):
@@ -249,6 +250,7 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
     earlier, later = earlier[noticed], later[noticed]
     sent_ns = recorded.sent_ns[air.rows[earlier]]
     power_mw = recorded.places.pair_powers_mw(air.sender[earlier], air.sender[later], sent_ns)
+    power_mw *= 10 ** (recorded.gain_db[air.rows[earlier]] / 10)
     sensed = power_mw >= milliwatts(radio.mac.carrier_sense_dbm) * (1 + ROUNDING)
     return np.unique(air.rows[later[sensed & (air.sender[earlier] != air.sender[later])]])
 

@@ -22,7 +22,8 @@ from emulator.drivers.presence import Presence
 from emulator.faults.plan import FaultPlan, PlannedFault
 from emulator.faults.selectors import Nodes
 from emulator.radio.connectivity import connectivity_of
-from emulator.radio.engine import Deliveries, Delivery, Engine
+from emulator.radio.dot11p import abilities_of
+from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
 from emulator.radio.stages import least_latency_ns
 from emulator.records.costs import Costs
@@ -36,6 +37,7 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
 from emulator.world.world import Instant, World, components
+from vnet.radio import SendOptions
 from vnet.reports import Report
 from vnet.transport import wire
 from vnet.units import NS_PER_S
@@ -173,6 +175,7 @@ class Emulation:
             wire.VERSION,
             self.orders.of_node(node, incarnation),
             self.driving.control_ns,
+            *abilities_of(scenario.radio),
         )
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
@@ -184,12 +187,17 @@ class Emulation:
             return
         self.drive_to(time_ns)
         frames: dict[str, list[bytes]] = {}
+        options: dict[str, dict[int, SendOptions]] = {}
         endings: list[wire.Ending] = []
         unhandled: list[wire.Unhandled] = []
         notes: list[wire.Note] = []
         for part in traffic:
             for frame in part.frames:
-                frames.setdefault(frame.node, []).append(frame.payload)
+                queued = frames.setdefault(frame.node, [])
+                if frame.power_dbm is not None or frame.rate_mbps is not None:
+                    chosen = SendOptions(frame.power_dbm, frame.rate_mbps)
+                    options.setdefault(frame.node, {})[len(queued)] = chosen
+                queued.append(frame.payload)
             self._reports.extend(report for report in part.reports if self.up[report.node])
             endings.extend(part.endings)
             unhandled.extend(part.unhandled)
@@ -200,7 +208,7 @@ class Emulation:
             self._place(time_ns // self.world.period_ns)
         senders = [node for node in sorted(frames, key=self.number.__getitem__) if self.up[node]]
         for node in self.orders.to_medium(time_ns, senders):
-            self.engine.transmit(time_ns, self.number[node], frames[node])
+            self.engine.transmit(time_ns, self.number[node], frames[node], options.get(node, NO_OPTIONS))
         self.log_book.tell(time_ns, notes, unhandled)
         for ending in sorted(endings, key=lambda e: self.number[e.node]):
             self._end(time_ns, ending)

@@ -105,7 +105,6 @@ class Csma:
         self._aifs_ns, self._window = edca_parameters(mac)
         self._signals = signals
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
-        self._bitrate_mbps = radio.bitrate_mbps
         self._limit = radio.queue_frames
         threshold = Threshold(radio.receiver or Receiver())
         remembered_ns = 2 * least_latency_ns(radio) + 2 * WINDOW_NS  # what programs may ask for, and more
@@ -266,7 +265,7 @@ class Csma:
         station.contends, station.on_air = False, True
         self._counting.pop(station.node, None)
         frame.on_air_ns = now_ns
-        airtime = airtime_ns(frame.size_bytes, self._bitrate_mbps)
+        airtime = airtime_ns(frame.size_bytes, frame.bitrate_mbps)
         if self._congestion is not None:
             self._congestion.record_transmission(station.node, now_ns, airtime)
         self.medium.begin(frame, now_ns)

@@ -7,7 +7,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
+from vnet.radio import RadioAbilities
 from vnet.types import Array
 
 PREAMBLE_NS = 40_000
@@ -64,12 +66,22 @@ def airtime_ns(size_bytes: int, bitrate_mbps: float) -> int:
     return PREAMBLE_NS + SYMBOL_NS * -(-(SERVICE_AND_TAIL_BITS + 8 * size_bytes) // per_symbol)
 
 
-def airtimes_ns(radio: Radio, size_bytes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Airtimes in ns (any shape) of frames of these sizes; without a physical radio, their bits / bitrate."""
+def airtimes_ns(radio: Radio, size_bytes: NDArray[np.int64], bitrate_mbps: Array) -> NDArray[np.int64]:
+    """Airtimes in ns (n,) of frames of these sizes and bit rates; without a physical radio, bits / bit rate."""
     if not radio.is_physical:
-        return np.rint(size_bytes * 8_000 / radio.bitrate_mbps).astype(np.int64)
-    sizes, index = np.unique(size_bytes, return_inverse=True)
-    return np.array([airtime_ns(size, radio.bitrate_mbps) for size in sizes.tolist()], np.int64)[index]
+        return np.rint(size_bytes * 8_000 / bitrate_mbps).astype(np.int64)
+    airtimes = np.zeros(len(size_bytes), np.int64)
+    for rate in np.unique(bitrate_mbps).tolist():
+        some = bitrate_mbps == rate
+        sizes, index = np.unique(size_bytes[some], return_inverse=True)
+        airtimes[some] = np.array([airtime_ns(size, rate) for size in sizes.tolist()], np.int64)[index]
+    return airtimes
+
+
+def abilities_of(radio: Radio) -> RadioAbilities:
+    """Return what programs may choose for a frame with this radio."""
+    power_dbm = None if radio.path_loss is None else radio.path_loss.tx_power_dbm
+    return RadioAbilities(power_dbm, RATES_MBPS if radio.is_physical else ())
 
 
 def cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:

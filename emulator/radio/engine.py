@@ -11,8 +11,9 @@ after it has been sent, over all frames at once that have been sent since the la
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 
@@ -30,6 +31,7 @@ from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
+from emulator.radio.propagation import DIGITS
 from emulator.radio.reception import Reception
 from emulator.radio.sender_faults import Outgoing, SenderFaults
 from emulator.radio.signals import Signals
@@ -44,14 +46,19 @@ from emulator.radio.stages import (
     sender_side,
 )
 from emulator.radio.topology import Topology
-from emulator.radio.trace import Trace, payload_digest
+from emulator.radio.trace import CHOSEN, Trace, payload_digest
+from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links
+from vnet.radio import MIN_POWER_DBM, SendOptions
 from vnet.types import IntArray
+
+NO_OPTIONS: Mapping[int, SendOptions] = {}
 
 __all__ = ["Deliveries", "Delivery", "Engine"]
 
 _COLUMNS = ("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "left_ns")
+_CHOICES = attrgetter(*CHOSEN)
 _OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air_ns", "end_ns")
 """Returns a frame's values of `_COLUMNS` of the trace."""
 
@@ -73,6 +80,7 @@ class Engine:
         rules: OwnRules | None = None,
     ) -> None:
         self._node_ids = tuple(node_ids)
+        self._radio = radio
         self._max_payload_bytes = radio.max_payload_bytes
         count = len(node_ids)
         signals = Signals(seed, radio.fading, count) if radio.is_physical else None
@@ -99,6 +107,8 @@ class Engine:
         self._trace = Trace(node_ids, self._csma is not None, knows_power=radio.path_loss is not None)
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
+        self._choices = self._default_choices = 0.0, radio.bitrate_mbps
+        """Power above the scenario's in dB, and bit rate in Mbit/s, of the frame that is enqueued."""
         self._copies: Counter[tuple[int, int]] = Counter()
         self._in_flight = InFlight(len(node_ids))
         self.on_payload: Callable[[int, int, int, bytes], None] | None = None
@@ -146,12 +156,18 @@ class Engine:
 
     # Enqueueing.
 
-    def transmit(self, time_ns: int, node: int, payloads: Sequence[bytes]) -> None:
-        """Enqueue frames that `node` broadcasts at `time_ns`, in order. A node that is down sends nothing."""
+    def transmit(
+        self, time_ns: int, node: int, payloads: Sequence[bytes], options: Mapping[int, SendOptions] = NO_OPTIONS
+    ) -> None:
+        """Enqueue frames that `node` broadcasts at `time_ns`, in order. A node that is down sends nothing.
+
+        `options` are those of frames, by their index, that have another power or bit rate than the scenario's.
+        """
         if not self._topology.is_up(node):
             return
         self._mac.run(time_ns)
-        for payload in payloads:
+        for index, payload in enumerate(payloads):
+            self._choices = self._allowed(options[index]) if index in options else self._default_choices
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
             if self.on_payload is not None:
@@ -164,8 +180,11 @@ class Engine:
                 self._enqueue(time_ns, node, outgoing)
 
     def _frame(self, time_ns: int, node: int, outgoing: Outgoing) -> Frame:
+        gain_db, bitrate_mbps = self._choices
         return Frame(
             sender=node,
+            bitrate_mbps=bitrate_mbps,
+            gain_db=gain_db,
             seq=outgoing.seq,
             sent_ns=time_ns,
             size_bytes=len(outgoing.payload),
@@ -177,6 +196,19 @@ class Engine:
             name=outgoing.alias or self._node_ids[node],
             cause=outgoing.cause,
         )
+
+    def _allowed(self, options: SendOptions) -> tuple[float, float]:
+        """Return the power above the scenario's in dB and the bit rate of a frame, as far as the radio has them."""
+        gain_db, bitrate_mbps = self._default_choices
+        radio = self._radio
+        if options.power_dbm is not None and radio.path_loss is not None and math.isfinite(options.power_dbm):
+            power_dbm = max(options.power_dbm, MIN_POWER_DBM)
+            gain_db = round(min(power_dbm - radio.path_loss.tx_power_dbm, 0.0), DIGITS)
+        if radio.is_physical and options.rate_mbps in RATES_MBPS:
+            bitrate_mbps = float(options.rate_mbps or bitrate_mbps)
+        if (gain_db, bitrate_mbps) != self._default_choices:
+            self._trace.begin_choices(radio.bitrate_mbps)
+        return gain_db, bitrate_mbps
 
     def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
         frame = self._frame(time_ns, node, outgoing)
@@ -236,6 +268,8 @@ class Engine:
         then those of the second, and so on.
         """
         columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
+        if self._trace.chooses:
+            columns.update(zip(CHOSEN, np.array([_CHOICES(frame) for frame in frames]).T, strict=True))
         digests = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
         frame_index = np.repeat(np.arange(len(frames)), each)
         powers_db = None

@@ -51,6 +51,8 @@ class Frame:
     `draw` distinguishes its draws from the original's, and depends only on the fault and on the repeated frame. Its
     sender's name is `name`, and `cause` is the number of the fault that sends or changes it.
 
+    It is sent at `bitrate_mbps`, with a power of `gain_db` above that of the scenario.
+
     `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
     oversize, queue_full, held_back, fault (a rule dropped it), or pending for a frame that is sent. The frame is
     on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive
@@ -64,6 +66,8 @@ class Frame:
     size_bytes: int
     topology: TopologySnapshot
     effects: LinkEffects
+    bitrate_mbps: float
+    gain_db: float = 0.0
     copy: int = 0
     draw: int = 0
     payload: bytes = b""

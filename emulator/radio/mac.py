@@ -61,14 +61,13 @@ class _Backlog:
 class TransmitQueue:
     """A transmit queue for each sender: random access delay, airtime, and at most `radio.queue_frames` waiting.
 
-    The airtime is the frame's bits at `radio.bitrate_mbps`; with a physical radio it is that of 802.11p. A frame's
+    The airtime is the frame's bits at its bit rate; with a physical radio it is that of 802.11p. A frame's
     end is known as soon as it is enqueued. Faults `throttle` some senders.
     """
 
     def __init__(self, seed: int, radio: Radio) -> None:
         self._draws = Draws(seed, "access")
         self._access_jitter_ns = radio.access_jitter_ms * NS_PER_MS
-        self._bitrate_mbps = radio.bitrate_mbps
         self._is_physical = radio.is_physical
         self._limit = radio.queue_frames
         self._backlogs: dict[int, _Backlog] = {}
@@ -92,7 +91,7 @@ class TransmitQueue:
     def enqueue(self, frame: Frame) -> None:
         """Decide `queue_full`, or the time at which the frame's transmission ends."""
         jitter_ns = int(self._access_jitter_ns * self._draws.uniform(frame.sender, frame.seq, 1, frame.draw)[0])
-        bitrate_mbps = self._bitrate_mbps
+        bitrate_mbps = frame.bitrate_mbps
         if (unthrottled := self._unthrottled.get(frame.sender)) is not None:
             self._put(frame, unthrottled, jitter_ns, bitrate_mbps)
             bitrate_mbps = min(bitrate_mbps, self._throttled_mbps[frame.sender])
@@ -109,7 +108,7 @@ class TransmitQueue:
             return None
         airtime = round(frame.size_bytes * 8_000 / bitrate_mbps)
         if self._is_physical:  # a throttled sender takes even longer
-            airtime = max(airtime_ns(frame.size_bytes, self._bitrate_mbps), airtime)
+            airtime = max(airtime_ns(frame.size_bytes, frame.bitrate_mbps), airtime)
         return backlog.take(frame.sent_ns + jitter_ns, airtime)
 
     def next_ns(self) -> int | None:

@@ -46,7 +46,6 @@ class Reception:
 
     def __init__(self, radio: Radio, signals: Signals) -> None:
         self._signals = signals
-        self._bitrate_mbps = radio.bitrate_mbps
         self._threshold = Threshold(radio.receiver or Receiver())
 
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
@@ -57,8 +56,9 @@ class Reception:
         signals = [self._signal(frames[index]) for index in sent]
         power_mw = np.array([signal.power_mw for signal in signals])
         random_draws = np.array([signal.random_draws for signal in signals])
-        on_air_ns = np.array([airtime_ns(frames[index].size_bytes, self._bitrate_mbps) for index in sent])
-        alone = self._received_alone(power_mw, random_draws, on_air_ns - PREAMBLE_NS)
+        rates_mbps = np.array([frames[index].bitrate_mbps for index in sent])
+        on_air_ns = np.array([airtime_ns(frames[index].size_bytes, frames[index].bitrate_mbps) for index in sent])
+        alone = self._received_alone(power_mw, random_draws, on_air_ns - PREAMBLE_NS, rates_mbps)
         faded = np.zeros_like(receptions.outcome, bool)
         faded[sent] = ~alone
         receptions.decide(faded, Outcome.faded)
@@ -100,13 +100,15 @@ class Reception:
             frame.signal = self._signals.of(frame)
         return frame.signal
 
-    def _received_alone(self, power_mw: Array, random_draws: Words, payload_ns: IntArray) -> NDArray[np.bool_]:
+    def _received_alone(
+        self, power_mw: Array, random_draws: Words, payload_ns: IntArray, rates_mbps: Array
+    ) -> NDArray[np.bool_]:
         """Return the mask (K, N) of receptions that would succeed without interference.
 
         Draws decide only where bits are in error: at the edge of the range.
         """
         alone = power_mw >= self._threshold.alone_mw
-        costs = cost(np.where(alone, power_mw / self._threshold.noise_mw, np.inf), self._bitrate_mbps)
+        costs = _costs(np.where(alone, power_mw / self._threshold.noise_mw, np.inf), rates_mbps)
         if costs.any():
             edge = costs > 0
             spent = (costs * payload_ns[:, None])[edge]
@@ -128,7 +130,8 @@ class Reception:
         own_mw = power_mw[frame_of]
         others_mw = np.maximum(total_mw - own_mw, 0.0)
         snr = np.where(candidates[frame_of], own_mw / (self._threshold.noise_mw + others_mw), np.inf)
-        costs = cost(snr, self._bitrate_mbps) * lengths_ns[:, None]
+        rates_mbps = np.array([frame.bitrate_mbps for frame in frames])[frame_of]
+        costs = _costs(snr, rates_mbps) * lengths_ns[:, None]
         spent = np.add.reduceat(costs, np.cumsum([0, *each[:-1]]), axis=0)
         destroyed: NDArray[np.bool_] = spent > 0
         destroyed[destroyed] = spent[destroyed] >= _max_cost(random_draws[destroyed])
@@ -141,6 +144,13 @@ class Reception:
             if until_ns > begin_ns:
                 yield until_ns - begin_ns, total_mw
                 begin_ns = until_ns
+
+
+def _costs(snr: Array, rates_mbps: Array) -> IntArray:
+    """Return the costs (K, N) of a nanosecond of payload of frames at these bit rates (K,)."""
+    if (rates_mbps == rates_mbps[0]).all():
+        return cost(snr, float(rates_mbps[0]))
+    return np.array([cost(row, rate) for row, rate in zip(snr, rates_mbps.tolist(), strict=True)])
 
 
 def _max_cost(random_draws: Words) -> Array:

@@ -60,4 +60,6 @@ class Signals:
         steps = (random_draws & _LAST).view(np.int64)  # of the type of an index, which numpy need not convert
         power_mw = mean_mw * self.nakagami.factor(topology.fading[sender], steps)
         power_mw[sender] = mean_mw[sender]
+        if frame.gain_db:
+            power_mw *= 10 ** (frame.gain_db / 10)
         return Signal(random_draws, power_mw, random_draws.item(sender))

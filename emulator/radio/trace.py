@@ -39,8 +39,12 @@ _FRAME = np.dtype(
         ("on_air_ns", "<i8"),
         ("left_ns", "<i8"),
         ("copy", "<i2"),
+        ("gain_db", "<f8"),
+        ("bitrate_mbps", "<f8"),
     ]
 )
+CHOSEN = ("gain_db", "bitrate_mbps")
+"""Columns of the trace where programs choose powers or bit rates."""
 _RECEPTION = np.dtype(
     [
         ("frame", "<i4"),
@@ -125,6 +129,8 @@ class Trace:
         self._frames = _Table(_FRAME, INITIAL_FRAMES)
         self._powers = _Table(_POWER, INITIAL_RECEPTIONS if knows_power else 0)
         self.knows_power = knows_power
+        self.chooses = False
+        """True if a program has chosen a power or a bit rate."""
         self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -164,6 +170,12 @@ class Trace:
                 steps = np.clip(np.rint(power_db * POWER_STEPS_DB), UNKNOWN_POWER + 1, -UNKNOWN_POWER - 1)
                 powers[name] = np.nan_to_num(steps, nan=UNKNOWN_POWER)
         return first
+
+    def begin_choices(self, bitrate_mbps: float) -> None:
+        """Have columns for the powers and bit rates of frames; those so far had none but this bit rate."""
+        if not self.chooses:
+            self.chooses = True
+            self._frames.records["bitrate_mbps"] = bitrate_mbps
 
     def powers(self, rows: IntArray) -> tuple[list[float], list[float]]:
         """Return received powers in dBm, and their ratios to noise and interference in dB, of rows (n,)."""
@@ -211,7 +223,8 @@ class Trace:
 
         With `[radio.mac]` there are two more columns: `on_air_ns`, the start of a frame's transmission (null if it
         never started), and `left_ns`, the time at which it ended or the frame was dropped. With a path loss there
-        are `rssi_dbm` and `snr_db`, null for a frame that was never on air.
+        are `rssi_dbm` and `snr_db`, null for a frame that was never on air. Where programs have chosen a power or a
+        bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`.
         """
         rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -224,6 +237,7 @@ class Trace:
             )
 
         times = ("arrival_ns", "on_air_ns")
+        chosen = self._frames.records[self._receptions.records["frame"][order]] if self.chooses else None
         powers = self._powers.records[order] if self.knows_power else None
         arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
         return pa.table(
@@ -239,6 +253,7 @@ class Trace:
                 "arrival_ns": arrival,
                 "copy": pa.array(rows["copy"]),
                 **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
+                **({} if chosen is None else {name: pa.array(chosen[name]) for name in CHOSEN}),
                 **({} if powers is None else {name: _in_db(powers[name]) for name in UNHASHED}),
             }
         )

@@ -144,7 +144,23 @@ class RecordedTables:
     @cached_property
     def airtime_ns(self) -> IntArray:
         """Duration of each row's transmission, but for throttles."""
-        return airtimes_ns(self.scenario.radio, self.column("size_bytes"))
+        return airtimes_ns(self.scenario.radio, self.column("size_bytes"), self.bitrate_mbps)
+
+    @cached_property
+    def bitrate_mbps(self) -> Array:
+        """Bit rate of each row's frame in Mbit/s."""
+        return self._chosen("bitrate_mbps", self.scenario.radio.bitrate_mbps)
+
+    @cached_property
+    def gain_db(self) -> Array:
+        """Power of each row's frame above the scenario's in dB."""
+        return self._chosen("gain_db", 0.0)
+
+    def _chosen(self, name: str, default: float) -> Array:
+        """Return a column that the trace has where programs choose, or else the default."""
+        if name not in self.trace.column_names:
+            return np.full(len(self.trace), default)
+        return np.asarray(self.trace[name].to_numpy(), dtype=np.float64)
 
     @cached_property
     def seq(self) -> IntArray:

@@ -1,6 +1,7 @@
 """Vehicle programs that behave and misbehave, for whole runs: entries are `tests.system.programs:NAME`."""
 
 import asyncio
+import hashlib
 import json
 import os
 import random
@@ -126,13 +127,18 @@ async def forgetful(node: Node) -> None:
 
 
 async def answering(node: Node) -> None:
-    """Speaks at every fix, and answers at once, in seven bytes, what it hears of the vehicle before it."""
+    """Speaks at every fix, and answers at once, in seven bytes, what it hears of the vehicle before it.
+
+    Answers say what its radio measures, and have a power and a bit rate of their own.
+    """
     before = f"v{int(node.id[1:]) - 1:0{len(node.id) - 1}}"
 
     async def answer() -> None:
         async for packet in node.radio:
             if packet.sender == before and len(packet.payload) == 300:
-                await node.radio.broadcast(packet.payload[:6] + b"!")
+                measured = repr((packet.rssi_dbm, packet.snr_db, node.radio.busy_ratio, packet.payload[:6]))
+                said = hashlib.blake2b(measured.encode(), digest_size=6).digest()
+                await node.radio.broadcast(said + b"!", power_dbm=15.0, rate_mbps=12.0)
 
     answers = asyncio.create_task(answer())
     async for fix in node.gnss:

@@ -28,6 +28,8 @@ def test_whoever_answers_what_it_hears_is_woken_at_the_same_instant(vnet: Vnet) 
     assert simulated.fingerprint == apart.fingerprint == together.fingerprint
     answers = [row for row in simulated.trace() if row["size_bytes"] == 7]
     assert len(answers) > 20
+    assert {(round(row["gain_db"], 6), row["bitrate_mbps"]) for row in answers} == {(-18.0, 12.0)}
+    assert simulated.outcomes["delivered"] > 20
 
 
 def test_on_the_wall_clock_frames_share_the_medium_too(tmp_path: Path) -> None:

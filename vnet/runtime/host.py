@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from vnet.driving import Action
 from vnet.node import Fix, Node
+from vnet.radio import RadioAbilities, SendOptions
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
@@ -94,6 +95,7 @@ class Host:
             max_payload=welcome.max_payload,
             incarnation=welcome.incarnation,
             control_ns=welcome.control_ns,
+            abilities=RadioAbilities(welcome.max_power_dbm, welcome.rates_mbps),
             disk=partial(self._disks.of, welcome.node),
         )
 
@@ -103,10 +105,10 @@ class Host:
         """Emulated time in nanoseconds, by the clock of `node`."""
         return self._clocks.now_of(node)
 
-    def send_frame(self, node: str, payload: bytes) -> None:
+    def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
         if self._active[node]:
-            self._outbox.frames.append(wire.Frame(node, payload))
+            self._outbox.frames.append(wire.Frame(node, payload, *options))
             self._on_traffic()
 
     def busy_ratio(self, node: str) -> float | None:

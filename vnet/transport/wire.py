@@ -86,10 +86,12 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
-    """One broadcast that `node` enqueues."""
+    """One broadcast that `node` enqueues, with the scenario's power and bit rate where it has none of its own."""
 
     node: str
     payload: bytes
+    power_dbm: float | None = None
+    rate_mbps: float | None = None
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
@@ -242,6 +244,8 @@ class Welcome(Message, frozen=True):
     version: Count = 1
     order: Order | None = None
     control_ns: Count = 0
+    max_power_dbm: float | None = None
+    rates_mbps: Sequence[float] = ()
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):

@@ -43,7 +43,7 @@ def frame_of(
 ) -> Frame:
     """A frame that has been sent without taking any time."""
     topology = (among or Topology(np.zeros((1, 2)), Disc(1.0), 1)).now
-    return Frame(sender, seq, sent_ns, size, topology, ActiveLinkFaults(), end_ns=sent_ns)
+    return Frame(sender, seq, sent_ns, size, topology, ActiveLinkFaults(), 6.0, end_ns=sent_ns)
 
 
 def sent(
