@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.node import Fix
 from vnet.reports import Report
@@ -14,10 +15,12 @@ from vnet.transport.orders import Deviation
 times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)
 reals = st.floats(allow_nan=False)
-packets = st.builds(wire.WirePacket, names, names, times, times, st.binary(max_size=64))
+powers = st.none() | reals
+packets = st.builds(wire.WirePacket, names, names, times, times, st.binary(max_size=64), powers, powers)
 clocks = st.lists(
     st.builds(wire.ClockError, names, times, st.integers(-(2**50), 2**50), st.floats(-0.5, 0.5)), max_size=2
 )
+busy = st.lists(st.builds(wire.BusyRatios, times, st.lists(st.floats(0, 1), max_size=3)), max_size=2)
 fixes = st.builds(
     wire.WireFix,
     names,
@@ -34,7 +37,8 @@ reports = st.builds(
     st.none() | st.tuples(reals, reals, reals, reals),
     st.dictionaries(names, reals | st.lists(reals, max_size=4), max_size=3),
 )
-frames = st.builds(wire.Frame, names, st.binary(max_size=64))
+frames = st.builds(wire.Frame, names, st.binary(max_size=64), powers, powers)
+actions = st.builds(Action, names, st.none() | st.floats(-1e6, 1e6), st.integers(-1, 1))
 endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
 unhandled = st.builds(wire.Unhandled, names, st.none() | times, names, names, names)
 notes = st.builds(
@@ -55,6 +59,7 @@ traffic = st.builds(
     st.lists(unhandled, max_size=2),
     st.lists(notes, max_size=2),
     st.lists(deviations, max_size=2),
+    st.lists(actions, max_size=2),
 )
 steps = st.builds(wire.Step, times, traffic)
 histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
@@ -90,6 +95,7 @@ emulator_messages = st.one_of(
         times,
         st.lists(fixes, max_size=2),
         st.none() | times,
+        busy,
     ),
     st.builds(
         wire.Batch,
@@ -100,6 +106,7 @@ emulator_messages = st.one_of(
         times,
         st.booleans(),
         clocks,
+        busy,
     ),
     st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.StackRequest()),
