@@ -23,6 +23,8 @@ _LIFETIME = {CAM: 1 << 2 | 1, DENM: 60 << 2 | 1}
 """Multiples of a second."""
 _MOBILE, _HOPS, _RADIUS_M = 0x80, {CAM: 1, DENM: 10}, 1000
 _HEADER_BITS = 48
+_UNAVAILABLE = 900_000_001, 1_800_000_001
+"""Latitude and longitude that are not available; larger ones are none."""
 _LEAST_BITS = {CAM: 256, DENM: 250}
 """Bits of messages that have all that is read here."""
 
@@ -68,6 +70,13 @@ class Router:
 
 def station_of(message: bytes) -> Station | None:
     """Return what a CAM says of its station, or where the event of a DENM is; None if it is neither."""
+    station = _read(message)
+    if station is None or abs(station.latitude) > _UNAVAILABLE[0] or abs(station.longitude) > _UNAVAILABLE[1]:
+        return None
+    return station
+
+
+def _read(message: bytes) -> Station | None:
     if len(message) < 2 or message[0] not in _VERSIONS or message[1] not in _PORTS:
         return None
     kind = message[1]
@@ -84,7 +93,7 @@ def station_of(message: bytes) -> Station | None:
         heading = bits.take(12)
         bits.skip(7)
         speed = bits.take(14)
-        return Station(latitude, longitude, 0 if speed == 16383 else speed, 0 if heading == 3601 else heading)
+        return Station(latitude, longitude, 0 if speed == 16383 else speed, 0 if heading > 3600 else heading)
     bits.skip(_HEADER_BITS + 3 + 1)
     has_termination = bits.take(1)
     bits.skip(4 + 32 + 16 + 42 + 42 + has_termination)  # options, action, times of detection and reference
