@@ -46,10 +46,12 @@ def rule_digests(scenario: Scenario) -> dict[str, str]:
 
 
 def rules_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the entries of all rules of the user's own in a scenario, sorted."""
+    """Return the entries of all rules of the user's own in a scenario, and of its own network, sorted."""
     from emulator.scenario.fault_families import OwnRule  # whoever has a scenario has imported it
 
-    return tuple(sorted({fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}))
+    entries = {fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}
+    network = scenario.network.function
+    return tuple(sorted(entries | ({network} if network else set())))
 
 
 def digests_of(entries: tuple[str, ...], folders: tuple[Path, ...] = ()) -> dict[str, str]:
@@ -64,7 +66,7 @@ def changed_code(recorded: Mapping[str, Any], now: Mapping[str, str]) -> str:
         return ""
     names = {"program": f"the program {now['entries'].replace(' ', ', ')}", "vnet": "vnet"}
     if recorded.get("rule_entries") == now.get("rule_entries") is not None:
-        names["rules"] = f"the rules {now['rule_entries'].replace(' ', ', ')}"
+        names["rules"] = f"the functions {now['rule_entries'].replace(' ', ', ')}"
     changed = [
         words for key, words in names.items() if key in recorded and key in now and recorded[key] != now[key]
     ]

@@ -14,7 +14,12 @@ from emulator.scenario.program import Program, split_file
 from vnet.errors import ScenarioError, shown
 from vnet.runtime.own_packages import OWN
 
-DEFAULT_FUNCTIONS = {"program.entry": "main", "program.checks": "check", "fault.rule": DEFAULT_RULE}
+DEFAULT_FUNCTIONS = {
+    "program.entry": "main",
+    "program.checks": "check",
+    "fault.rule": DEFAULT_RULE,
+    "network.function": "network",
+}
 """Functions of a file that is named without one, by key."""
 
 
@@ -42,6 +47,16 @@ def with_rules(
     }
     ruled = tuple(found.fault(each) for each in faults)
     return program.model_copy(update={**data, "folders": found.folders}), ruled
+
+
+def with_network(program: Program, function: str, base: Path | None, source: str) -> tuple[Program, str]:
+    """Return `[program]` with the folder of the function of `[network]`, and that as `module:function`.
+
+    Raises ScenarioError for a file that is not there.
+    """
+    found = _Modules(program.folders, base, f"{source}: " if source else "")
+    entry = found.entry("network.function", function)
+    return program.model_copy(update={"folders": found.folders}), entry
 
 
 class _Modules:

@@ -9,15 +9,16 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import tomli_w
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from emulator.scenario.driven import Driven
 from emulator.scenario.faults import AnyFault
-from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
-from emulator.scenario.modules import with_rules
+from emulator.scenario.limits import DAY_S, FAR_M
+from emulator.scenario.modules import with_network, with_rules
+from emulator.scenario.network import Map, Network
 from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
@@ -31,9 +32,6 @@ from vnet.errors import ScenarioError, did_you_mean, first_names, printable, sho
 from vnet.units import NS_PER_S
 
 MANY = 1_000_000_000
-OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
-"""Keys of `[network]` for vehicles that move."""
-NO_PATH = 'path is required with kind = "file", "trips" or "sumo", and only then'
 
 
 class Run(Section):
@@ -92,89 +90,6 @@ class Run(Section):
         if self.tape is not None and (self.order != "fifo" or self.pacing != "lockstep"):
             raise ValueError('tape goes with order = "fifo" and pacing = "lockstep"')
         return self
-
-
-Shift = Annotated[float, Field(ge=-FAR_M, le=FAR_M)]
-OriginDeg = tuple[Annotated[float, Field(ge=-84, le=84)], Annotated[float, Field(ge=-180, le=180)]]
-
-
-class Network(Section):
-    """`[network]`: which vehicles there are and where they are, or how they drive."""
-
-    kind: Literal["generated", "file", "trips", "sumo", "city", "driven"] = "generated"
-    """`generated` draws `vehicles` in a `layout`, `file` reads where they stand; `trips` reads how they drive,
-    `sumo` has SUMO drive, and in a `city`, a generated one or that of `[map]`, `vehicles` drive anywhere; `driven`
-    ones are driven by their programs."""
-    path: Path | None = None
-    """Relative to the scenario file. `file`: CSV with the columns id, x_m, y_m (east, north), heading_rad; `trips`:
-    CSV, Parquet, NPZ, or SUMO's FCD (XML); `sumo`: a `.sumocfg`."""
-    vehicles: int = Field(38, ge=1, le=10_000)
-    """Number of generated vehicles; their ids are v01, v02, …, of 100 or more v001, v002, …"""
-    layout: Literal["urban", "dense"] = "urban"
-    """`urban` has the degrees and components of the published networks; `dense` packs all into 4.2 km by 4.2 km."""
-    size_m: float = Field(3000.0, ge=1000, le=10_000)
-    """Extent of the generated city, from one end to the other."""
-    seed: int = Field(1, ge=0, lt=2**63)
-    """Draws the generated network, the city and its traffic, or SUMO's traffic, and nothing of the run."""
-    start_s: float | None = Field(None, ge=-FAR_S, le=FAR_S)
-    """Trips: at which time of the file the run begins; at its first sample's, or SUMO's beginning, if left out."""
-    max_vehicles: int | None = Field(None, ge=1, le=10_000)
-    """Trips: no more than so many vehicles, those that enter first."""
-    disc: tuple[float, float, Annotated[float, Field(gt=0, le=FAR_M)]] | None = None
-    """Trips: vehicles are there only within this disc, x, y, radius in m."""
-    origin_deg: OriginDeg | None = None
-    """Trips in degrees: latitude and longitude of x = y = 0 m; the middle of the trips if left out."""
-    fastest_mps: float = Field(70.0, gt=0, le=1000)
-    """Trips: what is faster is a jump."""
-    longest_gap_s: float = Field(10.0, gt=0, le=DAY_S)
-    """Trips: so long without a sample a vehicle drives straight on; for longer it has left."""
-    max_acceleration_mps2: float | None = Field(None, gt=0, le=FAR_M)
-    """Trips: where a vehicle would need a greater acceleration, in the mean of half a second, it leaves, and enters
-    again behind; such jumps are driven if left out. Vehicles reach 10."""
-    impossible_trips: Literal["leave_out", "refuse"] = "leave_out"
-    """Trips: a vehicle with many steps that no vehicle can make is left out, which one line says, or the run is
-    refused. If most vehicles are so, units or ids are wrong, and the run is refused in any case."""
-
-    driven: Driven | None = None
-    """Road and dynamics of driven vehicles; `kind = "driven"` has them by default."""
-
-    @property
-    def moves(self) -> bool:
-        """True if vehicles drive, enter and leave."""
-        return self.kind in ("trips", "sumo", "city", "driven")
-
-    @model_validator(mode="after")
-    def _keys_go_with_their_kind(self) -> Network:
-        if (self.kind not in ("generated", "city", "driven")) != (self.path is not None):
-            raise ValueError(f'path is required with kind = "{self.kind}"' if self.path is None else NO_PATH)
-        given = [name for name in OF_TRIPS if getattr(self, name) is not None]
-        if given and self.kind not in ("trips", "sumo"):
-            raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
-        if self.driven is not None and self.kind != "driven":
-            raise ValueError(f'driven goes with kind = "driven", not with "{self.kind}"')
-        return self
-
-
-class Map(Section):
-    """`[map]`: the roads on which vehicles drive, as programs know them. Without it they know none."""
-
-    path: Path
-    """Relative to the scenario file: OpenStreetMap's XML or PBF, SUMO's `.net.xml`, GeoJSON or NPZ."""
-    drive_on: Literal["right", "left"] = "right"
-    """On which side of the road people drive."""
-    origin_deg: OriginDeg | None = None
-    """Latitude and longitude of x = y = 0 m, if the map is in degrees and the trips are not; else the trips'."""
-    sigma_m: float = Field(0.0, ge=0, le=WILD_M)
-    """Standard deviation by which true lanes stray from the map's: programs trust it no further."""
-    aside_m: float = Field(0.0, ge=-FAR_M, le=FAR_M)
-    """Mean distance of the driven line to the right of the map's lanes; negative: to the left."""
-    datum_m: tuple[Shift, Shift] = (0.0, 0.0)
-    """Shift of the map, east and north, before programs get it; `vnet map datum` finds it from trips."""
-    datum_sigma_m: float = Field(0.0, ge=0, le=WILD_M)
-    """Standard deviation in each axis by which the whole map may still be shifted. Nobody can tell that from the
-    common error: programs add it to the covariances that they state, not to what they exchange."""
-    margin_m: float = Field(300.0, ge=0, le=FAR_M)
-    """Programs are given the roads within so much of the box in which vehicles drive."""
 
 
 class Radio(Section):
@@ -359,6 +274,10 @@ def scenario_from(
     scenario = _with_absolute_paths(scenario, path)
     try:
         program, faults = with_rules(scenario.program, scenario.fault, path.parent, checks, str(path))
+        if (function := scenario.network.function) is not None:
+            program, function = with_network(program, function, path.parent, str(path))
+            network = scenario.network.model_copy(update={"function": function})
+            scenario = scenario.model_copy(update={"network": network})
     except ScenarioError as error:
         raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
     scenario = scenario.model_copy(update={"program": program, "fault": faults})

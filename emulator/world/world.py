@@ -68,7 +68,7 @@ def _drive(scenario: Scenario) -> World:
     if scenario.network.kind == "city":
         motion, lanes = drive_through_city(scenario.network, section, periods, scenario.period_ns)
     else:
-        motion = drive(scenario.network, periods, scenario.period_ns)
+        motion = drive(scenario.network, scenario.program, periods, scenario.period_ns)
         if section is not None:
             roads = read_roads(section.path, section.origin_deg or motion.origin_deg)
             lanes = lanes_around(roads, section, motion.position_m)

@@ -24,7 +24,9 @@ from emulator.drivers.hosts import messages
 from emulator.drivers.status import Course
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.faults import parse_fault
-from emulator.scenario.scenario import Network, Radio, Scenario, dump_scenario, load_scenario
+from emulator.scenario.network import Network
+from emulator.scenario.program import Program
+from emulator.scenario.scenario import Radio, Scenario, dump_scenario, load_scenario
 from emulator.scenario.sumo import input_files, read_begin_s
 from emulator.world.links import load_links
 from emulator.world.maps.files import read_roads
@@ -189,7 +191,7 @@ def _read_links(data: bytes) -> None:
 def _read_trips(name: str, data: bytes) -> None:
     """Read trips as a world does, with the reader for the file's name, and drive them."""
     network = Network(kind="trips", path=_file(name, data), origin_deg=(42.0, -83.0))
-    motion = drive(network, 21, 10**8)
+    motion = drive(network, Program(), 21, 10**8)
     there: Mask = np.logical_and.reduce(np.isfinite(motion.position_m), axis=2)
     assert motion.position_m.shape == (21, len(motion.node_ids), 2) and there[:20].any(axis=0).all()
 

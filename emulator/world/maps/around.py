@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.scenario.scenario import Map
+from emulator.scenario.network import Map
 from emulator.world.maps.osm import CLIPPED
 from emulator.world.maps.roads import Roads
 from vnet.errors import ScenarioError

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from emulator.scenario.scenario import Map, Network
+from emulator.scenario.limits import DAY_S
+from emulator.scenario.network import Map, Network
+from emulator.scenario.program import Program
 from emulator.scenario.sumo import read_begin_s
 from emulator.world.maps.around import lanes_around, notes_of
 from emulator.world.maps.city import city_roads
@@ -15,6 +17,7 @@ from emulator.world.trips.fcd import drive_sumo, read_fcd
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
 from emulator.world.trips.matrices import read_npz
 from emulator.world.trips.motion import Motion, Selection, motion_of
+from emulator.world.trips.own import own_samples
 from emulator.world.trips.samples import Samples
 from emulator.world.trips.tables import read_csv, read_parquet
 from vnet.errors import ScenarioError
@@ -25,16 +28,15 @@ READERS = {".csv": read_csv, ".parquet": read_parquet, ".npz": read_npz, ".xml":
 """Readers of trips by the ending of the file's name."""
 
 
-def drive(network: Network, periods: int, period_ns: int) -> Motion:
-    """Return the motion of a network's vehicles over `periods`.
+def drive(network: Network, program: Program, periods: int, period_ns: int) -> Motion:
+    """Return the motion of a network's vehicles over `periods`; `program` has the folders of their functions.
 
     Raise ScenarioError, naming the file and the line or row, for a bad file.
     """
-    path = network.path
-    assert path is not None
+    path = network.path or Path(f"network.kind = {network.function!r}")
     rules = Rules(
         fastest_mps=network.fastest_mps,
-        longest_gap_s=network.longest_gap_s,
+        longest_gap_s=DAY_S if network.kind == "own" else network.longest_gap_s,
         leaves_out=network.impossible_trips == "leave_out",
         hardest_mps2=network.max_acceleration_mps2,
     )
@@ -43,6 +45,9 @@ def drive(network: Network, periods: int, period_ns: int) -> Motion:
     if network.kind == "sumo":
         start_s = read_begin_s(path) if start_s is None else start_s
         samples = drive_sumo(path, network.seed, start_s + duration_s)
+    elif network.kind == "own":
+        start_s = start_s or 0.0
+        samples = own_samples(network, program, duration_s)
     else:
         window_s = None
         if start_s is not None:

@@ -102,7 +102,7 @@ def test_a_changed_rule_is_told_when_the_run_is_run_again(here: Path) -> None:
     (here / "rule_of_mine.py").write_text(RULE.replace("v01", "v02"))
     status, output = vnet("simulate", "run/scenario.toml", "--no-report", "--out", "other")
     assert status == 0
-    assert "the rules rule_of_mine:drops changed since this run was recorded" in output
+    assert "the functions rule_of_mine:drops changed since this run was recorded" in output
 
 
 @pytest.mark.slow
