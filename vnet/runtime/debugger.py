@@ -28,7 +28,12 @@ _NOT_STEPPED_INTO = (
     "agents.attachment",
     "agents.host",
     "emulator.",
+    "namedtuple_",  # what Python generates for named tuples
+    "vnet.driving",
+    "vnet.mailbox",
     "vnet.node",
+    "vnet.radio",
+    "vnet.reports",
     "vnet.runtime.",
     "vnet.transport.",
 )

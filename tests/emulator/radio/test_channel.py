@@ -1,5 +1,6 @@
 """The stages of the channel one by one: each decides what is its business, and draws only what it must."""
 
+from dataclasses import replace
 from typing import NamedTuple
 from unittest.mock import Mock
 
@@ -57,8 +58,8 @@ def sent(
 
 
 def queued(queue: TransmitQueue, seq: int, sender: int = 0, time_ns: int = 0, size: int = 100) -> int | None:
-    """Enqueue a frame; return the end of its transmission, or None if the queue was full."""
-    frame = frame_of(sender, seq, time_ns, size)
+    """Enqueue a frame of 8 Mb/s; return the end of its transmission, or None if the queue was full."""
+    frame = replace(frame_of(sender, seq, time_ns, size), bitrate_mbps=8.0)
     queue.enqueue(frame)
     assert queue.sent.pop() is frame
     return frame.end_ns if frame.sender_outcome == Outcome.pending else None
@@ -225,7 +226,7 @@ def expected_queue(sends: list[tuple[int, int]], limit: int) -> list[int | None]
 def test_the_queue_fills_and_drains_with_the_bit_rate(gaps: list[tuple[int, int]], limit: int) -> None:
     times = np.cumsum([gap for gap, _ in gaps]).tolist()
     sends = [(time, size) for time, (_, size) in zip(times, gaps, strict=True)]
-    stage = TransmitQueue(1, radio(access_jitter_ms=0, bitrate_mbps=8, queue_frames=limit))
+    stage = TransmitQueue(1, radio(access_jitter_ms=0, queue_frames=limit))
     left = [queued(stage, seq, 0, time_ns, size) for seq, (time_ns, size) in enumerate(sends)]
     assert left == expected_queue(sends, limit)
 
