@@ -49,6 +49,9 @@ def agent(
     join_timeout_s: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for the emulator's welcome.")
     ] = 60.0,
+    connect_timeout_s: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for an answer at ENDPOINT.")
+    ] = 5.0,
     path: Annotated[
         list[Path] | None,
         typer.Option(
@@ -99,7 +102,7 @@ def agent(
                 raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
         login = None if credentials is None else Credentials.load(credentials)
         debugger = None if debug is None or debug_socket is None else _debugger(debug, debug_socket)
-        run_agent(connect, run, node, login, join_timeout_s, Disks(files), debugger)
+        run_agent(connect, run, node, login, join_timeout_s, Disks(files), debugger, connect_timeout_s)
     except VnetError as error:
         print(f"vnet-agent: {error}", file=sys.stderr)
         sys.exit(2 if isinstance(error, ProgramError) else 3)

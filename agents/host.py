@@ -43,16 +43,18 @@ def run_agent(
     join_timeout_s: float,
     disks: Disks | None = None,
     debugger: NodeDebugger | None = None,
+    connect_timeout_s: float | None = None,
 ) -> None:
     """Join `run` at `endpoint` as `nodes` and run their programs to the end of the run.
 
     `disks` has the folders of the nodes, by default temporary ones. `debugger` stops in a program, in lockstep.
+    `connect_timeout_s` is how long to wait for a router, `join_timeout_s` for the emulator behind it.
 
     Raises TransportError (cannot join, refused, orphaned) and ProgramError (the program cannot be loaded).
     """
     with ExitStack() as stack:
         set_time_slice(PROMPT_SLICE_NS)  # Zenoh's threads keep it
-        session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS))
+        session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS, connect_timeout_s))
         attachment = Attachment(session, run, nodes, stack)
         stack.callback(attachment.write_total)
         stack.callback(end_within)

@@ -92,8 +92,13 @@ class Launcher:
     `stop` ends all that are left, whatever happened before. Agents are forked from the `zygote`, if there is one.
     """
 
-    def __init__(self, logs: Path, folders: Sequence[Path] = (), zygote: Zygote | None = None) -> None:
-        """Processes with logs in `logs`; agents look for their programs in `folders` too."""
+    def __init__(
+        self, logs: Path, folders: Sequence[Path] = (), zygote: Zygote | None = None, patience_s: float = 60.0
+    ) -> None:
+        """Processes with logs in `logs`; agents look for their programs in `folders` too.
+
+        Agents wait `patience_s` for the router, which is there but may be busy with others, and for the emulator.
+        """
         self.logs = logs
         self.disks: Path | None = None
         """Folder of the disks of vehicles, if agents are to have them in one place."""
@@ -101,6 +106,7 @@ class Launcher:
         """The debugger of a vehicle, and where its user answers."""
         self._folders = folders
         self._zygote = zygote
+        self._patience_s = patience_s
         self._processes: dict[str, Process] = {}
         self._services: set[str] = set()
 
@@ -136,6 +142,7 @@ class Launcher:
     def _agent_arguments(self, endpoint: str, run: str, nodes: Sequence[str]) -> list[str]:
         """Return the arguments of `vnet-agent`, but for its credentials."""
         arguments = ["--connect", endpoint, "--run", run]
+        arguments += ["--connect-timeout-s", str(self._patience_s), "--join-timeout-s", str(self._patience_s)]
         for node in nodes:
             arguments += ["--node", node]
         if self.disks is not None:

@@ -254,7 +254,7 @@ def test_the_status_of_a_run_is_its_picture_or_json(tmp_path: Path) -> None:
 
 def test_a_run_that_was_killed_is_said_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It leaves its control file behind."""
-    monkeypatch.setattr(session, "CONNECT_TIMEOUT_MS", 100)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 0.1)
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))  # and does not listen
         endpoint = f"tcp/127.0.0.1:{nobody.getsockname()[1]}"

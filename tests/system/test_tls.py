@@ -33,7 +33,7 @@ def create() -> Access:
 
 @pytest.fixture
 def access(monkeypatch: pytest.MonkeyPatch) -> Access:
-    monkeypatch.setattr(session, "CONNECT_TIMEOUT_MS", 1000)
+    monkeypatch.setattr(session, "CONNECT_TIMEOUT_S", 1.0)
     return create()
 
 

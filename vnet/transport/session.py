@@ -24,8 +24,8 @@ from vnet.transport.credentials import Credentials, Identity, as_base64, write_p
 AGENT_RUNTIME = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:2))"
 """`ZENOH_RUNTIME` of an agent, read by Zenoh when it starts: fewer threads, 30 % less CPU time."""
 
-CONNECT_TIMEOUT_MS = 5000
-"""Longest time to connect to a router: long enough for a loaded machine."""
+CONNECT_TIMEOUT_S = 5.0
+"""Longest time to connect to a router that may not be there: long enough for a loaded machine."""
 
 _NO_CONFIGURATIONS = "zenoh::api::session=off"
 """Filter of Zenoh's log that drops sessions' configurations, which contain passwords."""
@@ -52,8 +52,14 @@ def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Se
 
 
 @contextmanager
-def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -> Iterator[zenoh.Session]:
-    """Open a client session of the router at `endpoint`. Raise TransportError if none answers, or it refuses."""
+def open_client(
+    endpoint: str, credentials: Credentials | None, lease_ms: int, timeout_s: float | None = None
+) -> Iterator[zenoh.Session]:
+    """Open a client session of the router at `endpoint`.
+
+    Raise TransportError if none answers within `timeout_s` (by default 5 s), or it refuses.
+    """
+    timeout_s = CONNECT_TIMEOUT_S if timeout_s is None else timeout_s
     identity = None if credentials is None else credentials.tls
     if is_tls(endpoint) != (identity is not None):
         has = "have a certificate: connect to tls/HOST:PORT" if identity else "have no certificate"
@@ -62,7 +68,7 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
         "mode": "client",
         "connect": {
             "endpoints": [endpoint],
-            "timeout_ms": CONNECT_TIMEOUT_MS,
+            "timeout_ms": round(1000 * timeout_s),
             "exit_on_failure": True,
             "retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
         },
@@ -76,7 +82,7 @@ def open_client(endpoint: str, credentials: Credentials | None, lease_ms: int) -
         usrpwd = {"user": credentials.user, "password": credentials.password}
         config["transport"]["auth"] = {"usrpwd": usrpwd}
     who = f" as {credentials.user}" if credentials else " without credentials"
-    with _closed_at_end(_open(config, f"cannot connect to {endpoint}{who}")) as session:
+    with _closed_at_end(_open(config, f"cannot connect to {endpoint}{who}", timeout_s)) as session:
         yield session
 
 
@@ -130,18 +136,18 @@ def _identification(identity: Identity | None) -> dict[str, Any]:
     }
 
 
-def _open(config: dict[str, Any], failure: str) -> zenoh.Session:
+def _open(config: dict[str, Any], failure: str, timeout_s: float = 0.0) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
     except zenoh.ZError as error:
-        raise TransportError(f"{failure}: {_reason(str(error))}") from None
+        raise TransportError(f"{failure}: {_reason(str(error), timeout_s)}") from None
 
 
-def _reason(text: str) -> str:
+def _reason(text: str, timeout_s: float) -> str:
     if "Address already in use" in text or "os error 98" in text:
         return "the address is already in use"
     if "Cannot assign requested address" in text:
         return "no such address on this machine"
     if "Timeout" in text:
-        return f"no router answered, or it refused the credentials, within {CONNECT_TIMEOUT_MS / 1000:.0f} s"
+        return f"no router answered, or it refused the credentials, within {timeout_s:g} s"
     return text.split(" at /")[0]

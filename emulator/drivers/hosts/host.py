@@ -80,7 +80,7 @@ def run_host(
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="vnet-host-")))
         (folder / "logs").mkdir()
         zygote = Zygote(welcome.modules) if welcome.start == "fork" and sys.platform == "linux" else None
-        launcher = Launcher(folder / "logs", folders, zygote)
+        launcher = Launcher(folder / "logs", folders, zygote, join_timeout_s)
         launcher.disks = folder / "disks"
         stack.callback(launcher.stop, SHUT_DOWN_S)
         down = Down(

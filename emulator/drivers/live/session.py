@@ -72,7 +72,8 @@ async def run_live(
     """
     with ExitStack() as stack:
         zygote = _zygote(emulation.scenario) if options.launch and not options.access.hosts else None
-        launcher = Launcher(emulation.folder.logs, emulation.scenario.program.folders, zygote)
+        scenario = emulation.scenario
+        launcher = Launcher(emulation.folder.logs, scenario.program.folders, zygote, scenario.run.join_timeout_s)
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
             set_time_slice(PROMPT_SLICE_NS)

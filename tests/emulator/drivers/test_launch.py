@@ -7,6 +7,7 @@ import pytest
 
 from emulator.drivers.launch import Launcher
 from tests.support.processes import has_ended
+from vnet.transport.access import Access
 
 SAY = "import os; print(os.getsid(0), os.getpgrp() == os.getpid())"
 
@@ -47,3 +48,16 @@ def test_what_a_process_has_forked_ends_with_it(tmp_path: Path, then: str) -> No
         assert launcher.ended()["v1"].status == (3 if then else 0)
     launcher.stop()
     assert has_ended(child, 60)
+
+
+def test_agents_wait_as_long_as_they_may_join_for_a_router_that_many_ask(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a thousand that connect at once on a busy machine, the last one waits more than a few seconds."""
+    started: list[list[str]] = []
+    launcher = Launcher(tmp_path, patience_s=600.0)
+    monkeypatch.setattr(launcher, "start", lambda name, arguments, *_: started.append(arguments))
+    launcher.start_agents("tcp/127.0.0.1:1", Access.create("run", [["v01"]]), [["v01"]])
+    options = iter(started[0])
+    told = {option: next(options) for option in options if option.endswith("-timeout-s")}
+    assert told == {"--connect-timeout-s": "600.0", "--join-timeout-s": "600.0"}

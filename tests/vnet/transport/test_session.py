@@ -10,6 +10,7 @@ import pytest
 import zenoh
 
 from tests.support.paths import ROOT
+from vnet.errors import TransportError
 from vnet.transport import keys, session, wire
 from vnet.transport.access import Access, node_user
 from vnet.transport.session import open_client, open_router, router_endpoint
@@ -48,7 +49,7 @@ def test_zenohs_log_never_tells_a_configuration(wanted: str | None) -> None:
         "from vnet.errors import TransportError\n"
         "from vnet.transport import session\n"
         "from vnet.transport.credentials import Credentials\n"
-        "session.CONNECT_TIMEOUT_MS = 1\n"
+        "session.CONNECT_TIMEOUT_S = 0.001\n"
         "session.quiet_zenoh()\n"
         "try:\n"
         "    with session.open_client('tcp/127.0.0.1:1', Credentials('user', 'tell-nobody'), 1000): pass\n"
@@ -86,3 +87,11 @@ def test_a_peer_that_does_not_answer_does_not_keep_a_session_from_ending(monkeyp
     with open_client("tcp/127.0.0.1:1", None, LEASE_MS):
         pass
     assert opened.closed == 2
+
+
+def test_a_client_says_how_long_it_has_waited_for_a_router() -> None:
+    with (
+        pytest.raises(TransportError, match=r"tcp/127.0.0.1:1 without .*: no router answered.* within 0.05 s"),
+        open_client("tcp/127.0.0.1:1", None, LEASE_MS, timeout_s=0.05),
+    ):
+        pass
