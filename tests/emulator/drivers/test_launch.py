@@ -53,7 +53,7 @@ def test_what_a_process_has_forked_ends_with_it(tmp_path: Path, then: str) -> No
 def test_agents_wait_as_long_as_they_may_join_for_a_router_that_many_ask(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a thousand that connect at once on a busy machine, the last one waits more than a few seconds."""
+    """Each of a thousand that connect at once has to wait for others."""
     started: list[list[str]] = []
     launcher = Launcher(tmp_path, patience_s=600.0)
     monkeypatch.setattr(launcher, "start", lambda name, arguments, *_: started.append(arguments))
