@@ -71,7 +71,7 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
         body = struct.pack("<HHI", LINKTYPE_RADIOTAP, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
-    radiotap = _radiotap(recorded.scenario.radio.bitrate_mbps)
+    radiotaps = {rate: _radiotap(rate) for rate in np.unique(recorded.bitrate_mbps).tolist()}
     comments = _Comments(recorded)
     columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
@@ -86,7 +86,7 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
             routed = routers.packet(sender, seq, int(recorded.sent_ns[packet.row]), payload)
         if routed is not None:
             ethertype, payload, size_bytes = geonetworking.ETHERTYPE, routed, len(routed)
-        header = radiotap + _frame_header(sender, seq, ethertype)
+        header = radiotaps[float(recorded.bitrate_mbps[packet.row])] + _frame_header(sender, seq, ethertype)
         file.write(_packet_block(packet, header, payload or b"", size_bytes, comments.of(packet)))
         count += 1
     return count

@@ -91,6 +91,7 @@ class Engine:
         )
         self._mac: Mac = self._csma or TransmitQueue(seed, radio)
         self._rules = rules or OwnRules(seed, node_ids)
+        self._rules.tx_power_dbm = radio.path_loss.tx_power_dbm if radio.path_loss is not None else None
         self._links = LinkFaults(seed, self._mac, count, self._rules)
         self._senders = SenderFaults(self._node_ids, self._next_copy, self._ask_sender)
         self._reception = Reception(radio, signals) if signals is not None else None

@@ -26,6 +26,7 @@ from emulator.radio import rule_watch
 from emulator.radio.byte_flips import flips_between, random_flips
 from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions
 from emulator.radio.outcomes import PENDING
+from emulator.radio.propagation import DIGITS
 from emulator.radio.rule_answers import Answer, Answered, NonsenseError, answered_by_link, answered_by_sender
 from emulator.radio.topology import TopologySnapshot
 from emulator.scenario.fault_families import OwnRule
@@ -66,6 +67,10 @@ class RadioFrame:
     """Position of each receiver (n, 2)."""
     sender_position_m: Array
     """Position of the sender (2,)."""
+    power_dbm: float | None
+    """Transmit power, antenna gains included; None without `[radio.path_loss]`."""
+    rate_mbps: float
+    """Bit rate in Mbit/s."""
     options: Mapping[str, Any]
     """The fault's `options`."""
     _position_of: Callable[[str], Array]
@@ -99,9 +104,14 @@ class RuleFailure:
 
 
 class OwnRules:
-    """The rules of one run, their states, and which of them have failed. `on_failure` is told of each that does."""
+    """The rules of one run, their states, and which of them have failed.
+
+    `on_failure` is told of each that does. `tx_power_dbm` is the power of frames whose program has chosen none; None
+    without a path loss.
+    """
 
     def __init__(self, seed: int, node_ids: Sequence[str]) -> None:
+        self.tx_power_dbm: float | None = None
         self._seed = seed
         self._node_ids = tuple(node_ids)
         self._number = {node: number for number, node in enumerate(node_ids)}
@@ -161,6 +171,8 @@ class OwnRules:
             distance_m=_fixed(topology.distance_m[frame.sender, columns]),
             position_m=_fixed(topology.position_m[receivers]),
             sender_position_m=_fixed(topology.position_m[frame.sender]),
+            power_dbm=None if self.tx_power_dbm is None else round(self.tx_power_dbm + frame.gain_db, DIGITS),
+            rate_mbps=frame.bitrate_mbps,
             options=self._options[number],
             _position_of=lambda vehicle: self._where(topology, vehicle),
             _stream=(self._seed, f"fault {number} rule", frame.sender, frame.seq, frame.draw),

@@ -18,6 +18,7 @@ from emulator.export.mcap_file import SCHEMAS, write_mcap
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.scenario.scenario import Scenario
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
@@ -156,6 +157,27 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         sender, seq = packet["comment"].split(";")[0].replace(",", "").split(" frame ")
         assert mac[10:16] == b"\x02\x00\0\0\0" + bytes([recorded.number[sender] + 1])
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
+
+
+async def changes_its_rate(node: Any) -> None:
+    """Send frames by turns at the scenario's bit rate, and at 27 Mbit/s."""
+    async for fix in node.gnss:
+        await node.radio.broadcast(b"x", rate_mbps=27 if fix.time_ns % 200_000_000 else None)
+
+
+def test_a_packet_has_the_bit_rate_of_its_own_frame(tmp_path: Path) -> None:
+    radio = {"path_loss": {"kind": "free_space", "floor_dbm": -150.0}, "bitrate_mbps": 3.0}
+    scenario = {"run": {"duration_s": 1.0, "settle_s": 0.1}, "network": {"vehicles": 2, "layout": "dense"}}
+    program = {"entry": f"{__name__}:changes_its_rate"}
+    run_scenario(tmp_path / "run", Scenario.model_validate({**scenario, "radio": radio, "program": program}))
+    file = io.BytesIO()
+    recorded = RecordedRun.open(tmp_path / "run")
+    write_pcapng(recorded, file)
+    rates = {row["seq"]: row["bitrate_mbps"] for row in recorded.trace.to_pylist()}
+    assert set(rates.values()) == {3.0, 27.0}
+    for packet in packets(file.getvalue()):
+        seq = int(packet["comment"].split(";")[0].split(" frame ")[1])
+        assert packet["bytes"][9] / 2 == rates[seq]
 
 
 def test_comments_tell_what_became_of_a_frame(capture: bytes, recorded: OpenedRun) -> None:
