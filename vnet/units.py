@@ -24,6 +24,8 @@ UNITS = {
     "kb": "kB",
     "mb": "MB",
     "ppm": "ppm",
+    "db_per_m": "dB/m",
+    "m_per_km": "m/km",
     "rad_s": "rad/s",
     "rad": "rad",
     "deg": "°",

@@ -70,7 +70,7 @@ WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.
 """
 WORLD_COLUMNS = ["array", "type", "shape", "unit", "what"]
-KINDS = {"U": "text", "f": "double", "b": "bool"}
+KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
 `format` in `verdict.json` is the version of the whole folder.
 
@@ -105,6 +105,9 @@ WORLD = {
     "lane_heading_rad": "its direction of travel, counter-clockwise from east",
     "lane_length_m": "its length; infinite for a lane that is a straight line through its point",
     "links": "with `radio.links` only: whether the row's vehicle hears the column's",
+    "building_corner_m": "with `[radio.buildings]` only: the corners of the buildings near vehicles, ring by ring",
+    "building_first": "for each ring its first corner, and then the number of all corners",
+    "building_number": "the building to which each ring belongs; courts are rings of their own",
     "receiver_m": "with a recorded common error of several receivers only: what each has beyond the common error",
 }
 PAYLOAD = {

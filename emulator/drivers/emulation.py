@@ -90,12 +90,12 @@ class Emulation:
         """Length of the run."""
         self.world = world
         self.folder = folder
-        self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
+        self._connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.radio_inputs)
         self._rules = OwnRules(scenario.run.seed, world.node_ids)
         self._rules.load(scenario.fault, scenario.program)
         self._rules.on_failure = self._rule_failed
         self.engine = Engine(
-            world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.links, self._rules
+            world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.radio_inputs, self._rules
         )
         self.payloads = PayloadRecorder(world.node_ids) if scenario.run.keep_payloads else None
         if self.payloads is not None:

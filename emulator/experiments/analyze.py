@@ -119,7 +119,7 @@ def _measured(run: Path, rules: dict[str, Any]) -> dict[str, Any]:
 
 def hears_matrix(scenario: Scenario, world: World) -> Links:
     """Directed links at the start, (N, N), row i hears column j: range, links or path loss, and the peer cap."""
-    connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.links)
+    connectivity = connectivity_of(scenario.radio, scenario.run.seed, world.radio_inputs)
     topology = Topology(world.at(0).position_m, connectivity, scenario.radio.max_peers)
     return topology.admitted_links().matrix().T
 

@@ -6,9 +6,11 @@ from typing import Protocol
 
 import numpy as np
 
-from emulator.radio.propagation import MeanPower
+from emulator.radio.obstacles import Obstacles
+from emulator.radio.propagation import DIGITS, MeanPower
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links, links_within
+from emulator.world.radio_inputs import RadioInputs
 from vnet.types import Array, Mask
 
 
@@ -28,11 +30,16 @@ class Connectivity(Protocol):
         """Return the mean received power (N, N) in mW, 0 out of range; the diagonal is the transmit power."""
 
 
-def connectivity_of(radio: Radio, seed: int, links: Mask | None) -> Connectivity:
-    """Return the model that a scenario configures; `links` (N, N) is `radio.links` as loaded (rows: receivers)."""
+def connectivity_of(radio: Radio, seed: int, inputs: RadioInputs | None = None) -> Connectivity:
+    """Return the model that a scenario configures, with what it has read from files."""
+    inputs = inputs or RadioInputs()
     if radio.path_loss is not None:
-        return AboveFloor(MeanPower(radio.path_loss, radio.shadowing, seed), radio.path_loss.floor_dbm)
-    return Disc(radio.range_m) if links is None else Matrix(links)
+        obstacles = None
+        if radio.buildings is not None and inputs.buildings is not None:
+            obstacles = Obstacles(inputs.buildings, radio.buildings)
+        mean = MeanPower(radio.path_loss, radio.shadowing, seed)
+        return AboveFloor(mean, radio.path_loss.floor_dbm, obstacles)
+    return Disc(radio.range_m) if inputs.links is None else Matrix(inputs.links)
 
 
 def distances_m(position_m: Array) -> Array:
@@ -90,11 +97,12 @@ class Matrix(_EqualPower):
 
 
 class AboveFloor:
-    """All nodes whose mean received power is at least `floor_dbm`."""
+    """All nodes whose mean received power is at least `floor_dbm`, behind buildings too."""
 
-    def __init__(self, mean: MeanPower, floor_dbm: float) -> None:
+    def __init__(self, mean: MeanPower, floor_dbm: float, obstacles: Obstacles | None = None) -> None:
         self.mean = mean
         self._floor_dbm = floor_dbm
+        self._obstacles = obstacles
 
     def links(self, position_m: Array) -> Links:
         """See `Connectivity`."""
@@ -102,11 +110,21 @@ class AboveFloor:
 
     def in_range(self, position_m: Array, distance_m: Array) -> Mask:
         """See `Connectivity`."""
-        return _without_itself(self.mean.dbm(position_m, distance_m) >= self._floor_dbm)
+        return _without_itself(self._dbm(position_m, distance_m) >= self._floor_dbm)
+
+    def _dbm(self, position_m: Array, distance_m: Array) -> Array:
+        """Return the mean received power (N, N); -inf where buildings take it below the floor."""
+        power_dbm = self.mean.dbm(position_m, distance_m)
+        if self._obstacles is None:
+            return power_dbm
+        margin_db = power_dbm - self._floor_dbm
+        loss_db = self._obstacles.loss_db(position_m, np.maximum(margin_db, margin_db.T))
+        np.fill_diagonal(loss_db, 0.0)
+        return np.round(power_dbm - loss_db, DIGITS)
 
     def power_mw(self, position_m: Array, distance_m: Array) -> Array:
         """See `Connectivity`."""
-        power_dbm = self.mean.dbm(position_m, distance_m)
+        power_dbm = self._dbm(position_m, distance_m)
         itself = np.eye(len(power_dbm), dtype=bool)
         above = (power_dbm >= self._floor_dbm) | itself
         return np.asarray(np.where(above, 10 ** (np.where(above, power_dbm, 0.0) / 10), 0.0))

@@ -50,6 +50,7 @@ from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links
+from emulator.world.radio_inputs import RadioInputs
 from vnet.radio import MIN_POWER_DBM, SendOptions
 from vnet.types import IntArray
 
@@ -66,8 +67,8 @@ _OF_FRAME = attrgetter("sent_ns", "sender", "seq", "size_bytes", "copy", "on_air
 class Engine:
     """The state of the emulated radio. Nodes have the numbers 0 … N-1 in the order of `node_ids`.
 
-    `position_m` (N, 2) are positions in metres. `links` (N, N) is `radio.links` as loaded: entry (i, j) is true if
-    i receives j. It is None if range or path loss decide. `rules` are those of the user's own.
+    `position_m` (N, 2) are positions in metres. `inputs` are those that a scenario reads from files; `rules` are
+    those of the user's own.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class Engine:
         radio: Radio,
         seed: int,
         position_m: NDArray[np.float64],
-        links: NDArray[np.bool_] | None,
+        inputs: RadioInputs | None = None,
         rules: OwnRules | None = None,
     ) -> None:
         self._node_ids = tuple(node_ids)
@@ -85,7 +86,7 @@ class Engine:
         count = len(node_ids)
         signals = Signals(seed, radio.fading, count) if radio.is_physical else None
         nakagami = signals.nakagami if signals is not None else None
-        self._topology = Topology(position_m, connectivity_of(radio, seed, links), radio.max_peers, nakagami)
+        self._topology = Topology(position_m, connectivity_of(radio, seed, inputs), radio.max_peers, nakagami)
         self._csma = (
             Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
         )

@@ -106,8 +106,8 @@ class RuleFailure:
 class OwnRules:
     """The rules of one run, their states, and which of them have failed.
 
-    `on_failure` is told of each that does. `tx_power_dbm` is the power of frames whose program has chosen none; None
-    without a path loss.
+    `on_failure` is told of each that does. `tx_power_dbm` is the power of frames whose program has chosen none;
+    None without a path loss.
     """
 
     def __init__(self, seed: int, node_ids: Sequence[str]) -> None:

@@ -190,7 +190,7 @@ def bound_of(recorded: RecordedTables) -> BoundSeries:
         raise VnetError("no program reported a common error")
     position_m, start = recorded.vectors("position_m"), pc.equal(recorded.states["period"], 0)
     heading_rad = recorded.states.filter(start)["heading_rad"].to_numpy()
-    links = connectivity_of(scenario.radio, scenario.run.seed, world.links).links(world.position_m)
+    links = connectivity_of(scenario.radio, scenario.run.seed, world.radio_inputs).links(world.position_m)
     lane = lanes_of(position_m[0], heading_rad, world.lane_point_m, world.lane_heading_rad)
     filters = HearsAll(
         scenario,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.scenario import Scenario
 from emulator.world.links import load_links
+from emulator.world.radio_inputs import RadioInputs
 from vnet.errors import VnetError
 from vnet.types import Array, IntArray, Mask
 
@@ -47,7 +48,7 @@ class RecordedTables:
     busy: pa.Table | None = None
     """busy.parquet, where there is a MAC."""
     world: RecordedWorld | None = None
-    """world.npz, where the scenario takes its links from a file."""
+    """world.npz."""
     driven: pa.Table | None = None
     """driven.parquet, where programs drive."""
 
@@ -78,20 +79,22 @@ class RecordedTables:
     @cached_property
     def places(self) -> Places:
         """Positions of the vehicles. Raises ScenarioError if the scenario's links do not fit them."""
-        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self._links())
+        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self._radio_inputs())
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
         return Places(some, self.moves, self.scenario.period_ns, connectivity)
 
-    def _links(self) -> Mask | None:
-        """Links (N, N), who (row) hears whom (column), where the scenario gives them; no input file is read."""
+    def _radio_inputs(self) -> RadioInputs:
+        """Return what the radio had from files, as it was recorded; no input file is read."""
         radio, count = self.scenario.radio, len(self.node_ids)
+        recorded = RadioInputs() if self.world is None else self.world.radio_inputs
+        if radio.buildings is not None and recorded.buildings is None:
+            raise VnetError("[radio.buildings]: no buildings were recorded")
         if not isinstance(radio.links, Path):
-            return load_links(radio, count)
-        links = None if self.world is None else self.world.links
-        if links is None or len(links) != count:
+            return replace(recorded, links=load_links(radio, count))
+        if recorded.links is None or len(recorded.links) != count:
             raise VnetError(f"radio.links = {str(radio.links)!r}: no links of {count} vehicles were recorded")
-        return links
+        return recorded
 
     @cached_property
     def busy_ratio(self) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.world.arrays import read_arrays
+from emulator.world.buildings import LEAST_CORNERS, Buildings
+from emulator.world.radio_inputs import RadioInputs
 from emulator.world.world import World
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array, Mask
@@ -24,21 +27,27 @@ ARRAYS: dict[str, tuple[str, str]] = {
     "lane_heading_rad": ("f", "l"),
     "lane_length_m": ("f", "l"),
     "links": ("b", "n × n"),
+    "building_corner_m": ("f", "v × 2"),
+    "building_first": ("i", "f"),
+    "building_number": ("i", "g"),
     "receiver_m": ("f", "k × r × 2"),
 }
-"""The arrays of the file: kind of number, and shape for n vehicles, l lanes, k periods and r receivers."""
-OPTIONAL = ("links", "receiver_m")
+"""The arrays of the file: kind of number, and shape for n vehicles, l lanes, g rings of buildings with v corners in
+all, f = g + 1, k periods and r receivers."""
+BUILDINGS = ("building_corner_m", "building_first", "building_number")
+OPTIONAL = ("links", *BUILDINGS, "receiver_m")
 """Arrays that may be missing."""
 
 
 @dataclass(frozen=True)
 class RecordedWorld:
-    """The vehicles, the lanes, and `radio.links` of a run.
+    """The vehicles, the lanes, the links and the buildings of a run.
 
     `position_m` (n, 2) are positions at time 0, NaN of a vehicle that is not there yet; `area_m` (2, 2) the corners
     of the box in which vehicles are during the run; lanes (l) have a point, a heading and a length from there,
-    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `receiver_m`
-    (k, r, 2) is what each receiver of a recorded common error has beyond the common one in each period, or None.
+    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `building_…`
+    are the arrays of `Buildings`, or None; `receiver_m` (k, r, 2) is what each receiver of a recorded common error
+    has beyond the common one in each period, or None.
     """
 
     node_ids: tuple[str, ...]
@@ -48,12 +57,15 @@ class RecordedWorld:
     lane_heading_rad: Array
     lane_length_m: Array
     links: Mask | None = None
+    building_corner_m: Array | None = None
+    building_first: NDArray[np.intp] | None = None
+    building_number: NDArray[np.intp] | None = None
     receiver_m: Array | None = None
 
     @classmethod
     def of(cls, world: World) -> RecordedWorld:
         """Take from a world what is to be recorded."""
-        lanes = world.lane_map
+        lanes, buildings = world.lane_map, world.radio_inputs.buildings
         return cls(
             node_ids=world.node_ids,
             position_m=world.position_m(0),
@@ -61,9 +73,24 @@ class RecordedWorld:
             lane_point_m=lanes.point_m,
             lane_heading_rad=lanes.heading_rad,
             lane_length_m=lanes.length_m,
-            links=world.links,
+            links=world.radio_inputs.links,
+            building_corner_m=None if buildings is None else buildings.corner_m,
+            building_first=None if buildings is None else buildings.first,
+            building_number=None if buildings is None else buildings.building,
             receiver_m=world.receiver_m,
         )
+
+    @cached_property
+    def buildings(self) -> Buildings | None:
+        """The buildings between vehicles, where the radio has any."""
+        if self.building_corner_m is None or self.building_first is None or self.building_number is None:
+            return None
+        return Buildings(self.building_corner_m, self.building_first, self.building_number)
+
+    @property
+    def radio_inputs(self) -> RadioInputs:
+        """Inputs of the radio from files."""
+        return RadioInputs(self.links, self.buildings)
 
     def write(self, path: Path) -> None:
         """Write the file. Raises OSError."""
@@ -88,6 +115,8 @@ class RecordedWorld:
 def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     """Raise VnetError unless the arrays have their kinds and shapes."""
     sizes = {"2": 2, "n": len(arrays.get("node_ids", ())), "l": len(arrays.get("lane_heading_rad", ()))}
+    rings = arrays.get("building_number", np.zeros(0))
+    sizes |= {"v": len(arrays.get("building_corner_m", ())), "g": len(rings), "f": len(rings) + 1}
     sizes |= dict(zip("kr", np.shape(arrays.get("receiver_m", np.zeros((0, 0, 2)))), strict=False))
     for name, (kind, dimensions) in ARRAYS.items():
         if name not in arrays:
@@ -97,3 +126,10 @@ def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         shape = tuple(sizes[dimension] for dimension in dimensions.split(" × "))
         if arrays[name].dtype.kind != kind or arrays[name].shape != shape:
             raise VnetError(f"{path}: {name} is {arrays[name].dtype} {arrays[name].shape}, not {kind} {shape}")
+    if len(present := [name for name in BUILDINGS if name in arrays]) not in (0, len(BUILDINGS)):
+        raise VnetError(f"{path}: of the arrays of buildings only {', '.join(present)}")
+    if present:
+        first, number = arrays["building_first"], arrays["building_number"]
+        sound = first[0] == 0 and first[-1] == sizes["v"] and (np.diff(first) >= LEAST_CORNERS).all()
+        if not sound or not (np.diff(number, prepend=0) >= 0).all() or number.max(initial=0) >= max(len(number), 1):
+            raise VnetError(f"{path}: building_first, building_number: not the rings of buildings")

@@ -18,6 +18,7 @@ from emulator.records.reported import figure_text, is_text
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
 from emulator.report.source import NothingToShow, Source
+from emulator.world.buildings import Buildings
 from vnet.errors import printable
 from vnet.types import Array, Mask
 from vnet.units import title_of
@@ -26,6 +27,8 @@ INNER_PX = 334
 """Width of a map inside its axes, at the size that it is drawn for."""
 LEAST_PX, MOST_PX = 150, 420
 """Bounds of its height."""
+MOST_CORNERS = 12_000
+"""Corners of buildings that are drawn, those of the largest ones."""
 MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 8000, 3000, 400
 """Road segments, links and trajectories that are drawn: more would make a page of many megabytes."""
 MOST_NAMED = 30
@@ -59,10 +62,10 @@ def _network(source: Source) -> Drawing:
     position_m = _last_positions(source)
     if source.recorded.moves:
         shown = _draw_trajectories(made, source, scale)
-        text = f"Grey: roads. Lines: the ways of {shown}; points: where they were last."
+        text = f"{_ground(source)} Lines: the ways of {shown}; points: where they were last."
     else:
         shown = _draw_links(made, source, scale)
-        text = f"Grey: roads. Lines: {shown}; points: vehicles."
+        text = f"{_ground(source)} Lines: {shown}; points: vehicles."
     _draw_vehicles(made, position_m * scale)
     if len(position_m) <= MOST_NAMED:
         for node, (x, y) in zip(source.recorded.node_ids, position_m * scale, strict=True):
@@ -136,6 +139,8 @@ def _frame(source: Source, legend_rows: int) -> tuple[Canvas, float]:
     (left, bottom), (right, top) = (centre - half) * scale, (centre + half) * scale
     made.axes.set(xlim=(left, right), ylim=(bottom, top))
     made.axes.grid(visible=False)
+    if world.buildings is not None:
+        _draw_buildings(made, world.buildings.touching(centre - half, centre + half), scale)
     _draw_roads(made, world.lane_point_m, world.lane_heading_rad, world.lane_length_m, (centre, half), scale)
     return made, scale
 
@@ -155,6 +160,25 @@ def _draw_roads(
     if len(chosen) > MOST_ROADS:
         chosen = np.sort(chosen[np.argsort(-length_m[chosen], kind="stable")[:MOST_ROADS]])
     _draw_lines(made, np.stack([start, end], axis=1)[chosen] * scale, GREY, 0.55, 0.8)
+
+
+def _draw_buildings(made: Canvas, buildings: Buildings, scale: float) -> None:
+    """Draw the areas of buildings as one path, the largest ones if there are many."""
+    shown = buildings.largest(MOST_CORNERS)
+    if not len(shown):
+        return
+    codes = np.full(len(shown.corner_m), Outline.LINETO, dtype=np.uint8)
+    codes[shown.first[:-1]] = Outline.MOVETO
+    closed = shown.first[1:]
+    corners = np.insert(shown.corner_m * scale, closed, shown.corner_m[shown.first[:-1]] * scale, axis=0)
+    outline = Outline(corners, np.insert(codes, closed, Outline.CLOSEPOLY))
+    made.axes.add_patch(PathPatch(outline, facecolor=GREY, edgecolor="none", alpha=0.3))
+
+
+def _ground(source: Source) -> str:
+    """Return what the grey of a map is, in words."""
+    buildings = source.recorded.world.buildings
+    return "Grey lines: roads; grey areas: buildings." if buildings is not None else "Grey: roads."
 
 
 def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: float) -> None:

@@ -1,4 +1,4 @@
-"""The sections of a physical radio: `[radio.path_loss]`, `shadowing`, `fading`, `receiver`, `mac`, `congestion`.
+"""The sections of a physical radio: `[radio.path_loss]`, `shadowing`, `buildings`, `fading`, `receiver`, `mac`, …
 
 Each section adds a stage to the channel: without any of them the radio is the disc of
 `radio.range_m`. docs/radio.md has the formulas and where the defaults come from.
@@ -7,10 +7,12 @@ Each section adds a stage to the channel: without any of them the radio is the d
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from emulator.scenario.network import OriginDeg
 from emulator.scenario.sections import Section
 
 RATES_MBPS = (3.0, 4.5, 6.0, 9.0, 12.0, 18.0, 24.0, 27.0)
@@ -84,6 +86,21 @@ class Shadowing(Section):
     """Standard deviation of the shadowing."""
     decorrelation_m: float = Field(25.0, gt=0, le=1e6)
     """Displacement of one end at which the correlation has fallen to 1/e."""
+
+
+class Buildings(Section):
+    """`[radio.buildings]`: attenuation by the buildings between two vehicles (Sommer, Eckhoff, German and Dressler
+    2011): `wall_db` for each outer wall on the straight way, and `inside_db_per_m` for each metre inside."""
+
+    path: Path | None = None
+    """Outlines, relative to the scenario file: OpenStreetMap's XML or PBF, GeoJSON, or CSV in metres with the
+    columns building, x_m, y_m, a row for each corner. Those of the file of `[map]` if left out."""
+    origin_deg: OriginDeg | None = None
+    """Latitude and longitude of x = y = 0 m, if the file is in degrees, and neither map nor trips say it."""
+    wall_db: float = Field(9.0, ge=0, le=300)
+    """Attenuation by each outer wall."""
+    inside_db_per_m: float = Field(0.4, ge=0, le=300)
+    """Attenuation by each metre inside a building."""
 
 
 class Fading(Section):

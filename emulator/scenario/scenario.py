@@ -21,7 +21,7 @@ from emulator.scenario.modules import with_network, with_rules
 from emulator.scenario.network import Map, Network
 from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
-from emulator.scenario.radio import RATES_MBPS, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
+from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.renamed import with_new_names
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
@@ -127,6 +127,8 @@ class Radio(Section):
     """Path loss; it replaces the range: received power decides connectivity."""
     shadowing: Shadowing | None = None
     """Shadowing by obstacles, which differs between links."""
+    buildings: Buildings | None = None
+    """Attenuation by buildings, those of the map or of a file."""
     fading: Fading | None = None
     """Fading: variation of the power from frame to frame."""
     receiver: Receiver | None = None
@@ -145,7 +147,7 @@ class Radio(Section):
     def _stages_fit_together(self) -> Radio:
         if self.path_loss is not None and self.links is not None:
             raise ValueError("path_loss and links both say who hears whom: leave one of them out")
-        for name in ("shadowing", "fading"):
+        for name in ("shadowing", "buildings", "fading"):
             if getattr(self, name) is not None and self.path_loss is None:
                 raise ValueError(f"{name} needs path_loss: without it no signal is weaker than another")
         if self.receiver is not None and not self.is_physical:
@@ -205,6 +207,13 @@ class Scenario(Section):
             check_driving(self.driven, self.run.control_hz, self.period_ns, self.world)
         elif self.world.ranging is not None:
             raise ValueError(f'world.ranging goes with network.kind = "driven", not with "{kind}"')
+        return self
+
+    @model_validator(mode="after")
+    def _buildings_are_in_a_file(self) -> Scenario:
+        buildings = self.radio.buildings
+        if buildings is not None and buildings.path is None and self.map is None:
+            raise ValueError("radio.buildings.path is missing: without [map] there is no other file of buildings")
         return self
 
     @property
@@ -311,6 +320,7 @@ def input_digests(scenario: Scenario) -> dict[str, str]:
     read = (
         scenario.network.path,
         scenario.radio.links,
+        scenario.radio.buildings and scenario.radio.buildings.path,
         scenario.map and scenario.map.path,
         scenario.world.common_error.path,
         scenario.run.tape,
@@ -334,6 +344,9 @@ def _with_absolute_paths(scenario: Scenario, scenario_path: Path) -> Scenario:
     if isinstance(radio.links, Path):
         path = _absolute(radio.links, "radio.links", scenario_path)
         radio = radio.model_copy(update={"links": path})
+    if radio.buildings is not None and radio.buildings.path is not None:
+        path = _absolute(radio.buildings.path, "radio.buildings.path", scenario_path)
+        radio = radio.model_copy(update={"buildings": radio.buildings.model_copy(update={"path": path})})
     roads = scenario.map
     if roads is not None:
         roads = roads.model_copy(update={"path": _absolute(roads.path, "map.path", scenario_path)})

@@ -56,13 +56,13 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
     """Return the message of a run's constants; only faults may be added to its `scenario` during the run.
 
     `node_ids`; lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`, which is infinite for a line in both
-    directions from its point); `range_m` (None if links or path loss decide connectivity); `component` (int16, n),
-    the connected component of each vehicle at the start (-1: absent); `area_m` (float32, 2 × 2), the corners of the
-    bounding box of all positions during the run; `moves`, true if vehicles drive; `scenario_text`, the resolved
-    scenario as TOML.
+    directions from its point); `building_edge_m` (k × 2 × 2), the ends of the edges of buildings; `range_m` (None
+    if links or path loss decide connectivity); `component` (int16, n), the connected component of each vehicle at
+    the start (-1: absent); `area_m` (float32, 2 × 2), the corners of the bounding box of all positions during the
+    run; `moves`, true if vehicles drive; `scenario_text`, the resolved scenario as TOML.
     """
     radio = scenario.radio
-    connectivity = connectivity_of(radio, scenario.run.seed, world.links)
+    connectivity = connectivity_of(radio, scenario.run.seed, world.radio_inputs)
     label = components(world.position_m, radio.range_m, connectivity.links(world.position_m))
     return {
         "name": scenario.run.name,
@@ -70,6 +70,7 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
         "lane_point_m": pack(world.lane_point_m),
         "lane_heading_rad": pack(world.lane_heading_rad),
         "lane_length_m": pack(world.lane_length_m),
+        "building_edge_m": pack([] if world.buildings is None else world.buildings.edges_m()),
         "range_m": radio.range_m if radio.links is None and radio.path_loss is None else None,
         "max_peers": scenario.radio.max_peers,
         "component": label.astype("<i2").tobytes(),

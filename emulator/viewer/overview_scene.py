@@ -89,6 +89,9 @@ class OverviewScene:
         lanes = np.stack([point - behind[:, None] * along, point + ahead[:, None] * along], axis=1)
         canvas.strip_style("map/lanes", (*GREY, 120), 1.0, -30.0)
         canvas.strips("map/lanes", lanes, static=True)
+        if len(edges := unpack(scene["building_edge_m"], 2).reshape(-1, 2, 2)):
+            canvas.strip_style("map/buildings", (*GREY, 200), 1.0, -29.0)
+            canvas.strips("map/buildings", edges, static=True)
         self._set_styles()
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas, scene)
@@ -260,7 +263,13 @@ def in_reach(radio: Mapping[str, Any]) -> str:
     """Rule of connectivity in words, by the scenario's section."""
     if "path_loss" not in radio:
         return "radio by given links" if "links" in radio else f"radio {radio['range_m']:g} m"
-    stages = {"shadowing": "shadowing", "fading": "fading", "mac": "CSMA", "congestion": "congestion"}
+    stages = {
+        "shadowing": "shadowing",
+        "buildings": "buildings",
+        "fading": "fading",
+        "mac": "CSMA",
+        "congestion": "congestion",
+    }
     words = [f"radio: {radio['path_loss']['kind'].replace('_', ' ')}"]
     return ", ".join(words + [text for name, text in stages.items() if name in radio])
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, shown
 
 MAX_ROWS = 10_000
 """Most rows of a file: the most vehicles of a scenario."""
@@ -42,3 +43,25 @@ def check_row_count(path: Path, rows: int) -> None:
     """Raise ScenarioError if there are more than `MAX_ROWS` rows."""
     if rows > MAX_ROWS:
         raise ScenarioError(f"{path}: more than {MAX_ROWS} rows; a scenario has at most so many vehicles")
+
+
+def check_columns(path: Path, reader: csv.DictReader[str], columns: Sequence[str]) -> None:
+    """Raise ScenarioError unless each of these columns is there once."""
+    names = list(reader.fieldnames or [])
+    for column in columns:
+        if names.count(column) != 1:
+            problem = "two columns" if column in names else "no column"
+            raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(columns)}")
+
+
+def number_within(path: Path, line: int, row: Mapping[str, str | None], column: str, most: float) -> float:
+    """Return the number in a column of the row of a line. Raise ScenarioError unless it is within ± `most`."""
+    try:
+        value = float(row[column] or "")
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= most:
+        raise ScenarioError(
+            f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, within ±{most:g}"
+        )
+    return value

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import NETWORK_KEY, philox
-from emulator.world.csv_file import check_row_count, open_csv
+from emulator.world.csv_file import check_columns, check_row_count, number_within, open_csv
 from vnet.errors import ScenarioError, shown
 from vnet.transport.keys import is_segment
 from vnet.types import Array
@@ -74,11 +74,7 @@ def load_network(path: Path) -> Network:
     vehicles: dict[str, tuple[float, float, float]] = {}
     with open_csv(path, _LONGEST_LINE) as lines:
         reader = csv.DictReader(lines)
-        names = list(reader.fieldnames or [])
-        for column in COLUMNS:
-            if names.count(column) != 1:
-                problem = "two columns" if column in names else "no column"
-                raise ScenarioError(f"{path}: {problem} {column!r}; needed are {', '.join(COLUMNS)}")
+        check_columns(path, reader, COLUMNS)
         for row in reader:
             name, values = _read_row(path, reader.line_num, row)
             if name in vehicles:
@@ -106,18 +102,7 @@ def _read_row(path: Path, line: int, row: dict[str, str | None]) -> tuple[str, t
     name = (row["id"] or "").strip()
     if not is_segment(name):
         raise ScenarioError(f"{path}: line {line}: id = {shown(name)}: letters, digits, '_', '.', '-', at most 64")
-    values = []
-    for column in COLUMNS[1:]:
-        try:
-            value = float(row[column] or "")
-        except ValueError:
-            value = math.nan
-        if not abs(value) <= MAX_COORDINATE_M:
-            raise ScenarioError(
-                f"{path}: line {line}: {column} = {shown(row[column])}: a finite number is needed, "
-                f"within ±{MAX_COORDINATE_M:g}"
-            )
-        values.append(value)
+    values = [number_within(path, line, row, column, MAX_COORDINATE_M) for column in COLUMNS[1:]]
     return name, (values[0], values[1], values[2])
 
 

@@ -12,6 +12,8 @@ from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import Gnss
 from emulator.world.common_error import common_errors
 from emulator.world.links import load_links
+from emulator.world.projection import Frame
+from emulator.world.radio_inputs import RadioInputs, load_buildings
 from emulator.world.receivers import MotionSensors, further_error_m, noise_m, speed_mps
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
@@ -46,27 +48,35 @@ class Instant:
 class World:
     """The truth of a run: the `motion` of all vehicles, and the fixes of their receivers.
 
-    `lane_map` is given to programs; `lane_of` (N,), the lane of each vehicle that stands on one, is not. `links`
-    (N, N) is `radio.links`: the receiver is the row, the sender the column; it is None if range or path loss
-    decide. `moves` is true if vehicles drive, enter and leave. `course_m` (K, N, 2) are the positions at the start
-    of each period, NaN for an absent vehicle; `receiver_m` (K, R, 2) is what a file's receivers have beyond the
-    common error, or None. `notes` are lines for the user about the input. Raise ScenarioError
-    if the scenario's links, exceptions or processes do not fit the vehicles.
+    `lane_map` is given to programs; `lane_of` (N,), the lane of each vehicle that stands on one, is not. `frame` is
+    that of the metres, if it is known. `radio_inputs` is what the radio reads from files. `moves` is true if
+    vehicles drive, enter and leave. `course_m` (K, N, 2) are the positions at the start of each period, NaN for an
+    absent vehicle; `receiver_m` (K, R, 2) is what a file's receivers have beyond the common error, or None. `notes`
+    are lines for the user about the input. Raise ScenarioError if the scenario's links, buildings, exceptions or
+    processes do not fit the vehicles.
     """
 
     def __init__(
-        self, scenario: Scenario, motion: Motion, lane_map: LaneMap | RoadMap, lane_of: NDArray[np.intp]
+        self,
+        scenario: Scenario,
+        motion: Motion,
+        lane_map: LaneMap | RoadMap,
+        lane_of: NDArray[np.intp],
+        frame: Frame | None = None,
     ) -> None:
         count = len(motion.node_ids)
         self.node_ids = motion.node_ids
         self.moves = scenario.network.moves
-        self.links = load_links(scenario.radio, count)
         self.period_ns = scenario.period_ns
         self.periods = periods_of(scenario)
         self.lane_map = lane_map
         self.lane_of = lane_of
         self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
+        buildings = load_buildings(scenario, frame, self.area_m)
+        self.radio_inputs = RadioInputs(load_links(scenario.radio, count), buildings)
+        if buildings is not None and not len(buildings):
+            self.notes = (*self.notes, "radio.buildings: none is near a vehicle; check its origin_deg")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)

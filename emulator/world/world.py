@@ -22,6 +22,7 @@ from emulator.world.graph import components_of_links
 from emulator.world.lateral import lateral_offsets_m
 from emulator.world.neighbours import Links, links_within
 from emulator.world.networks import Network, generate_network, load_network
+from emulator.world.projection import Frame
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import Instant, World, periods_of
 from vnet.roads.lanes import LaneMap
@@ -66,14 +67,15 @@ def _drive(scenario: Scenario) -> World:
     section, periods = scenario.map, periods_of(scenario)
     lanes: LaneMap | RoadMap = LaneMap(np.zeros((0, 2)), np.zeros(0), scenario.world.lateral.half_width_m)
     if scenario.network.kind == "city":
-        motion, lanes = drive_through_city(scenario.network, section, periods, scenario.period_ns)
+        motion, lanes, frame = drive_through_city(scenario.network, section, periods, scenario.period_ns)
     else:
         motion = drive(scenario.network, scenario.program, periods, scenario.period_ns)
+        frame = None if motion.origin_deg is None else Frame.around(*motion.origin_deg)
         if section is not None:
             roads = read_roads(section.path, section.origin_deg or motion.origin_deg)
-            lanes = lanes_around(roads, section, motion.position_m)
+            lanes, frame = lanes_around(roads, section, motion.position_m), roads.frame
             motion = replace(motion, notes=(*motion.notes, *notes_of(section.path, roads)))
-    return World(scenario, motion, lanes, np.zeros(0, dtype=np.intp))
+    return World(scenario, motion, lanes, np.zeros(0, dtype=np.intp), frame)
 
 
 def build_world(scenario: Scenario) -> World:

@@ -9,8 +9,12 @@ SMALL = ("--set", "network.vehicles=6", "--duration", "1.5")
 ANSWERING = ("--program", "tests.system.programs:answering")
 
 
-def test_processes_on_one_channel_do_the_same_as_their_simulation(vnet: Vnet) -> None:
-    live, simulated = (vnet(command, SCENARIO, *SMALL) for command in ("run", "simulate"))
+def test_processes_on_one_channel_do_the_same_as_their_simulation(vnet: Vnet, tmp_path: Path) -> None:
+    """Among buildings, too: a wall across the network."""
+    wall = tmp_path / "wall.csv"
+    wall.write_text("building,x_m,y_m\nwall,0,-9000\nwall,9,-9000\nwall,9,9000\nwall,0,9000\n")
+    behind = (*SMALL, "--set", f"radio.buildings.path={wall}")
+    live, simulated = (vnet(command, SCENARIO, *behind) for command in ("run", "simulate"))
     for run in (live, simulated):
         assert run.status == 0, run.stderr + run.stdout
         assert {run.check(name)["verdict"] for name in ("fading", "medium", "latency")} == {"valid"}

@@ -38,19 +38,25 @@ _DIGITS = 9
 """Decimals of a degree that are written (0.1 mm)."""
 
 
-class _Geometry(msgspec.Struct):
+class Geometry(msgspec.Struct):
+    """Geometry of a feature: its type, and coordinates, whose nesting depends on the type."""
+
     type: str
     coordinates: list[Any] = []
 
 
-class _Feature(msgspec.Struct):
-    geometry: _Geometry | None = None
+class Feature(msgspec.Struct):
+    """A geometry with its properties."""
+
+    geometry: Geometry | None = None
     properties: dict[str, Any] | None = None
 
 
-class _Collection(msgspec.Struct):
+class Collection(msgspec.Struct):
+    """A feature collection."""
+
     type: str
-    features: list[_Feature]
+    features: list[Feature]
     crs: Any = None
 
 
@@ -59,8 +65,16 @@ def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
 
     Points that are equal to seven decimals are the same, so that lines that meet are joined roads.
     """
+    builder = RoadsBuilder(path)
+    for number, feature in enumerate(read_collection(path).features):
+        _add_feature(path, builder, number, feature)
+    return builder.build_from_degrees(origin_deg)
+
+
+def read_collection(path: Path) -> Collection:
+    """Read a collection of features in WGS-84. Raise ScenarioError for a bad file."""
     try:
-        collection = msgspec.json.decode(read_bounded(path, LARGEST_BYTES), type=_Collection)
+        collection = msgspec.json.decode(read_bounded(path, LARGEST_BYTES), type=Collection)
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # msgspec's errors are ValueErrors
@@ -69,13 +83,19 @@ def read_geojson(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
         raise ScenarioError(f"{path}: type = {shown(collection.type)}: a FeatureCollection is needed")
     if collection.crs is not None and not any(name in str(collection.crs) for name in _WGS84_NAMES):
         raise ScenarioError(f"{path}: crs = {shown(collection.crs)}: convert it to WGS-84 first")
-    builder = RoadsBuilder(path)
-    for number, feature in enumerate(collection.features):
-        _add_feature(path, builder, number, feature)
-    return builder.build_from_degrees(origin_deg)
+    return collection
 
 
-def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: _Feature) -> None:
+def check_on_earth(where: str, degrees: Array) -> None:
+    """Raise ScenarioError unless these longitudes and latitudes (n, 2) are on the earth."""
+    beyond = ~(np.abs(degrees) <= [180.0, 90.0])
+    if beyond.any():
+        at, axis = np.argwhere(beyond)[0].tolist()
+        quantity, most = (("longitude", 180), ("latitude", 90))[axis]
+        raise ScenarioError(f"{where}: {quantity} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
+
+
+def _add_feature(path: Path, builder: RoadsBuilder, number: int, feature: Feature) -> None:
     where = f"{path}: feature {number}"
     geometry, properties = feature.geometry, feature.properties or {}
     if geometry is None or geometry.type not in ("LineString", "MultiLineString"):
@@ -129,11 +149,7 @@ def _points(where: str, line: Any) -> list[tuple[object, tuple[float, float]]]:
     if len(found) < 2 or any(len(point) < 2 for point in found):
         raise ScenarioError(f"{where}: its coordinates are not a line of two or more points")
     degrees = np.array([point[:2] for point in found])
-    beyond = ~(np.abs(degrees) <= [180.0, 90.0])
-    if beyond.any():
-        at, axis = np.argwhere(beyond)[0].tolist()
-        quantity, most = (("longitude", 180), ("latitude", 90))[axis]
-        raise ScenarioError(f"{where}: {quantity} = {degrees[at, axis]:g}: not within ±{most}; is it WGS-84?")
+    check_on_earth(where, degrees)
     keys = np.round(degrees * 10**_SAME_DIGITS).astype(np.int64).tolist()
     return [((east, north), (lon, lat)) for (east, north), (lon, lat) in zip(keys, degrees.tolist(), strict=True)]
 

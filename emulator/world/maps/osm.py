@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,26 +24,35 @@ _LONGEST_LINE = 1 << 16
 
 def read_osm(path: Path, origin_deg: tuple[float, float] | None) -> Roads:
     """Read roads; the origin is their centre unless given. Raise ScenarioError, naming the way, for a bad file."""
+    builder = RoadsBuilder(path)
+    with osm_errors(path):
+        import osmium
+
+        file = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
+        for entity in file:
+            if isinstance(entity, osmium.osm.Way):
+                _add_way(path, builder, entity)
+    if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
+        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways: extract maps with their nodes")
+    return builder.build_from_degrees(origin_deg)
+
+
+@contextmanager
+def osm_errors(path: Path) -> Iterator[None]:
+    """Raise ScenarioError in place of pyosmium's errors, also if it is not installed."""
     try:
         import osmium
     except ImportError:
         raise ScenarioError(
             f"{path}: OpenStreetMap files need pyosmium, which is not installed: pip install 'vnet-emulator[maps]'"
         ) from None
-    builder = RoadsBuilder(path)
     try:
-        file = osmium.FileProcessor(path).with_locations().with_filter(osmium.filter.KeyFilter("highway"))
-        for entity in file:
-            if isinstance(entity, osmium.osm.Way):
-                _add_way(path, builder, entity)
+        yield
     except osmium.InvalidLocationError as error:
         value = str(error).partition("'")[2].removesuffix("'")
         raise ScenarioError(f"{path}: {_line_of(path, value)}{printable(str(error), 300)}") from None
     except (RuntimeError, ValueError, OSError) as error:
         raise ScenarioError(f"{path}: not an OpenStreetMap file: {printable(str(error), 300)}") from None
-    if clipped := builder.is_empty and builder.notes.get(CLIPPED, 0):
-        raise ScenarioError(f"{path}: it lacks the nodes of its {clipped} ways: extract maps with their nodes")
-    return builder.build_from_degrees(origin_deg)
 
 
 def _line_of(path: Path, value: str) -> str:

@@ -12,6 +12,7 @@ from emulator.scenario.sumo import read_begin_s
 from emulator.world.maps.around import lanes_around, notes_of
 from emulator.world.maps.city import city_roads
 from emulator.world.maps.files import read_roads
+from emulator.world.projection import Frame
 from emulator.world.trips.clean import Rules
 from emulator.world.trips.fcd import drive_sumo, read_fcd
 from emulator.world.trips.generate import RIGHT, Side, generate_motion
@@ -90,8 +91,8 @@ def whole_motion(path: Path, origin_deg: tuple[float, float] | None, rate_hz: fl
 
 def drive_through_city(
     network: Network, section: Map | None, periods: int, period_ns: int
-) -> tuple[Motion, RoadMap]:
-    """Return generated trips through a generated city, or through the map of `section`, and the map's lanes.
+) -> tuple[Motion, RoadMap, Frame | None]:
+    """Return generated trips through a generated city, or through the map of `section`, and its lanes and frame.
 
     Raise ScenarioError if the map cannot be read, or no vehicle can drive on it.
     """
@@ -105,7 +106,7 @@ def drive_through_city(
     if section is not None:
         motion = replace(motion, notes=notes_of(section.path, roads))
     lanes = roads.lane_map() if section is None else lanes_around(roads, section, motion.position_m)
-    return motion, lanes
+    return motion, lanes, roads.frame
 
 
 def _read(path: Path, window_s: tuple[float, float] | None) -> Samples:

@@ -14,6 +14,7 @@ from emulator.radio.engine import Delivery, Engine
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.scenario.scenario import Radio
+from emulator.world.radio_inputs import RadioInputs
 
 PERIOD_NS = 100_000_000
 seeds = st.integers(0, 2**63 - 1)
@@ -25,7 +26,7 @@ def place(count: int, seed: int, side_m: float = 8000.0) -> np.ndarray:
 
 def engine(position_m: np.ndarray, seed: int = 1, links: np.ndarray | None = None, **radio: float) -> Engine:
     ids = [f"v{number}" for number in range(len(position_m))]
-    return Engine(ids, Radio.model_validate(radio), seed, position_m, links)
+    return Engine(ids, Radio.model_validate(radio), seed, position_m, RadioInputs(links))
 
 
 def rows(of: Engine) -> list[dict[str, Any]]:
