@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from math import log, sqrt
 from typing import Any
 
 import numpy as np
@@ -13,12 +14,15 @@ from emulator.records.recorded_run import ARRIVED, END_OF_TIME_NS, ON_AIR, Recor
 from emulator.records.verdicts import Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import SenderFault
 from emulator.scenario.faults import Custom, CustomSender, StaleMessages
+from emulator.world.link_table import LinkTable
 from emulator.world.neighbours import Links
 from vnet.counted import counted
-from vnet.types import IntArray, Mask
+from vnet.types import Array, IntArray, Mask
 from vnet.units import NS_PER_S
 
 LOSS_BAND = 0.999
+LOSS_SIGMAS = 4.9
+"""Half-width of the band of measured losses, in standard deviations: one sound run in a million is outside."""
 IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
 
 
@@ -177,8 +181,7 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
     judged &= recorded.placed & ~recorded.is_unsure(recorded.sent_ns) & ~recorded.dropped_by_sender
     everybody = np.arange(len(recorded.node_ids))
     edges = {0, END_OF_TIME_NS} | {edge for span in recorded.down for edge in (span.start_ns, span.end_ns)}
-    if recorded.moves:
-        edges |= set(recorded.period_starts_ns().tolist())
+    edges |= set(recorded.places.starts_ns.tolist())
     wrong = np.zeros(len(capped), dtype=bool)
     for start_ns, end_ns in pairwise(sorted(edges)):
         rows = recorded.sent_between(start_ns, end_ns)
@@ -192,7 +195,7 @@ def _wrongly_capped(recorded: RecordedRun, capped: Mask) -> Mask:
 
 def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Links:
     """Return the pairs of a sender and a receiver whose cap admits it when these nodes (N,) are up."""
-    pairs = recorded.places.links(int(recorded.places.index(np.array([time_ns]))[0]))
+    pairs = recorded.places.links(time_ns)
     pairs = pairs.of(up[pairs.sender])
     # For each receiver the nearest first, equally near ones by number.
     order = np.lexsort((pairs.sender, pairs.distance_m, pairs.receiver))
@@ -204,8 +207,10 @@ def admitted_by_cap(recorded: RecordedRun, up: Mask, time_ns: int) -> Links:
 
 
 def check_loss_rate(recorded: RecordedRun) -> Finding:
-    """Check that the share of lost receptions is in the binomial band of `radio.loss`."""
+    """Check that the share of lost receptions is in the binomial band of `radio.loss`, or of the links' losses."""
     name = "loss_rate"
+    if isinstance(recorded.radio_inputs.links, LinkTable):
+        return _check_measured_losses(name, recorded)
     loss = recorded.scenario.radio.loss
     drawing = drew_for_loss(recorded)
     lost, drawn = int((drawing & recorded.outcome_is("lost")).sum()), int(drawing.sum())
@@ -218,6 +223,35 @@ def check_loss_rate(recorded: RecordedRun) -> Finding:
     outside = not low <= lost <= high
     rows = recorded.rows(wrong_way) if outside else []
     return result(name, int(outside), text, f"{text}: outside the {LOSS_BAND:.1%} band", rows, **figures)
+
+
+def _check_measured_losses(name: str, recorded: RecordedRun) -> Finding:
+    """Check the number of lost receptions, and each of those on links that lose everything, or nothing."""
+    rows = np.flatnonzero(drew_for_loss(recorded) & recorded.placed)
+    lost = recorded.outcome_is("lost")[rows]
+    if not len(rows):
+        return nothing_seen(name, recorded, "no reception came as far as the loss")
+    found = recorded.places.pair_losses(recorded.sender[rows], recorded.receiver[rows], recorded.sent_ns[rows])
+    assert found is not None
+    loss = np.nan_to_num(found, nan=1.0)
+    expected, away = float(loss.sum()), _deviation_of_sum(loss)
+    impossible = np.where(lost, loss == 0, loss == 1)
+    outside = not expected - away <= lost.sum() <= expected + away
+    share, law = float(lost.mean()), expected / len(rows)
+    text = f"{int(lost.sum()):,} of {counted(len(rows), 'reception')} lost, {share:.2%}; {law:.2%} expected"
+    problem = (
+        f"{text}: outside its band" if outside else f"{counted(int(impossible.sum()), 'reception')} impossible"
+    )
+    broken = rows[impossible] if impossible.any() else rows[lost == (share > law)]
+    figures = {"lost": int(lost.sum()), "pairs": len(rows), "rate": share, "expected": law}
+    count = int(impossible.sum()) + outside
+    return result(name, count, text, problem, recorded.rows(broken) if count else [], **figures)
+
+
+def _deviation_of_sum(probability: Array) -> float:
+    """Return by how much a sum of independent events (n,) may differ from the sum of their probabilities."""
+    variance = float((probability * (1 - probability)).sum())
+    return LOSS_SIGMAS * sqrt(variance) + (log(1e6) / 3 if variance > 0 else 0)
 
 
 def drew_for_loss(recorded: RecordedRun) -> Mask:

@@ -17,6 +17,7 @@ from rich.table import Table
 
 from emulator.cli.options import LATEST, RunArgument
 from emulator.export.mcap_file import write_mcap
+from emulator.export.measured_links import write_links
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.atomic import atomically, disk_errors
@@ -51,6 +52,7 @@ class Format(StrEnum):
     PCAPNG = "pcapng"
     MCAP = "mcap"
     CSV = "csv"
+    LINKS = "links"
 
 
 class Payloads(StrEnum):
@@ -115,7 +117,8 @@ def export(
     to: Annotated[
         Format | None,
         typer.Option(
-            help="pcapng for Wireshark, mcap for Foxglove and Rerun, csv. Default: as --out ends, else csv."
+            help="pcapng for Wireshark, mcap for Foxglove and Rerun, csv, or links: a table for radio.links. "
+            "Default: as --out ends, else csv."
         ),
     ] = None,
     out: Annotated[
@@ -126,10 +129,18 @@ def export(
         Payloads | None,
         typer.Option(help="Of pcapng: its for CAM and DENM, which then have headers of GeoNetworking and BTP."),
     ] = None,
+    every_s: Annotated[
+        float | None,
+        typer.Option(
+            "--every", min=0, max=86_400, help="Of links: seconds for each loss; 0: each frame. Default: 1."
+        ),
+    ] = None,
 ) -> None:
     """Write a run in a format that other tools read."""
     with one_line_errors():
         chosen = _format(to, out)
+        if every_s is not None and chosen is not Format.LINKS:
+            raise VnetError(f"--every {every_s:g}: of links, and not of {chosen.value}")
         if payloads is not None and chosen is not Format.PCAPNG:
             raise VnetError(f"--payloads {payloads.value}: of pcapng, and not of {chosen.value}")
         recorded = RecordedRun.open(run)
@@ -141,6 +152,10 @@ def export(
             case Format.MCAP:
                 path = out or run / "run.mcap"
                 print(f"{_write(path, recorded, write_mcap):,} messages in {path}")
+            case Format.LINKS:
+                path = out or run / "links.csv"
+                links = partial(write_links, every_s=1.0 if every_s is None else every_s)
+                print(f"{_write(path, recorded, links):,} rows in {path}")
             case Format.CSV:
                 path = out or run / "csv"
                 print(f"{', '.join(_write_folder(path, recorded))} in {path}")
@@ -150,6 +165,8 @@ def _format(to: Format | None, out: Path | None) -> Format:
     """Return the format that was asked for by name or by the end of the file's name; refuse two at once."""
     suffix = "" if out is None else out.suffix.lower().removeprefix(".")
     of_suffix = Format(suffix) if suffix in list(Format) else None
+    if to is Format.LINKS and suffix == "csv":
+        return to
     if to is not None and of_suffix not in (to, None):
         raise VnetError(f"--out {out}: ends like a file of {suffix}, and --to is {to.value}")
     if suffix in ("pcap", "cap"):

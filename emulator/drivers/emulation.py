@@ -130,9 +130,10 @@ class Emulation:
         return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
 
     def _links(self, period: int) -> Links:
-        if period == self._placed:
+        connectivity = self._connectivity
+        if period == self._placed and not len(connectivity.changes_ns):
             return self.engine.links
-        return self._connectivity.links(self.world.position_m(period))
+        return connectivity.at(period * self.world.period_ns).links(self.world.position_m(period))
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Connected component of each vehicle."""

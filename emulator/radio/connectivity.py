@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.radio.obstacles import Obstacles
 from emulator.radio.propagation import DIGITS, MeanPower
 from emulator.scenario.scenario import Radio
+from emulator.world.link_table import LinkTable
 from emulator.world.neighbours import Links, links_within
 from emulator.world.radio_inputs import RadioInputs
-from vnet.types import Array, Mask
+from vnet.types import Array, IntArray, Mask
 
 
 class Connectivity(Protocol):
@@ -19,6 +21,16 @@ class Connectivity(Protocol):
 
     `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them.
     """
+
+    @property
+    def changes_ns(self) -> IntArray:
+        """Times at which the model changes, sorted, each once; none if it depends on positions alone."""
+
+    def at(self, time_ns: int) -> Connectivity:
+        """Return the model as it is at a time."""
+
+    def losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array | None:
+        """Return the loss probabilities (n,) of pairs in range; None if they are `radio.loss`."""
 
     def links(self, position_m: Array) -> Links:
         """Return the pairs of a sender and a receiver in its range."""
@@ -39,6 +51,8 @@ def connectivity_of(radio: Radio, seed: int, inputs: RadioInputs | None = None) 
             obstacles = Obstacles(inputs.buildings, radio.buildings)
         mean = MeanPower(radio.path_loss, radio.shadowing, seed)
         return AboveFloor(mean, radio.path_loss.floor_dbm, obstacles)
+    if isinstance(inputs.links, LinkTable):
+        return Measured(inputs.links)
     return Disc(radio.range_m) if inputs.links is None else Matrix(inputs.links)
 
 
@@ -48,7 +62,24 @@ def distances_m(position_m: Array) -> Array:
     return np.asarray(np.hypot(offset_m[..., 0], offset_m[..., 1]))
 
 
-class _EqualPower:
+class _Timeless:
+    """A model that depends on positions alone, and leaves losses to `radio.loss`."""
+
+    @property
+    def changes_ns(self) -> IntArray:
+        """See `Connectivity`."""
+        return np.zeros(0, np.int64)
+
+    def at(self, time_ns: int) -> Self | Measured:
+        """See `Connectivity`."""
+        return self
+
+    def losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array | None:
+        """See `Connectivity`."""
+        return None
+
+
+class _EqualPower(_Timeless):
     """Connectivity without a path loss: all signals in range are equally strong, so overlapping frames are lost."""
 
     def links(self, position_m: Array) -> Links:
@@ -96,7 +127,41 @@ class Matrix(_EqualPower):
         return _without_itself(self._links.T & np.isfinite(distance_m))
 
 
-class AboveFloor:
+class Measured(_EqualPower):
+    """Links given by a table over time, independent of positions, as they are at `time_ns`."""
+
+    def __init__(self, table: LinkTable, time_ns: int = 0, loss: Array | None = None) -> None:
+        self._table, self._time_ns = table, time_ns
+        self._sender, self._receiver, _ = table.pairs
+        self._loss = table.loss_at(time_ns) if loss is None else loss
+
+    @property
+    def changes_ns(self) -> IntArray:
+        """See `Connectivity`."""
+        return self._table.changes_ns
+
+    def at(self, time_ns: int) -> Measured:
+        """See `Connectivity`."""
+        if time_ns < self._time_ns:
+            return Measured(self._table, time_ns)
+        return Measured(self._table, time_ns, self._table.loss_at(time_ns, self._loss, self._time_ns))
+
+    def losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array:
+        """See `Connectivity`."""
+        return self._table.of_pairs(self._loss, sender, receiver)
+
+    def links(self, position_m: Array) -> Links:
+        """See `Connectivity`."""
+        there = np.isfinite(position_m[:, 0])
+        linked = np.isfinite(self._loss) & there[self._sender] & there[self._receiver]
+        return Links.of_pairs(position_m, self._sender[linked], self._receiver[linked])
+
+    def in_range(self, position_m: Array, distance_m: Array) -> Mask:
+        """See `Connectivity`."""
+        return self.links(position_m).matrix()
+
+
+class AboveFloor(_Timeless):
     """All nodes whose mean received power is at least `floor_dbm`, behind buildings too."""
 
     def __init__(self, mean: MeanPower, floor_dbm: float, obstacles: Obstacles | None = None) -> None:

@@ -168,6 +168,7 @@ class Engine:
         if not self._topology.is_up(node):
             return
         self._mac.run(time_ns)
+        self._topology.advance(time_ns)
         for index, payload in enumerate(payloads):
             self._choices = self._allowed(options[index]) if index in options else self._default_choices
             seq = self._next_seq[node]

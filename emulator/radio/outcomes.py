@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -88,11 +89,13 @@ class Outcome(IntEnum):
     lost = (
         4,
         Facts(
-            meaning="by `radio.loss`",
+            meaning="by `radio.loss`, or the loss of its link in `radio.links`",
             stage=Stage.RECEPTION,
             colour="red",
             sign="▒",
-            is_possible=lambda scenario, vehicles: scenario.radio.loss > 0,
+            is_possible=lambda scenario, vehicles: (
+                scenario.radio.loss > 0 or isinstance(scenario.radio.links, Path)
+            ),
         ),
     )
     queue_full = (

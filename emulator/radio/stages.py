@@ -77,7 +77,7 @@ def change_by_faults(frames: Sequence[Frame], receptions: Receptions) -> None:
 
 
 class Loss:
-    """Independent loss of every reception, with probability `radio.loss`."""
+    """Independent loss of every reception, with probability `radio.loss`, or with that of its link."""
 
     def __init__(self, seed: int, loss: float) -> None:
         self._draws = Draws(seed, "loss")
@@ -85,8 +85,9 @@ class Loss:
 
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Decide `lost`."""
-        if self._loss > 0:
-            receptions.decide(frame_draws(self._draws, frames, receptions) < self._loss, Outcome.lost)
+        loss = self._loss if frames[0].topology.loss is None else rows(frames, "loss")
+        if np.any(loss > 0):
+            receptions.decide(frame_draws(self._draws, frames, receptions) < loss, Outcome.lost)
 
 
 class Latency:

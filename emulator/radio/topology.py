@@ -28,7 +28,8 @@ class TopologySnapshot:
 
     `in_range` marks the links in range, and `admitted` those that the receiver's peer cap admits. `power_mw` is the
     mean received power in mW and `fading` the shape of the fading as `Nakagami.shape` returns it; both are None
-    without a physical radio, and with one the arrays are matrices.
+    without a physical radio, and with one the arrays are matrices. `loss` is the probability with which a frame is
+    lost on a link in range; None if it is `radio.loss`.
     """
 
     position_m: Array
@@ -38,6 +39,7 @@ class TopologySnapshot:
     power_mw: Array | None = None
     fading: NDArray[np.intp] | None = None
     receiver: NDArray[np.intp] | None = None
+    loss: Array | None = None
 
     def receivers(self, sender: int) -> NDArray[np.intp] | slice:
         """Return the index that takes the columns of a sender's row from an array over all nodes (N,)."""
@@ -53,7 +55,9 @@ class Topology:
     def __init__(
         self, position_m: Array, connectivity: Connectivity, max_peers: int, nakagami: Nakagami | None = None
     ) -> None:
-        self._connectivity = connectivity
+        self._connectivity = connectivity.at(0)
+        self._changes_ns = connectivity.changes_ns
+        self._valid_ns = self._span(0)
         self._max_peers = max_peers
         self._nakagami = nakagami
         self._position_m = position_m
@@ -86,6 +90,21 @@ class Topology:
         sender, column = np.nonzero(links.admitted)
         return Links(len(self.up), sender, links.receiver[sender, column], links.distance_m[sender, column])
 
+    def advance(self, time_ns: int) -> None:
+        """Let links be as they are at a time, where they are given over time."""
+        first_ns, end_ns = self._valid_ns
+        if not first_ns <= time_ns < end_ns:
+            self._connectivity = self._connectivity.at(time_ns)
+            self._valid_ns = self._span(time_ns)
+            self.move(self._position_m)
+
+    def _span(self, time_ns: int) -> tuple[float, float]:
+        """Return the times from which and until which links are as they are at a time."""
+        index = int(np.searchsorted(self._changes_ns, time_ns, side="right"))
+        first_ns = self._changes_ns[index - 1].item() if index else -np.inf
+        end_ns = self._changes_ns[index].item() if index < len(self._changes_ns) else np.inf
+        return first_ns, end_ns
+
     def move(self, position_m: Array) -> None:
         """Move the vehicles to `position_m` (N, 2)."""
         self._position_m, self._links = position_m, None
@@ -94,7 +113,20 @@ class Topology:
             self._now = _snapshot_of(self._links, position_m)
         else:
             self._now = self._matrices(position_m)
+        self._now = self._with_losses(self._now)
         self._is_ranked = False
+
+    def _with_losses(self, links: TopologySnapshot) -> TopologySnapshot:
+        """Return a snapshot with the losses of its links, if they have any of their own."""
+        if not len(self._changes_ns):
+            return links
+        sender, column = np.nonzero(links.in_range)
+        receiver = column if links.receiver is None else links.receiver[sender, column]
+        if (losses := self._connectivity.losses(sender, receiver)) is None:
+            return links
+        loss = np.zeros(links.in_range.shape)
+        loss[sender, column] = losses
+        return replace(links, loss=loss)
 
     def _matrices(self, position_m: Array) -> TopologySnapshot:
         """Return the snapshot as matrices of all pairs."""

@@ -16,14 +16,23 @@ from vnet.types import Array, IntArray, Mask
 class Places:
     """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
 
-    `connectivity` says who is in range of whom.
+    `connectivity` says who is in range of whom. That is constant within each of the E *epochs*, which begin with
+    periods where vehicles move, and where links are given over time. The last one ends at `end_ns`.
     """
 
-    def __init__(self, position_m: Array, moves: bool, period_ns: int, connectivity: Connectivity) -> None:
+    def __init__(
+        self, position_m: Array, moves: bool, period_ns: int, connectivity: Connectivity, end_ns: int
+    ) -> None:
         self._position_m = position_m
         self._moves = moves
         self._period_ns = period_ns
         self._connectivity = connectivity
+        periods_ns = np.arange(len(position_m)) * period_ns
+        self._end_ns = len(position_m) * period_ns if moves else end_ns
+        changes_ns = connectivity.changes_ns
+        known = changes_ns < (self._end_ns if len(position_m) else 0)
+        self.starts_ns = np.union1d(periods_ns, changes_ns[known])
+        """Times at which epochs begin."""
 
     def index(self, time_ns: IntArray) -> IntArray:
         """Index of the position, of the K, at each of these instants."""
@@ -45,13 +54,21 @@ class Places:
         """(N, N) between vehicles."""
         return distances_m(self.position_m(index))
 
-    def links(self, index: int) -> Links:
+    def links(self, time_ns: int) -> Links:
         """Links of a sender and a receiver in its range."""
-        return self._connectivity.links(self.position_m(index))
+        return self._connectivity_at(time_ns).links(self._position_at(time_ns))
 
-    def power_mw(self, index: int) -> Array:
+    def _connectivity_at(self, time_ns: int) -> Connectivity:
+        self._connectivity = self._connectivity.at(time_ns)  # the next time is often a later one
+        return self._connectivity
+
+    def _position_at(self, time_ns: int) -> Array:
+        return self.position_m(int(self.index(np.array([time_ns]))[0]))
+
+    def power_mw(self, time_ns: int) -> Array:
         """(N, N), rows are senders: the mean power of signals, 0 out of range."""
-        return self._connectivity.power_mw(self.position_m(index), self.distance_m(index))
+        position_m = self._position_at(time_ns)
+        return self._connectivity_at(time_ns).power_mw(position_m, distances_m(position_m))
 
     def pair_distances_m(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
         """Distances (n,) in m from senders to receivers at these instants; NaN where they are not known."""
@@ -65,51 +82,67 @@ class Places:
     def pairs_in_range(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Mask:
         """Mask (n,) of the senders and receivers in range at these instants; False where that is not known."""
         found = np.zeros(len(time_ns), dtype=bool)
-        for index, rows in self._rows_by_index(time_ns):
-            found[rows] = self.links(index).contain(sender[rows], receiver[rows])
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            found[rows] = self.links(start_ns).contain(sender[rows], receiver[rows])
+        return found
+
+    def pair_losses(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array | None:
+        """Loss probabilities (n,) of pairs in range at these instants; None if they are `radio.loss`."""
+        if not len(self._connectivity.changes_ns):
+            return None
+        found = np.full(len(time_ns), np.nan)
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            losses = self._connectivity_at(start_ns).losses(sender[rows], receiver[rows])
+            assert losses is not None
+            found[rows] = losses
         return found
 
     def pair_powers_mw(self, sender: NDArray[np.intp], receiver: NDArray[np.intp], time_ns: IntArray) -> Array:
         """With which mean power signals arrive at these instants; 0 out of range, or where that is not known."""
         found = np.zeros(len(time_ns))
-        for index, rows in self._rows_by_index(time_ns):
-            found[rows] = self.power_mw(index)[sender[rows], receiver[rows]]
+        for start_ns, rows in self._rows_by_epoch(time_ns):
+            found[rows] = self.power_mw(start_ns)[sender[rows], receiver[rows]]
         return found
 
-    def _rows_by_index(self, time_ns: IntArray) -> Iterator[tuple[int, NDArray[np.intp]]]:
-        """Yield each index of a position, of the K, and the instants (of n) to which it belongs, if it is known."""
+    def _epoch(self, time_ns: IntArray) -> NDArray[np.intp]:
+        """Number of the epoch at each of these instants; the last one goes on."""
+        return np.maximum(np.searchsorted(self.starts_ns, time_ns, side="right") - 1, 0)
+
+    def _rows_by_epoch(self, time_ns: IntArray) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Yield the start of each epoch and the instants (of n) that are in it, if their positions are known."""
         rows = np.flatnonzero(self.known(time_ns))
-        index = self.index(time_ns)[rows]
-        order = np.argsort(index, kind="stable")
-        rows, index = rows[order], index[order]
-        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(index)) + 1):
+        epoch = self._epoch(time_ns[rows])
+        order = np.argsort(epoch, kind="stable")
+        rows, epoch = rows[order], epoch[order]
+        for some in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(epoch)) + 1):
             if len(some):
-                yield int(index[some[0]]), rows[some]
+                yield int(self.starts_ns[epoch[some[0]]]), rows[some]
 
     @cached_property
     def _degrees(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """(K, N) each: how many are in range of a sender, and how many a receiver has in range."""
-        all_pairs = (self.links(index) for index in range(len(self._position_m)))
+        """(E, N) each: how many are in range of a sender, and how many a receiver has in range."""
+        all_pairs = (self.links(start_ns) for start_ns in self.starts_ns.tolist())
         both = [(pairs.out_degrees(), pairs.in_degrees()) for pairs in all_pairs]
         out, into = zip(*both, strict=True) if both else ((), ())
-        shape = self._position_m.shape[:2]
+        shape = len(self.starts_ns), self._position_m.shape[1]
         return np.array(out, np.intp).reshape(shape), np.array(into, np.intp).reshape(shape)
 
     def receivers_in_range(self, sender: NDArray[np.intp], time_ns: IntArray) -> NDArray[np.intp]:
         """Number of vehicles in range of each of these senders at these instants; -1 where that is not known."""
         count = np.full(len(sender), -1, dtype=np.intp)
         there = self.known(time_ns)
-        count[there] = self._degrees[0][self.index(time_ns)[there], sender[there]]
+        count[there] = self._degrees[0][self._epoch(time_ns[there]), sender[there]]
         return count
 
     def senders_in_range(self, index: int) -> NDArray[np.intp]:
-        """(N,), how many each receiver has in range."""
-        return np.asarray(self._degrees[1][min(index, len(self._position_m) - 1)])
+        """(N,), how many each receiver has in range at the start of a period."""
+        return np.asarray(self._degrees[1][self._epoch(np.array([index * self._period_ns]))[0]])
 
     def mean_senders_in_range(self) -> Array:
         """(N,), how many each receiver has in range, in the mean over the time in which it is there."""
-        there = self.present().sum(axis=0)
-        return np.asarray(self._degrees[1].sum(axis=0) / np.maximum(there, 1))
+        epoch_ns = np.diff(self.starts_ns, append=self._end_ns)
+        present = self.present()[self.index(self.starts_ns)]
+        return np.asarray(epoch_ns @ self._degrees[1] / np.maximum(epoch_ns @ present, 1))
 
     @property
     def most_in_range(self) -> int:
@@ -125,5 +158,5 @@ class Places:
     def was_lonely(self, sender: int, time_ns: IntArray) -> Mask:
         """(n - 1,), whether a sender had nobody in range at some time between one of n instants and the next."""
         lonely = np.concatenate([[0], np.cumsum(self._degrees[0][:, sender] == 0)])
-        index = np.minimum(self.index(time_ns), len(self._position_m) - 1)
+        index = self._epoch(time_ns)
         return np.asarray(lonely[index[1:] + 1] > lonely[index[:-1]])

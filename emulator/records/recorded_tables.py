@@ -24,6 +24,7 @@ from emulator.records.run_folder import Event
 from emulator.records.run_tables import VALUES_AS_LIST
 from emulator.records.verdicts import MOST_ROWS
 from emulator.scenario.scenario import Scenario
+from emulator.world.link_table import LinkTable
 from emulator.world.links import load_links
 from emulator.world.radio_inputs import RadioInputs
 from vnet.errors import VnetError
@@ -79,20 +80,22 @@ class RecordedTables:
     @cached_property
     def places(self) -> Places:
         """Positions of the vehicles. Raises ScenarioError if the scenario's links do not fit them."""
-        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self._radio_inputs())
+        connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self.radio_inputs)
         position_m = self.vectors("position_m") if self.known_m is None else self.known_m
         some = position_m if self.moves else position_m[:1]
-        return Places(some, self.moves, self.scenario.period_ns, connectivity)
+        return Places(some, self.moves, self.scenario.period_ns, connectivity, self.scenario.duration_ns)
 
-    def _radio_inputs(self) -> RadioInputs:
-        """Return what the radio had from files, as it was recorded; no input file is read."""
+    @cached_property
+    def radio_inputs(self) -> RadioInputs:
+        """Inputs of the radio from files, as they were recorded; no input file is read."""
         radio, count = self.scenario.radio, len(self.node_ids)
         recorded = RadioInputs() if self.world is None else self.world.radio_inputs
         if radio.buildings is not None and recorded.buildings is None:
             raise VnetError("[radio.buildings]: no buildings were recorded")
         if not isinstance(radio.links, Path):
-            return replace(recorded, links=load_links(radio, count))
-        if recorded.links is None or len(recorded.links) != count:
+            return replace(recorded, links=load_links(radio, self.node_ids))
+        links = recorded.links
+        if links is None or (not isinstance(links, LinkTable) and len(links) != count):
             raise VnetError(f"radio.links = {str(radio.links)!r}: no links of {count} vehicles were recorded")
         return recorded
 

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from emulator.world.arrays import read_arrays
 from emulator.world.buildings import LEAST_CORNERS, Buildings
+from emulator.world.link_table import LinkTable
 from emulator.world.radio_inputs import RadioInputs
 from emulator.world.world import World
 from vnet.errors import ScenarioError, VnetError
-from vnet.types import Array, Mask
+from vnet.types import Array, IntArray, Mask
 
 LARGEST_BYTES = 1 << 30
 """Largest size of one array of the file; the links of ten thousand vehicles take 100 MB."""
@@ -27,15 +28,20 @@ ARRAYS: dict[str, tuple[str, str]] = {
     "lane_heading_rad": ("f", "l"),
     "lane_length_m": ("f", "l"),
     "links": ("b", "n × n"),
+    "link_time_ns": ("i", "q"),
+    "link_sender": ("i", "q"),
+    "link_receiver": ("i", "q"),
+    "link_loss": ("f", "q"),
     "building_corner_m": ("f", "v × 2"),
     "building_first": ("i", "f"),
     "building_number": ("i", "g"),
     "receiver_m": ("f", "k × r × 2"),
 }
-"""The arrays of the file: kind of number, and shape for n vehicles, l lanes, g rings of buildings with v corners in
-all, f = g + 1, k periods and r receivers."""
+"""The arrays of the file: kind of number, and shape for n vehicles, l lanes, q rows about links, g rings of
+buildings with v corners in all, f = g + 1, k periods and r receivers."""
 BUILDINGS = ("building_corner_m", "building_first", "building_number")
-OPTIONAL = ("links", *BUILDINGS, "receiver_m")
+LINKS = ("link_time_ns", "link_sender", "link_receiver", "link_loss")
+OPTIONAL = ("links", *LINKS, *BUILDINGS, "receiver_m")
 """Arrays that may be missing."""
 
 
@@ -45,9 +51,9 @@ class RecordedWorld:
 
     `position_m` (n, 2) are positions at time 0, NaN of a vehicle that is not there yet; `area_m` (2, 2) the corners
     of the box in which vehicles are during the run; lanes (l) have a point, a heading and a length from there,
-    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `building_…`
-    are the arrays of `Buildings`, or None; `receiver_m` (k, r, 2) is what each receiver of a recorded common error
-    has beyond the common one in each period, or None.
+    infinite for a line that goes both ways. `links` (n, n) is who (row) hears whom (column), or None; `link_…` are
+    the arrays of `LinkTable`, and `building_…` those of `Buildings`, or None; `receiver_m` (k, r, 2) is what each
+    receiver of a recorded common error has beyond the common one in each period, or None.
     """
 
     node_ids: tuple[str, ...]
@@ -57,6 +63,10 @@ class RecordedWorld:
     lane_heading_rad: Array
     lane_length_m: Array
     links: Mask | None = None
+    link_time_ns: IntArray | None = None
+    link_sender: NDArray[np.intp] | None = None
+    link_receiver: NDArray[np.intp] | None = None
+    link_loss: Array | None = None
     building_corner_m: Array | None = None
     building_first: NDArray[np.intp] | None = None
     building_number: NDArray[np.intp] | None = None
@@ -66,6 +76,8 @@ class RecordedWorld:
     def of(cls, world: World) -> RecordedWorld:
         """Take from a world what is to be recorded."""
         lanes, buildings = world.lane_map, world.radio_inputs.buildings
+        links = world.radio_inputs.links
+        table = links if isinstance(links, LinkTable) else None
         return cls(
             node_ids=world.node_ids,
             position_m=world.position_m(0),
@@ -73,12 +85,25 @@ class RecordedWorld:
             lane_point_m=lanes.point_m,
             lane_heading_rad=lanes.heading_rad,
             lane_length_m=lanes.length_m,
-            links=world.radio_inputs.links,
+            links=None if isinstance(links, LinkTable) else links,
+            link_time_ns=None if table is None else table.time_ns,
+            link_sender=None if table is None else table.sender,
+            link_receiver=None if table is None else table.receiver,
+            link_loss=None if table is None else table.loss,
             building_corner_m=None if buildings is None else buildings.corner_m,
             building_first=None if buildings is None else buildings.first,
             building_number=None if buildings is None else buildings.building,
             receiver_m=world.receiver_m,
         )
+
+    @cached_property
+    def link_table(self) -> LinkTable | None:
+        """Links over time, where the radio has measured ones."""
+        if self.link_time_ns is None or self.link_sender is None:
+            return None
+        if self.link_receiver is None or self.link_loss is None:
+            return None
+        return LinkTable(self.link_time_ns, self.link_sender, self.link_receiver, self.link_loss)
 
     @cached_property
     def buildings(self) -> Buildings | None:
@@ -90,7 +115,7 @@ class RecordedWorld:
     @property
     def radio_inputs(self) -> RadioInputs:
         """Inputs of the radio from files."""
-        return RadioInputs(self.links, self.buildings)
+        return RadioInputs(self.links if self.link_table is None else self.link_table, self.buildings)
 
     def write(self, path: Path) -> None:
         """Write the file. Raises OSError."""
@@ -117,6 +142,7 @@ def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
     sizes = {"2": 2, "n": len(arrays.get("node_ids", ())), "l": len(arrays.get("lane_heading_rad", ()))}
     rings = arrays.get("building_number", np.zeros(0))
     sizes |= {"v": len(arrays.get("building_corner_m", ())), "g": len(rings), "f": len(rings) + 1}
+    sizes["q"] = len(arrays.get("link_time_ns", ()))
     sizes |= dict(zip("kr", np.shape(arrays.get("receiver_m", np.zeros((0, 0, 2)))), strict=False))
     for name, (kind, dimensions) in ARRAYS.items():
         if name not in arrays:
@@ -126,10 +152,22 @@ def _check(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
         shape = tuple(sizes[dimension] for dimension in dimensions.split(" × "))
         if arrays[name].dtype.kind != kind or arrays[name].shape != shape:
             raise VnetError(f"{path}: {name} is {arrays[name].dtype} {arrays[name].shape}, not {kind} {shape}")
-    if len(present := [name for name in BUILDINGS if name in arrays]) not in (0, len(BUILDINGS)):
-        raise VnetError(f"{path}: of the arrays of buildings only {', '.join(present)}")
-    if present:
+    if _has(path, "links over time", LINKS, arrays):
+        ends = np.stack([arrays["link_sender"], arrays["link_receiver"]])
+        time_ns, loss = arrays["link_time_ns"], arrays["link_loss"]
+        sound = (np.diff(time_ns, prepend=0) >= 0).all() and ((ends >= 0) & (ends < sizes["n"])).all()
+        if not sound or not (np.isnan(loss) | ((loss >= 0) & (loss <= 1))).all():
+            raise VnetError(f"{path}: link_time_ns, link_sender, link_receiver, link_loss: not links over time")
+    if _has(path, "buildings", BUILDINGS, arrays):
         first, number = arrays["building_first"], arrays["building_number"]
         sound = first[0] == 0 and first[-1] == sizes["v"] and (np.diff(first) >= LEAST_CORNERS).all()
         if not sound or not (np.diff(number, prepend=0) >= 0).all() or number.max(initial=0) >= max(len(number), 1):
             raise VnetError(f"{path}: building_first, building_number: not the rings of buildings")
+
+
+def _has(path: Path, what: str, names: tuple[str, ...], arrays: dict[str, NDArray[Any]]) -> bool:
+    """Return whether these arrays are there. Raise VnetError if only some of them are."""
+    present = [name for name in names if name in arrays]
+    if len(present) not in (0, len(names)):
+        raise VnetError(f"{path}: of the arrays of {what} only {', '.join(present)}")
+    return bool(present)

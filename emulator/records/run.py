@@ -191,8 +191,7 @@ class Run:
         """
         self._period(time_s)
         places = self._recorded.places
-        time_ns = np.array([round(time_s * NS_PER_S)])
-        return places.links(int(places.index(time_ns)[0])).matrix()
+        return places.links(round(time_s * NS_PER_S)).matrix()
 
     def up(self, time_s: float) -> Mask:
         """Return the vehicles (N,) that are up at `time_s`: in the network, not ended, and not ended by a fault."""

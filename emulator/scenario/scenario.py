@@ -103,7 +103,9 @@ class Radio(Section):
     links: Path | tuple[tuple[int, ...], ...] | None = None
     """Links in place of the range: a square matrix of 0 and 1, or a CSV file of one without a header (relative to
     the scenario file). Row i, column j is 1 where vehicle i hears vehicle j, in the order of the network's
-    vehicles; the diagonal is ignored."""
+    vehicles; the diagonal is ignored. Or a CSV file of links over time with the columns time_s, sender, receiver,
+    loss, sorted by time: the loss probability of a link until its next row; without a loss, and before its first
+    row, the receiver is out of range."""
     max_peers: int = Field(30, ge=1, le=MANY)
     """Peer cap: each receiver hears at most so many senders, the nearest that are up."""
     loss: float = Field(0.0, ge=0, le=1)

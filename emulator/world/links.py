@@ -1,8 +1,9 @@
-"""Connectivity given as a matrix instead of a range, read from CSV or from the scenario itself."""
+"""Connectivity given as a matrix or a table instead of a range, read from CSV or from the scenario itself."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,20 +11,29 @@ from numpy.typing import NDArray
 
 from emulator.scenario.scenario import Radio
 from emulator.world.csv_file import MAX_ROWS, check_row_count, open_csv
+from emulator.world.link_table import COLUMNS, LinkTable, read_link_table
 from vnet.errors import ScenarioError, shown
 
 _LONGEST_LINE = 10 * MAX_ROWS
 """Characters of a line: an entry may be written as `1.000000,`."""
 
 
-def load_links(radio: Radio, vehicles: int) -> NDArray[np.bool_] | None:
-    """Return `radio.links` (N, N): entry (i, j) is true if vehicle i receives vehicle j; None without a matrix.
+def load_links(radio: Radio, node_ids: Sequence[str]) -> NDArray[np.bool_] | LinkTable | None:
+    """Return `radio.links`: a table over time, or a matrix (N, N); None if there are none.
 
-    The diagonal is ignored: no vehicle receives itself. Raise ScenarioError unless it is a square matrix of 0 and 1
-    with `vehicles` rows.
+    Entry (i, j) of a matrix is true if vehicle i receives vehicle j. The diagonal is ignored: no vehicle receives
+    itself. Raise ScenarioError unless it is a table of these vehicles, or a square matrix of 0 and 1 with a row for
+    each.
     """
+    vehicles = len(node_ids)
     if radio.links is None:
         return None
+    if isinstance(radio.links, Path) and _is_table(radio.links):
+        if radio.loss:
+            raise ScenarioError(
+                f"radio.loss = {radio.loss:g}: must be 0, because {radio.links} has the losses of links"
+            )
+        return read_link_table(radio.links, node_ids)
     if isinstance(radio.links, Path):
         where, links = str(radio.links), _read(radio.links)
     else:
@@ -35,6 +45,12 @@ def load_links(radio: Radio, vehicles: int) -> NDArray[np.bool_] | None:
         )
     np.fill_diagonal(links, False)
     return links
+
+
+def _is_table(path: Path) -> bool:
+    """Return whether a file begins with the names of columns."""
+    with open_csv(path, _LONGEST_LINE) as lines:
+        return COLUMNS[0] in next(iter(lines), "")
 
 
 def _read(path: Path) -> NDArray[np.bool_]:

@@ -34,8 +34,12 @@ class Links:
     @classmethod
     def of_matrix(cls, linked: Mask, position_m: Array) -> Links:
         """Return the pairs that a mask (N, N) marks, whose rows are senders."""
-        sender, receiver = np.nonzero(linked)
-        return cls(len(linked), sender, receiver, _distances_m(position_m, sender, receiver))
+        return cls.of_pairs(position_m, *np.nonzero(linked))
+
+    @classmethod
+    def of_pairs(cls, position_m: Array, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Links:
+        """Return these pairs (n,), which are sorted, of vehicles at positions (N, 2)."""
+        return cls(len(position_m), sender, receiver, _distances_m(position_m, sender, receiver))
 
     def of(self, chosen: Mask) -> Links:
         """Return the pairs that a mask (n,) marks."""

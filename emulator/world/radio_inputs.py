@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from emulator.scenario.scenario import Scenario
 from emulator.world.buildings import Buildings
+from emulator.world.link_table import LinkTable
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError
 from vnet.types import Array, Mask
@@ -15,11 +16,11 @@ from vnet.types import Array, Mask
 class RadioInputs:
     """Inputs of the radio; None where a scenario has none.
 
-    `links` (N, N) is `radio.links`: entry (i, j) is true if i receives j. `buildings` are those of
-    `[radio.buildings]`, as far as they are near vehicles.
+    `links` is `radio.links`: a table, or a matrix (N, N) whose entry (i, j) is true if i receives j. `buildings`
+    are those of `[radio.buildings]`, as far as they are near vehicles.
     """
 
-    links: Mask | None = None
+    links: Mask | LinkTable | None = None
     buildings: Buildings | None = None
 
 

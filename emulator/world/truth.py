@@ -74,7 +74,7 @@ class World:
         self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
         buildings = load_buildings(scenario, frame, self.area_m)
-        self.radio_inputs = RadioInputs(load_links(scenario.radio, count), buildings)
+        self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings)
         if buildings is not None and not len(buildings):
             self.notes = (*self.notes, "radio.buildings: none is near a vehicle; check its origin_deg")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])

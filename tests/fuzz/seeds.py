@@ -252,6 +252,17 @@ NET = b"""<net version="1.20"><location netOffset="0,0" projParameter="+proj=utm
 OSM = b"""<osm version="0.6"><node id="1" lat="42.28" lon="-83.74"/><node id="2" lat="42.281" lon="-83.74"/>
 <way id="7"><nd ref="1"/><nd ref="2"/><tag k="highway" v="primary"/><tag k="lanes" v="3"/></way></osm>
 """
+OSM_BUILDING = b"""<osm version="0.6"><node id="1" lat="42.28" lon="-83.74"/>
+<node id="2" lat="42.281" lon="-83.74"/><node id="3" lat="42.281" lon="-83.741"/>
+<way id="7"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="1"/>
+<tag k="building" v="yes"/></way></osm>
+"""
+BUILDINGS = b"building,x_m,y_m\na,0,0\na,9,0\na,9,9\nb,20,0\nb,29,0\nb,29,9\nb,20,0\n"
+LINK_TABLE = b"time_s,sender,receiver,loss\n0,a,b,0.5\n0,b,a,0\n1.5,a,b,\n"
+POLYGON = (
+    b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"building": "yes"}, '
+    b'"geometry": {"type": "Polygon", "coordinates": [[[-83.74, 42.28], [-83.73, 42.28], [-83.73, 42.29]]]}}]}'
+)
 GEOJSON = (
     b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"class": "primary"}, '
     b'"geometry": {"type": "LineString", "coordinates": [[-83.74, 42.28], [-83.73, 42.28]]}}]}'

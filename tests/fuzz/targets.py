@@ -28,13 +28,18 @@ from emulator.scenario.network import Network
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Radio, Scenario, dump_scenario, load_scenario
 from emulator.scenario.sumo import input_files, read_begin_s
+from emulator.world.buildings import LEAST_CORNERS
+from emulator.world.link_table import LinkTable
 from emulator.world.links import load_links
 from emulator.world.maps.files import read_roads
+from emulator.world.maps.outlines import read_buildings
 from emulator.world.networks import load_network
+from emulator.world.projection import Frame
 from emulator.world.trips.drive import drive
 from emulator.world.world import build_world
 from tests.fuzz.seeds import (
     ACCESS,
+    BUILDINGS,
     CSV_WORDS,
     FAULT_SEEDS,
     FAULT_WORDS,
@@ -44,11 +49,14 @@ from tests.fuzz.seeds import (
     GEOJSON,
     HOST_TX,
     JSON_WORDS,
+    LINK_TABLE,
     MSGPACK_WORDS,
     NET,
     NETWORK,
     OSM,
+    OSM_BUILDING,
     OVERRIDE,
+    POLYGON,
     QUERIES,
     RX,
     SCENARIO,
@@ -184,8 +192,18 @@ def _read_network(data: bytes) -> None:
 
 
 def _read_links(data: bytes) -> None:
-    links = load_links(Radio(links=_file("links.csv", data)), 2)
-    assert links is not None and links.shape == (2, 2) and not links.diagonal().any()
+    links = load_links(Radio(links=_file("links.csv", data)), ["a", "b"])
+    if isinstance(links, LinkTable):
+        assert (np.diff(links.time_ns, prepend=0) >= 0).all() and (links.sender != links.receiver).all()
+        assert len(links.loss_at(2**62)) == len(links.pairs[0])
+    else:
+        assert links is not None and links.shape == (2, 2) and not links.diagonal().any()
+
+
+def _read_buildings(name: str, data: bytes) -> None:
+    buildings = read_buildings(_file(name, data), lambda: Frame.around(42.0, -83.0))
+    assert len(buildings) and np.isfinite(buildings.corner_m).all()
+    assert (np.diff(buildings.first) >= LEAST_CORNERS).all() and len(buildings.edges_m()) == buildings.first[-1]
 
 
 def _read_trips(name: str, data: bytes) -> None:
@@ -273,7 +291,10 @@ TARGETS = (  # the slowest first
     Target("network CSV", _read_network, ScenarioError, (NETWORK,), CSV_WORDS),
     Target("fault", _read_fault, ScenarioError, FAULT_SEEDS, FAULT_WORDS),
     Target("control query", _read_query, VnetError, QUERIES, FAULT_WORDS),
-    Target("links CSV", _read_links, ScenarioError, (b"0,1\n1,0\n", b"0,1.0\n\n0,0\n"), CSV_WORDS),
+    Target("links CSV", _read_links, ScenarioError, (b"0,1\n1,0\n", b"0,1.0\n\n0,0\n", LINK_TABLE), CSV_WORDS),
+    Target("buildings CSV", partial(_read_buildings, "b.csv"), ScenarioError, (BUILDINGS,), CSV_WORDS),
+    Target("buildings OSM", partial(_read_buildings, "b.osm"), ScenarioError, (OSM_BUILDING,), XML_WORDS),
+    Target("buildings GeoJSON", partial(_read_buildings, "b.geojson"), ScenarioError, (POLYGON,), JSON_WORDS),
     Target("access.json", _read_access, TransportError, (ACCESS,), JSON_WORDS),
     Target(
         "credentials", _read_credentials, TransportError, (b'{"user": "node-v01", "password": "p"}',), JSON_WORDS

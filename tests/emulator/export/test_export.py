@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
@@ -15,10 +16,12 @@ from typer.testing import CliRunner
 
 from emulator.cli.commands import app
 from emulator.export.mcap_file import SCHEMAS, write_mcap
+from emulator.export.measured_links import measured_links
 from emulator.export.pcapng import write_pcapng
 from emulator.export.tables import write_csv
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
+from emulator.world.link_table import read_link_table
 from tests.emulator.checks.test_judge import run_scenario
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
@@ -284,6 +287,7 @@ def test_without_to_the_file_s_name_says_the_format(
     ("options", "message"),
     [
         (["--to", "mcap", "--out", "x.pcapng"], "--out x.pcapng: ends like a file of pcapng, and --to is mcap"),
+        (["--every", "2"], "--every 2: of links, and not of csv"),
         (["--out", "x.pcap"], "--out x.pcap: of captures pcapng is written; let it end with .pcapng"),
     ],
 )
@@ -292,7 +296,7 @@ def test_a_name_of_another_format_is_refused(folder: Path, options: list[str], m
     assert (done.exit_code, done.stderr) == (2, f"vnet: {message}\n")
 
 
-@pytest.mark.parametrize("to", ["pcapng", "mcap", "csv"])
+@pytest.mark.parametrize("to", ["pcapng", "mcap", "csv", "links"])
 def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     folder: Path, tmp_path: Path, to: str
 ) -> None:
@@ -304,6 +308,24 @@ def test_an_export_goes_where_it_is_told_and_never_over_something_else(
     nowhere = RUNNER.invoke(app, ["export", str(folder), "--to", to, "--out", str(out / "no" / "no")])
     assert nowhere.exit_code == 2 or to == "csv"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"], "nothing half-written is left"
+
+
+@pytest.mark.parametrize(("every", "every_s"), [([], 1.0), (["--every", "0.5"], 0.5), (["--every", "0"], 0.0)])
+def test_the_links_of_a_run_are_what_the_file_says(
+    folder: Path, recorded: OpenedRun, tmp_path: Path, every: list[str], every_s: float
+) -> None:
+    out = tmp_path / "links.csv"
+    done = RUNNER.invoke(app, ["export", str(folder), "--to", "links", "--out", str(out), *every])
+    assert done.exit_code == 0, done.stderr
+    written, expected = read_link_table(out, recorded.node_ids), measured_links(recorded, round(every_s * 1e9))
+    assert f"{len(expected.time_ns)} rows in" in done.stdout
+    for name in ("time_ns", "sender", "receiver"):
+        assert np.array_equal(getattr(written, name), getattr(expected, name))
+    assert np.allclose(written.loss, expected.loss, rtol=1e-8, equal_nan=True)
+    blocked = [row for row in recorded.trace.to_pylist() if row["cause"].startswith("block") and not row["copy"]]
+    at_ns, index = blocked[0]["sent_ns"], recorded.number[blocked[0]["receiver"]]
+    before = (expected.time_ns <= at_ns) & (expected.sender == recorded.number["v1"]) & (expected.receiver == index)
+    assert expected.loss[before][-1] > 0
 
 
 def test_what_is_no_run_is_refused_in_one_line(tmp_path: Path) -> None:

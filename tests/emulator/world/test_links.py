@@ -8,19 +8,23 @@ import pytest
 from emulator.records.recorded_world import RecordedWorld
 from emulator.scenario.scenario import Radio, Scenario
 from emulator.stream.messages import scene_message
+from emulator.world.link_table import LinkTable
 from emulator.world.links import load_links
 from emulator.world.world import build_world
 from vnet.errors import ScenarioError
 
+NAMES = ["v1", "v2", "v3"]
 CHAIN = [[False, False, False], [True, False, False], [False, True, False]]
 
 
 def links_of(path: Path, vehicles: int = 3) -> np.ndarray | None:
-    return load_links(Radio(links=path), vehicles)
+    links = load_links(Radio(links=path), NAMES[:vehicles])
+    assert not isinstance(links, LinkTable)
+    return links
 
 
 def test_without_links_there_is_no_matrix() -> None:
-    assert load_links(Radio(), 3) is None
+    assert load_links(Radio(), NAMES) is None
 
 
 @pytest.mark.parametrize(
@@ -38,8 +42,8 @@ def test_a_file_is_the_matrix_it_holds(tmp_path: Path, text: str) -> None:
 
 
 def test_a_matrix_in_the_scenario_is_that_matrix() -> None:
-    links = load_links(Radio.model_validate({"links": [[1, 0, 0], [1, 0, 0], [0, 1, 0]]}), 3)
-    assert links is not None
+    links = load_links(Radio.model_validate({"links": [[1, 0, 0], [1, 0, 0], [0, 1, 0]]}), NAMES)
+    assert isinstance(links, np.ndarray)
     assert links.tolist() == CHAIN
 
 

@@ -1,0 +1,129 @@
+"""Measured links over time: a table of loss probabilities, each of which holds until the next of its pair."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.scenario.limits import DAY_S
+from emulator.world.csv_file import check_columns, number_within, open_csv
+from vnet.errors import ScenarioError, first_names, shown
+from vnet.types import Array, IntArray
+from vnet.units import NS_PER_S
+
+COLUMNS = ("time_s", "sender", "receiver", "loss")
+"""Columns of the file. A row without a loss takes the receiver out of range."""
+MOST_ROWS = 5_000_000
+"""Rows of a file; they are checked one by one."""
+_LONGEST_LINE = 1000
+"""Characters of a line."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkTable:
+    """R rows about the links of vehicles, in the order of their times.
+
+    From `time_ns` (R,) on, frames of `sender` (R,) are lost at `receiver` (R,) with probability `loss` (R,); NaN if
+    it is out of range. So it is before its first row.
+    """
+
+    time_ns: IntArray
+    sender: NDArray[np.intp]
+    receiver: NDArray[np.intp]
+    loss: Array
+
+    @cached_property
+    def changes_ns(self) -> IntArray:
+        """Times at which links change, each once."""
+        return np.unique(self.time_ns)
+
+    @cached_property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Sender and receiver (P,) of each pair that has a row, sorted, and the pair (R,) of each row."""
+        key, pair = np.unique(self._key(self.sender, self.receiver), return_inverse=True)
+        return key // self._size, key % self._size, pair.astype(np.intp)
+
+    @cached_property
+    def _size(self) -> int:
+        return int(max(self.receiver.max(initial=0), self.sender.max(initial=0))) + 1
+
+    def _key(self, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> NDArray[np.intp]:
+        return sender * self._size + receiver
+
+    def of_pairs(self, values: Array, sender: NDArray[np.intp], receiver: NDArray[np.intp]) -> Array:
+        """Return the entries (n,), of values (P,) of all pairs, of some; NaN for those that have no row."""
+        known, asked = self._key(*self.pairs[:2]), self._key(sender, receiver)
+        index = np.minimum(np.searchsorted(known, asked), len(known) - 1)
+        return np.where((known[index] == asked) & (receiver < self._size), values[index], np.nan)
+
+    def loss_at(self, time_ns: int, before: Array | None = None, before_ns: int = -1) -> Array:
+        """Return the losses (P,) of the pairs at a time, NaN out of range.
+
+        `before` are those at an earlier time `before_ns`, from which it takes less time.
+        """
+        sender, _, pair = self.pairs
+        loss = np.full(len(sender), np.nan) if before is None else before.copy()
+        first, end = np.searchsorted(self.time_ns, [before_ns, time_ns], side="right")
+        some = slice(0 if before is None else first, end)
+        if len(last := pair[some][::-1]):
+            _, index = np.unique(last, return_index=True)
+            loss[last[index]] = self.loss[some][::-1][index]
+        return loss
+
+
+def read_link_table(path: Path, node_ids: Sequence[str]) -> LinkTable:
+    """Read a file with the columns `COLUMNS`, sorted by time. Raise ScenarioError, naming the line."""
+    number = {node: index for index, node in enumerate(node_ids)}
+    rows: list[tuple[int, int, int, float]] = []
+    seen: set[tuple[int, int]] = set()
+    with open_csv(path, _LONGEST_LINE) as lines:
+        reader = csv.DictReader(lines)
+        check_columns(path, reader, COLUMNS)
+        for row in reader:
+            new = _read_row(path, reader.line_num, row, number)
+            where = f"{path}: line {reader.line_num}"
+            if rows and new[0] < rows[-1][0]:
+                raise ScenarioError(f"{where}: time_s = {row['time_s']}: earlier than the row before; sort by time")
+            if rows and new[0] > rows[-1][0]:
+                seen.clear()
+            if new[1:3] in seen:
+                raise ScenarioError(
+                    f"{where}: {row['sender']} to {row['receiver']} twice at one time; leave one out"
+                )
+            seen.add(new[1:3])
+            rows.append(new)
+            if len(rows) > MOST_ROWS:
+                raise ScenarioError(f"{path}: more than {MOST_ROWS} rows")
+    if not rows:
+        raise ScenarioError(f"{path}: no rows; a row for each link is needed")
+    time_ns, sender, receiver, loss = map(np.array, zip(*rows, strict=True))
+    return LinkTable(time_ns.astype(np.int64), sender.astype(np.intp), receiver.astype(np.intp), loss.astype(float))
+
+
+def _read_row(
+    path: Path, line: int, row: dict[str, str | None], number: dict[str, int]
+) -> tuple[int, int, int, float]:
+    time_s = number_within(path, line, row, "time_s", DAY_S)
+    if time_s < 0:
+        raise ScenarioError(f"{path}: line {line}: time_s = {time_s:g}: 0 or more is needed")
+    ends = [(row[name] or "").strip() for name in COLUMNS[1:3]]
+    for name, node in zip(COLUMNS[1:3], ends, strict=True):
+        if node not in number:
+            some = first_names(list(number))
+            raise ScenarioError(
+                f"{path}: line {line}: {name} = {shown(node)}: no such vehicle; the network has {some}"
+            )
+    if ends[0] == ends[1]:
+        raise ScenarioError(f"{path}: line {line}: {shown(ends[0])} to itself: two vehicles are needed")
+    loss = np.nan
+    if (row["loss"] or "").strip():
+        loss = number_within(path, line, row, "loss", 1.0)
+        if loss < 0:
+            raise ScenarioError(f"{path}: line {line}: loss = {loss:g}: 0 to 1, or nothing out of range, is needed")
+    return round(time_s * NS_PER_S), number[ends[0]], number[ends[1]], loss
