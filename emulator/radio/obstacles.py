@@ -17,14 +17,14 @@ from emulator.scenario.radio import Buildings as Section
 from emulator.world.buildings import Buildings
 from vnet.types import Array, Mask
 
-CELL_M = 25.0
-"""Least side of the cells in which edges are looked up: about the length of a house."""
+CELL_M = 20.0
+"""Least side of the cells in which edges are looked up: about the length of a building's edge."""
 MOST_CELLS = 10_000_000
 """Entries of the table of cells; with enormous buildings cells are larger."""
 MARGIN = 1e-3
 """Share of a cell by which rays are widened, against rounding, where cells are chosen."""
-FIRST_COLUMNS = 4
-"""Columns of cells in which a ray is followed in the first round; then twice as many, and so on."""
+FIRST_REACH_M = 50.0
+"""Length over which rays are followed in the first round; then twice as far, and so on."""
 MOST_RAYS = 20_000
 """Rays that are followed at once, which bounds the memory."""
 
@@ -51,31 +51,22 @@ class _Cells:
         order = np.argsort(key, kind="stable")
         self._key, self._box = key[order], box[order]
 
-    def columns(self, start_m: Array, end_m: Array) -> tuple[Index, Index]:
-        """Return the first column (n,) that each ray touches, and the one behind the last.
+    def along(self, start_m: Array, end_m: Array) -> tuple[Index, Index]:
+        """Return pairs (ray, box), perhaps twice: all boxes that rays touch, and others near them.
 
         Rays go from `start_m` to `end_m` (n, 2), and none of them to the west.
         """
-        west, east = ((end_m[:, 0] - self._corner_m[0]) / self._cell_m for end_m in (start_m, end_m))
+        (west, south), (east, north) = ((end_m - self._corner_m).T / self._cell_m for end_m in (start_m, end_m))
         first = np.clip(np.floor(west - MARGIN), 0, self._columns).astype(np.intp)
-        return first, np.clip(np.floor(east + MARGIN) + 1, first, self._columns).astype(np.intp)
-
-    def along(self, start_m: Array, end_m: Array, first: Index, last: Index) -> tuple[Index, Index]:
-        """Return pairs (ray, box), perhaps twice, of boxes in the cells of rays, in columns from `first` to `last`.
-
-        All boxes that a ray touches in these columns are among them; `last` (n,) is not one of the columns.
-        """
-        count = last - first
+        count = np.clip(np.floor(east + MARGIN) + 1, first, self._columns).astype(np.intp) - first
         ray = np.repeat(np.arange(len(first)), count)
         column = first[ray] + np.arange(len(ray)) - np.repeat(np.cumsum(count) - count, count)
-        (west, south), (east, north) = ((end_m - self._corner_m).T / self._cell_m for end_m in (start_m, end_m))
         width = np.where(east > west, east - west, 1.0)
         ends = []
         for border in (column - MARGIN, column + 1 + MARGIN):
             share = (np.clip(border, west[ray], east[ray]) - west[ray]) / width[ray]
             ends.append(south[ray] + share * (north - south)[ray])
-        vertical = (east == west)[ray]
-        ends[1] = np.where(vertical, north[ray], ends[1])
+        ends[1] = np.where((east == west)[ray], north[ray], ends[1])
         low = np.maximum(np.floor(np.minimum(*ends) - MARGIN), 0)
         high = np.minimum(np.floor(np.maximum(*ends) + MARGIN), self._rows - 1)
         inside = high >= low
@@ -100,14 +91,15 @@ class _Crossings:
         """Return no crossings."""
         return cls(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros(0))
 
-    def and_(self, other: _Crossings) -> _Crossings:
-        """Return both, each ray with each edge once, by ray and edge."""
+    def and_(self, other: _Crossings, edges: int) -> _Crossings:
+        """Return both, each ray with each of so many edges once, by ray and edge."""
         ray, edge = np.append(self.ray, other.ray), np.append(self.edge, other.edge)
-        share = np.append(self.share, other.share)
-        order = np.lexsort((edge, ray))
-        ray, edge, share = ray[order], edge[order], share[order]
-        new = np.append(True, (np.diff(ray) != 0) | (np.diff(edge) != 0))[: len(ray)]
-        return _Crossings(ray[new], edge[new], share[new])
+        _, index = np.unique(ray * edges + edge, return_index=True)
+        return _Crossings(ray[index], edge[index], np.append(self.share, other.share)[index])
+
+    def of(self, kept: Mask) -> _Crossings:
+        """Return the crossings that a mask (n,) marks."""
+        return _Crossings(self.ray[kept], self.edge[kept], self.share[kept])
 
 
 class Obstacles:
@@ -148,27 +140,30 @@ class Obstacles:
         """Return the losses (n,) of rays from `start_m` to `end_m` (n, 2), infinite beyond their margin."""
         swapped = _is_before(end_m, start_m)[:, None]
         start_m, end_m = np.where(swapped, end_m, start_m), np.where(swapped, start_m, end_m)
-        column, last = self._cells.columns(start_m, end_m)
-        crossings, columns = _Crossings.none(), FIRST_COLUMNS
+        length_m = np.hypot(*(end_m - start_m).T)
+        crossings, reach_m = _Crossings.none(), FIRST_REACH_M
+        followed, passes = np.zeros(len(start_m)), np.ones(len(start_m), dtype=bool)
         alive = np.arange(len(start_m))
-        while len(alive):
-            until = np.minimum(column[alive] + columns, last[alive])
-            more = self._crossings(start_m[alive], end_m[alive], column[alive], until)
-            crossings = crossings.and_(_Crossings(alive[more.ray], more.edge, more.share))
-            column[alive], columns = until, 2 * columns
-            walls = np.bincount(crossings.ray, minlength=len(start_m))
-            alive = alive[(until < last[alive]) & (self._wall_db * walls[alive] <= margin_db[alive])]
+        while len(alive):  # most rays through a town need not be followed far
+            until = np.minimum(followed[alive] + reach_m / np.maximum(length_m[alive], reach_m / 2), 1.0)
+            more = self._crossings(start_m[alive], end_m[alive], followed[alive], until)
+            crossings = crossings.and_(_Crossings(alive[more.ray], more.edge, more.share), len(self._building))
+            passes &= self._wall_db * np.bincount(crossings.ray, minlength=len(start_m)) <= margin_db
+            crossings = crossings.of(passes[crossings.ray])
+            followed[alive], reach_m = until, 2 * reach_m
+            alive = alive[(until < 1) & passes[alive]]
         walls = np.bincount(crossings.ray, minlength=len(start_m))
-        loss_db = self._wall_db * walls + self._inside_db_per_m * self._inside_m(start_m, end_m, crossings)
-        return np.where(loss_db <= margin_db, loss_db, np.inf)
+        loss_db = self._wall_db * walls + self._inside_db_per_m * self._inside_m(start_m, end_m, crossings, passes)
+        return np.where(passes & (loss_db <= margin_db), loss_db, np.inf)
 
-    def _crossings(self, start_m: Array, end_m: Array, first: Index, last: Index) -> _Crossings:
-        """Return where rays cross edges in these columns; perhaps some twice.
+    def _crossings(self, start_m: Array, end_m: Array, first: Array, last: Array) -> _Crossings:
+        """Return where rays cross edges between these shares (n,) of them, perhaps some twice, and others beyond.
 
         Ends of edges on the ray's line count as right of it, ends of rays on the edge's line as left of that: as
         if the ray were moved by a little to the north, and by much less to the west.
         """
-        ray, edge = self._cells.along(start_m, end_m, first, last)
+        from_m, to_m = (start_m + share[:, None] * (end_m - start_m) for share in (first, last))
+        ray, edge = self._cells.along(from_m, to_m)
         (one, two), start, end = self._edge_m[edge].swapaxes(0, 1), start_m[ray], end_m[ray]
         crosses = (_left_of(start, end, one) > 0) != (_left_of(start, end, two) > 0)
         ray, edge, one, two, start, end = (each[crosses] for each in (ray, edge, one, two, start, end))
@@ -177,15 +172,15 @@ class Obstacles:
         before, behind = before[crosses], behind[crosses]
         return _Crossings(ray[crosses], edge[crosses], before / (before - behind))
 
-    def _inside_m(self, start_m: Array, end_m: Array, crossings: _Crossings) -> Array:
-        """Return the metres (n,) of rays inside buildings.
+    def _inside_m(self, start_m: Array, end_m: Array, crossings: _Crossings, chosen: Mask) -> Array:
+        """Return the metres (n,) of rays inside buildings, 0 of those that are not `chosen` (n,).
 
         Along a ray the crossings of a building, with the ends that are inside it, are entries and exits by turns.
         """
         parts = [(crossings.ray, self._building[crossings.edge], crossings.share)]
         for end, point_m in ((0.0, start_m), (1.0, end_m)):
-            ray, building = self._containing(point_m)
-            parts.append((ray, building, np.full(len(ray), end)))
+            place, building = self._containing(point_m[chosen])
+            parts.append((np.flatnonzero(chosen)[place], building, np.full(len(place), end)))
         ray, building, share = (np.concatenate(each) for each in zip(*parts, strict=True))
         order = np.lexsort((share, building, ray))
         ray, share, one = ray[order], share[order], ray[order] * self._buildings + building[order]
@@ -203,8 +198,8 @@ class Obstacles:
         place, number = np.unique(point_m, axis=0, return_inverse=True)
         east_m = np.maximum(place[:, 0], self._edge_m[..., 0].max(initial=0.0)) + CELL_M
         far_m = np.column_stack([east_m, place[:, 1]])
-        found = self._crossings(place, far_m, *self._cells.columns(place, far_m))
-        found = _Crossings.none().and_(found)
+        found = self._crossings(place, far_m, np.zeros(len(place)), np.ones(len(place)))
+        found = _Crossings.none().and_(found, len(self._building))
         pair, times = np.unique(found.ray * self._buildings + self._building[found.edge], return_counts=True)
         contained = pair[times % 2 == 1]
         of_place = np.argsort(number.ravel(), kind="stable")

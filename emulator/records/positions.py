@@ -12,6 +12,9 @@ from emulator.radio.connectivity import Connectivity, distances_m
 from emulator.world.neighbours import Links
 from vnet.types import Array, IntArray, Mask
 
+MOST_KEPT = 1_000_000
+"""Links of epochs that are kept, in all (24 MB): several checks ask for them, and buildings make them expensive."""
+
 
 class Places:
     """Positions (K, N, 2) of K periods, or of one (K = 1) where nobody moves; NaN where a vehicle was not there.
@@ -33,6 +36,8 @@ class Places:
         known = changes_ns < (self._end_ns if len(position_m) else 0)
         self.starts_ns = np.union1d(periods_ns, changes_ns[known])
         """Times at which epochs begin."""
+        self._kept: dict[int, Links] = {}
+        self._room = MOST_KEPT
 
     def index(self, time_ns: IntArray) -> IntArray:
         """Index of the position, of the K, at each of these instants."""
@@ -56,7 +61,13 @@ class Places:
 
     def links(self, time_ns: int) -> Links:
         """Links of a sender and a receiver in its range."""
-        return self._connectivity_at(time_ns).links(self._position_at(time_ns))
+        epoch = int(self._epoch(np.array([time_ns]))[0])
+        if epoch not in self._kept:
+            links = self._connectivity_at(time_ns).links(self._position_at(time_ns))
+            if len(links.sender) > self._room:
+                return links
+            self._kept[epoch], self._room = links, self._room - len(links.sender)
+        return self._kept[epoch]
 
     def _connectivity_at(self, time_ns: int) -> Connectivity:
         self._connectivity = self._connectivity.at(time_ns)  # the next time is often a later one
