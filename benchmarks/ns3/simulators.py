@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,20 +34,20 @@ class MissingError(Exception):
     """ns-3 cannot be used here; says in one line why, and how to get it."""
 
 
-def build(folder: Path) -> Path:
-    """Compile the program into `folder`. Raises MissingError."""
+def build(folder: Path, source: Path = PROGRAM, modules: Sequence[str] = MODULES) -> Path:
+    """Compile a program, which uses these modules of ns-3, into `folder`. Raises MissingError."""
     for tool in ("g++", "pkg-config"):
         if shutil.which(tool) is None:
             raise MissingError(f"{tool} is missing: {HOW_TO_GET_IT}")
-    names = [f"ns3-{module}" for module in MODULES]
+    names = [f"ns3-{module}" for module in modules]
     found = subprocess.run(["pkg-config", "--cflags", "--libs", *names], capture_output=True, text=True)
     if found.returncode:
         raise MissingError(f"ns-3 is missing: {HOW_TO_GET_IT}")
-    program = folder / "broadcast"
-    command = ["g++", "-O2", "-std=c++17", str(PROGRAM), "-o", str(program), *found.stdout.split()]
+    program = folder / source.stem
+    command = ["g++", "-O2", "-std=c++17", str(source), "-o", str(program), *found.stdout.split()]
     compiled = subprocess.run(command, capture_output=True, text=True)
     if compiled.returncode:
-        raise MissingError(f"{PROGRAM.name} does not compile: {_last_line(compiled.stderr)}: {HOW_TO_GET_IT}")
+        raise MissingError(f"{source.name} does not compile: {_last_line(compiled.stderr)}: {HOW_TO_GET_IT}")
     return program
 
 

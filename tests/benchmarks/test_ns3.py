@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.ns3 import buildings
 from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison
 from benchmarks.ns3.figure import draw
 from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
@@ -84,3 +85,12 @@ def test_without_ns3_it_says_in_one_line_how_to_get_it(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.count("\n") == 1 and "apt-get install" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_buildings_cut_the_same_rays_as_in_ns3_where_it_is_installed(capsys: pytest.CaptureFixture[str]) -> None:
+    status = buildings.main()
+    if status == 2:
+        assert "apt-get install" in capsys.readouterr().err
+        pytest.skip("ns-3 is not installed, which Debian's libns3-dev is for")
+    assert (status, capsys.readouterr().out) == (0, "19,900 rays: 12,026 cut in ns-3, 12,026 in vnet; 0 differ\n")
