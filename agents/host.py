@@ -245,9 +245,11 @@ class _RealTimeAgent:
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
         self._host.busy.add(batch.busy)
+        self._host.results.add(batch.results)
         for packet in () if batch.held else batch.packets:
             self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
+        self._host.results.settle(max((result.time_ns for result in batch.results), default=0))
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
@@ -13,7 +14,7 @@ from vnet.mailbox import Mailbox
 
 
 class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a dataclass; a run has millions
-    """One received broadcast. Times are emulated nanoseconds from the start of the run.
+    """One received frame. Times are emulated nanoseconds from the start of the run.
 
     `rssi_dbm` is the received power, and `snr_db` its ratio to noise and interference, averaged over the payload;
     both are rounded to 0.01 dB. They are None where the scenario has no path loss.
@@ -28,17 +29,38 @@ class Packet(Struct, frozen=True, gc=False):  # made six times as fast as a data
 
 
 class RadioAbilities(NamedTuple):
-    """Limits of a choice for a frame: the largest power in dBm, or None, and the bit rates in Mbit/s."""
+    """Limits of a choice for a frame: the largest power in dBm, or None, and the bit rates in Mbit/s.
+
+    `acknowledges` says that there is a MAC, which acknowledges frames to a single vehicle.
+    """
 
     max_power_dbm: float | None = None
     rates_mbps: Sequence[float] = ()
+    acknowledges: bool = False
 
 
 class SendOptions(NamedTuple):
-    """Choices of a program for a frame; None: the scenario's power or bit rate."""
+    """Choices of a program for a frame; None: the scenario's power or bit rate.
+
+    `to` is the vehicle to which a frame is addressed, None for a broadcast; `number` counts the frames of this kind
+    that its sender has sent, and its result names it.
+    """
 
     power_dbm: float | None = None
     rate_mbps: float | None = None
+    to: str | None = None
+    number: int = 0
+
+
+class SendResult(NamedTuple):
+    """Result of `Radio.send`, as the sender knows it.
+
+    `delivered` says that an acknowledgement came; without one the frame may have been received all the same.
+    `attempts` is how often the frame was transmitted: 0 if it never left its sender.
+    """
+
+    delivered: bool
+    attempts: int
 
 
 class RadioTransport(Protocol):
@@ -68,7 +90,7 @@ def _number(value: float) -> float:
 
 
 class Radio:
-    """The vehicle's radio: sends broadcasts to all nodes in range, and receives theirs.
+    """The vehicle's radio: sends broadcasts to all nodes in range or frames to one, and receives theirs.
 
     Attributes:
         max_payload: largest payload of a frame in bytes.
@@ -83,6 +105,9 @@ class Radio:
         self.max_power_dbm = abilities.max_power_dbm
         self.rates_mbps = tuple(abilities.rates_mbps)
         self.inbox: Mailbox[Packet] = Mailbox()
+        self._acknowledges = abilities.acknowledges
+        self._next_send = 0
+        self._sends: dict[int, asyncio.Future[SendResult]] = {}
         self._node_id = node_id
         self._transport = transport
 
@@ -97,43 +122,87 @@ class Radio:
         Raise `PayloadTooLargeError` above `max_payload` bytes, TypeError for what is not bytes, and ValueError for
         a power or a rate that the radio does not have.
         """
-        options = SendOptions(self._checked_power(power_dbm), self._checked_rate(rate_mbps))
+        options = SendOptions(
+            self._checked_power("broadcast", power_dbm), self._checked_rate("broadcast", rate_mbps)
+        )
+        self._transport.send_frame(self._node_id, self._checked_payload("broadcast", payload), options)
+
+    async def send(
+        self, to: str, payload: bytes, *, power_dbm: float | None = None, rate_mbps: float | None = None
+    ) -> SendResult:
+        """Send a frame to the vehicle `to` alone, and return whether it was acknowledged.
+
+        The frame is transmitted again until an acknowledgement comes, up to 7 times in all. The result comes one
+        `radio.latency_ms` after the sender's MAC knows it. Cancelling the call stops no transmission. The other
+        arguments and exceptions are those of `broadcast`; raise ValueError also without `[radio.mac]`, and for a
+        `to` that is no other vehicle's name. A name that no vehicle has is not acknowledged, with 0 attempts.
+        """
+        if not self._acknowledges:
+            raise ValueError(
+                f"send({shown(to)}, …): only with [radio.mac] a frame is acknowledged; use broadcast()"
+            )
+        if not isinstance(to, str) or to == self._node_id:
+            raise ValueError(f"send({shown(to)}, …): the name of another vehicle is expected")
+        content = self._checked_payload("send", payload)
+        power_dbm, rate_mbps = self._checked_power("send", power_dbm), self._checked_rate("send", rate_mbps)
+        number, self._next_send = self._next_send, self._next_send + 1
+        result: asyncio.Future[SendResult] = asyncio.get_running_loop().create_future()
+        self._sends[number] = result
+        try:
+            self._transport.send_frame(self._node_id, content, SendOptions(power_dbm, rate_mbps, to, number))
+            return await result
+        finally:
+            self._sends.pop(number, None)
+
+    @property
+    def is_sending(self) -> bool:
+        """True if a task waits for the result of `send`."""
+        return bool(self._sends)
+
+    def settle(self, number: int, result: SendResult) -> None:
+        """Give the call of `send` with this number its result, if it still waits for one."""
+        waiting = self._sends.get(number)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(result)
+
+    def _checked_payload(self, call: str, payload: bytes) -> bytes:
+        """Return a payload as bytes. Raise TypeError for what is not bytes, and PayloadTooLargeError."""
         try:
             content = bytes(memoryview(payload))
         except TypeError:
             raise TypeError(
-                f"broadcast({shown(payload)}): bytes are expected, not {type(payload).__name__}; encode it first, "
+                f"{call}({shown(payload)}): bytes are expected, not {type(payload).__name__}; encode it first, "
                 "as with msgpack.packb(…) or text.encode()"
             ) from None
         if len(content) > self.max_payload:
             raise PayloadTooLargeError(len(content), self.max_payload)
-        self._transport.send_frame(self._node_id, content, options)
+        return content
 
-    def _checked_power(self, power_dbm: float | None) -> float | None:
+    def _checked_power(self, call: str, power_dbm: float | None) -> float | None:
         """Return a power as a float. Raise ValueError for one that the radio does not have."""
         if power_dbm is None:
             return None
         if self.max_power_dbm is None:
             raise ValueError(
-                f"broadcast(power_dbm={shown(power_dbm)}): only with [radio.path_loss] a frame has a power"
+                f"{call}(power_dbm={shown(power_dbm)}): only with [radio.path_loss] a frame has a power"
             )
         number = _number(power_dbm)
         if not MIN_POWER_DBM <= number <= self.max_power_dbm:
             text = f"{MIN_POWER_DBM:g} to {self.max_power_dbm:g} dBm; radio.path_loss.tx_power_dbm is the largest"
-            raise ValueError(f"broadcast(power_dbm={shown(power_dbm)}): allowed are {text}")
+            raise ValueError(f"{call}(power_dbm={shown(power_dbm)}): allowed are {text}")
         return number
 
-    def _checked_rate(self, rate_mbps: float | None) -> float | None:
+    def _checked_rate(self, call: str, rate_mbps: float | None) -> float | None:
         """Return a bit rate as a float. Raise ValueError for one that the radio does not have."""
         if rate_mbps is None:
             return None
         if not self.rates_mbps:
             text = "only with [radio.path_loss] or [radio.mac] a frame has a rate of its own"
-            raise ValueError(f"broadcast(rate_mbps={shown(rate_mbps)}): {text}")
+            raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): {text}")
         number = _number(rate_mbps)
         if number not in self.rates_mbps:
             rates = ", ".join(f"{rate:g}" for rate in self.rates_mbps)
-            raise ValueError(f"broadcast(rate_mbps={shown(rate_mbps)}): 802.11p has {rates}")
+            raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): 802.11p has {rates}")
         return number
 
     @property

@@ -65,6 +65,11 @@ Two sections are not the scenario's own: they hold SHA-256 of what the run has r
 CHOICES = """
 Where programs have [chosen powers or bit rates](../radio.md#power-and-bit-rate-of-a-frame), there are two more:
 `gain_db`, the power of the frame above that of the scenario, and `bitrate_mbps`.
+
+Where programs have sent [frames to single vehicles](../radio.md#frames-to-one-vehicle), each transmission of such
+a frame has one row, that of its addressee, with another `copy`, and there are three more columns: `attempt`, the
+number of the transmission (0 for a broadcast), `ack_on_air_ns`, the start of the acknowledgement (null without
+one), and `acked`, whether the sender received that.
 """
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.

@@ -15,7 +15,7 @@ from docs.generate.markdown import page as whole_page
 from vnet.errors import PayloadTooLargeError
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import GnssReceiver
-from vnet.radio import Radio
+from vnet.radio import Radio, SendResult
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.units import unit_of
@@ -42,11 +42,12 @@ PARTS = {
     "node.radio": Radio,
     "node.gnss": GnssReceiver,
     "Packet": vnet.Packet,
+    "SendResult": SendResult,
     "Fix": vnet.Fix,
     "node.map": LaneMap,
     "node.map of a city": RoadMap,
 }
-HOSTS_ONLY = {"sever", "to_wire", "from_wire"}
+HOSTS_ONLY = {"sever", "to_wire", "from_wire", "is_sending", "settle"}
 """Public, but none of a program's business."""
 WAITING = f"""
 `async for` waits for the next one, and goes on until the run ends. The newest {INBOX_LIMIT} that the program has
@@ -71,8 +72,9 @@ def _part(title: str, thing: type) -> Iterator[str]:
     said, _, attributes = docstring(thing).partition("\nAttributes:\n")
     yield said
     yield table(["attribute", "what"], ([f"`{name}`", sentence(text)] for name, text in _listed(attributes)))
-    if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct):
-        rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in thing.__annotations__.items())
+    if dataclasses.is_dataclass(thing) or issubclass(thing, msgspec.Struct | tuple):
+        types = {name: getattr(kind, "__forward_arg__", kind) for name, kind in thing.__annotations__.items()}
+        rows = ([f"`{name}`", _plain(kind), unit_of(name)] for name, kind in types.items())
         yield table(["attribute", "type", "unit"], rows)
     for name, member in _members(thing):
         yield f"**`{name}`**: {docstring(member)}"

@@ -24,6 +24,7 @@ LOSS_BAND = 0.999
 LOSS_SIGMAS = 4.9
 """Half-width of the band of measured losses, in standard deviations: one sound run in a million is outside."""
 IN_TRACE = tuple(o.name for o in Outcome if o not in (Outcome.pending, Outcome.out_of_range))
+"""Outcomes of rows of the trace; of frames to single vehicles, `out_of_range` as well."""
 
 
 def nothing_seen(name: str, recorded: RecordedRun, text: str) -> Finding:
@@ -41,8 +42,8 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     broken: dict[str, Mask] = {
         "repeated": _repeated(recorded),
         "wrong_count": _in_frames_of_wrong_size(recorded),
-        "not_in_range": recorded.placed & ~recorded.in_range,
-        "undecided": ~recorded.outcome_is(*IN_TRACE),
+        "not_in_range": recorded.placed & (recorded.in_range == _sent_beyond_range(recorded)),
+        "undecided": ~(recorded.outcome_is(*IN_TRACE) | _sent_beyond_range(recorded)),
         "orphans": _orphans(recorded),
         "disordered": _out_of_order(recorded),
         "mistimed": _mistimed(recorded),
@@ -67,6 +68,11 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     )
 
 
+def _sent_beyond_range(recorded: RecordedRun) -> Mask:
+    """Rows of frames to single vehicles that were out of range."""
+    return np.asarray((recorded.attempt > 0) & recorded.outcome_is("out_of_range"))
+
+
 def _repeated(recorded: RecordedRun) -> Mask:
     key = recorded.emission * len(recorded.node_ids) + recorded.receiver
     order = np.argsort(key, kind="stable")
@@ -76,12 +82,15 @@ def _repeated(recorded: RecordedRun) -> Mask:
 
 
 def _in_frames_of_wrong_size(recorded: RecordedRun) -> Mask:
-    """Rows of frames without exactly one row for each receiver in range; duplicates may have fewer."""
+    """Rows of frames without exactly one row for each receiver in range; duplicates may have fewer.
+
+    A frame to a single vehicle has one row.
+    """
     first, inverse, rows = np.unique(recorded.emission, return_index=True, return_inverse=True, return_counts=True)[
         1:
     ]
     in_range = recorded.places.receivers_in_range(recorded.sender[first], recorded.sent_ns[first])
-    wrong = recorded.placed[first] & (rows != in_range)
+    wrong = recorded.placed[first] & (rows != np.where(recorded.attempt[first] > 0, 1, in_range))
     sent = np.bincount(inverse, weights=~received_twice(recorded), minlength=len(first)) > 0
     return np.asarray((wrong & sent)[inverse])
 
@@ -94,6 +103,7 @@ def _orphans(recorded: RecordedRun) -> Mask:
     np.minimum.at(original_ns, index[~copies], recorded.sent_ns[~copies])
     named = recorded.trace["cause"].combine_chunks()
     nameless = np.asarray(named.to_numpy(zero_copy_only=False) == "", dtype=bool)
+    nameless &= recorded.attempt < 2  # what is transmitted again is a copy, but no fault's
     return np.asarray(copies & (nameless | (original_ns[index] > recorded.sent_ns)))
 
 
@@ -256,7 +266,7 @@ def _deviation_of_sum(probability: Array) -> float:
 
 def drew_for_loss(recorded: RecordedRun) -> Mask:
     """Return the receptions that came as far as the radio's loss; duplicates had one draw."""
-    return np.asarray(recorded.outcome_is("lost", *ARRIVED) & ~received_twice(recorded))
+    return np.asarray(recorded.outcome_is("lost", "duplicate", *ARRIVED) & ~received_twice(recorded))
 
 
 def received_twice(recorded: RecordedRun) -> Mask:

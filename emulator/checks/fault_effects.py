@@ -173,7 +173,7 @@ def _slowed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
         on_air = on_air[np.argsort(begin_ns[on_air])]
         silent_ns = np.maximum.accumulate(np.append(0, (begin_ns + recorded.airtime_ns)[on_air]))
         free_ns = np.maximum(ready_ns, silent_ns[np.searchsorted(begin_ns[on_air], begin_ns)])
-        aifs_ns, window = edca_parameters(radio.mac)
+        aifs_ns, window, _ = edca_parameters(radio.mac)
         slow |= begin_ns > free_ns + aifs_ns + (window + 2) * SLOT_NS + recorded.guard_ns
     return np.asarray(slow)
 

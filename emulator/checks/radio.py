@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from emulator.checks.channel import nothing_seen, received_twice
 from emulator.radio.csma import edca_parameters
-from emulator.radio.dot11p import DETECTION_NS, arrival_probability
+from emulator.radio.dot11p import DETECTION_NS, SIFS_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.reception import Threshold, milliwatts
+from emulator.radio.unicast import MOST_ATTEMPTS, ack_airtime_ns
 from emulator.records.distributions import chi2_sf
 from emulator.records.recorded_run import ON_AIR, RecordedRun
 from emulator.records.verdicts import Finding, NotExercised, result
@@ -121,22 +122,32 @@ def _arrives(radio: Radio, m: float, airtime_ns: int, rate_mbps: float, power_db
 
 @dataclass(frozen=True)
 class _Air:
-    """The transmissions of a run, in order of their beginning, each by its first row of the trace."""
+    """The transmissions of a run, in order of their beginning, each by its first row of the trace.
+
+    An acknowledgement, `is_ack`, has the row of its frame.
+    """
 
     recorded: RecordedRun
     rows: NDArray[np.intp]
     sender: NDArray[np.intp]
     begin_ns: IntArray
     end_ns: IntArray
+    is_ack: Mask
 
     @classmethod
     def of(cls, recorded: RecordedRun) -> _Air:
         """All that were on air."""
         own = np.flatnonzero(~received_twice(recorded) & (recorded.on_air_ns >= 0))
-        rows = own[np.unique(recorded.emission[own], return_index=True)[1]]
-        rows = rows[np.argsort(recorded.on_air_ns[rows], kind="stable")]
-        begin_ns = recorded.on_air_ns[rows]
-        return cls(recorded, rows, recorded.sender[rows], begin_ns, begin_ns + recorded.airtime_ns[rows])
+        frames = own[np.unique(recorded.emission[own], return_index=True)[1]]
+        acked = frames[recorded.ack_on_air_ns[frames] >= 0]
+        acks_ns = np.array([ack_airtime_ns(rate) for rate in recorded.bitrate_mbps[acked].tolist()], np.int64)
+        rows = np.concatenate([frames, acked])
+        sender = np.concatenate([recorded.sender[frames], recorded.receiver[acked]])
+        begin_ns = np.concatenate([recorded.on_air_ns[frames], recorded.ack_on_air_ns[acked]])
+        end_ns = begin_ns + np.concatenate([recorded.airtime_ns[frames], acks_ns])
+        is_ack = np.arange(len(rows)) >= len(frames)
+        order = np.argsort(begin_ns, kind="stable")
+        return cls(recorded, rows[order], sender[order], begin_ns[order], end_ns[order], is_ack[order])
 
     def near(self, within_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Pairs of transmissions (earlier, later): the later begins before so long after the other's end."""
@@ -162,8 +173,9 @@ class _Air:
         """Return pairs of an index into `rows` of the trace and a transmission that overlapped that row's."""
         other, starts = self._overlaps
         emission = self.recorded.emission
-        by_emission = np.argsort(emission[self.rows])
-        mine = by_emission[np.searchsorted(emission[self.rows], emission[rows], sorter=by_emission)]
+        frames = np.flatnonzero(~self.is_ack)
+        frames = frames[np.argsort(emission[self.rows[frames]])]
+        mine = frames[np.searchsorted(emission[self.rows[frames]], emission[rows])]
         count = starts[mine + 1] - starts[mine]
         index = np.repeat(np.arange(len(rows)), count)
         nth = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
@@ -188,6 +200,7 @@ def check_medium(recorded: RecordedRun) -> Finding:
         "into_others": _into_others(air),
         "collided_alone": _collided_alone(air),
         "heard_while_sending": _heard_while_sending(air),
+        "badly_acknowledged": _badly_acknowledged(recorded),
     }
     counts: dict[str, Any] = {what: len(rows) for what, rows in broken.items()}
     counts["too_idle"] = _too_idle(air)
@@ -227,13 +240,15 @@ def _without_pause(air: _Air) -> NDArray[np.intp]:
             least_ns = LEAST_PAUSE_NS
         case None:
             least_ns = 0
-    order = np.argsort(air.sender, kind="stable")
-    same = air.sender[order[1:]] == air.sender[order[:-1]]
-    begin_ns, end_ns = air.begin_ns[order], air.end_ns[order]
-    early = (begin_ns[1:] < end_ns[:-1] + edca_parameters(radio.mac).aifs_ns) | (
-        begin_ns[1:] < begin_ns[:-1] + least_ns
-    )
-    return np.asarray(air.rows[order[1:][same & early]])
+    early = [np.zeros(0, np.intp)]
+    for some, pause_ns in ((np.arange(len(air.rows)), 0), (np.flatnonzero(~air.is_ack), least_ns)):
+        order = some[np.argsort(air.sender[some], kind="stable")]
+        before, after = order[:-1], order[1:]
+        soon = air.begin_ns[after] < air.end_ns[before] + edca_parameters(radio.mac).aifs_ns
+        is_retry = air.recorded.attempt[air.rows[after]] > 1
+        soon |= (air.begin_ns[after] < air.begin_ns[before] + pause_ns) & ~is_retry
+        early.append(after[(air.sender[before] == air.sender[after]) & soon & ~air.is_ack[after]])
+    return np.asarray(air.rows[np.unique(np.concatenate(early))])
 
 
 def _into_others(air: _Air) -> NDArray[np.intp]:
@@ -250,9 +265,10 @@ def _into_others(air: _Air) -> NDArray[np.intp]:
     earlier, later = earlier[noticed], later[noticed]
     sent_ns = recorded.sent_ns[air.rows[earlier]]
     power_mw = recorded.places.pair_powers_mw(air.sender[earlier], air.sender[later], sent_ns)
-    power_mw *= 10 ** (recorded.gain_db[air.rows[earlier]] / 10)
+    power_mw *= 10 ** (np.where(air.is_ack[earlier], 0.0, recorded.gain_db[air.rows[earlier]]) / 10)
     sensed = power_mw >= milliwatts(radio.mac.carrier_sense_dbm) * (1 + ROUNDING)
-    return np.unique(air.rows[later[sensed & (air.sender[earlier] != air.sender[later])]])
+    sensed &= (air.sender[earlier] != air.sender[later]) & ~air.is_ack[later]  # which nothing keeps back
+    return np.unique(air.rows[later[sensed]])
 
 
 def _audible(air: _Air, rows: NDArray[np.intp]) -> Mask:
@@ -276,6 +292,33 @@ def _heard_while_sending(air: _Air) -> NDArray[np.intp]:
     index, other = air.met(rows)
     itself = air.sender[other] == recorded.receiver[rows][index]
     return np.asarray(rows[np.unique(index[itself])])
+
+
+def _badly_acknowledged(recorded: RecordedRun) -> NDArray[np.intp]:
+    """Rows of frames to single vehicles that break the rules of acknowledgements.
+
+    An acknowledgement follows what was received after SIFS. A frame that was acknowledged is not transmitted again,
+    and none more often than allowed. Of the attempts that were received only the first arrives.
+    """
+    rows = np.flatnonzero((recorded.attempt > 0) & ~received_twice(recorded))
+    attempt, ack_ns, acked = recorded.attempt[rows], recorded.ack_on_air_ns[rows], recorded.acked[rows]
+    arrived = recorded.arrived[rows]
+    duplicate = recorded.outcome_is("duplicate")[rows]
+    answered = ack_ns >= 0
+    wrong = attempt > MOST_ATTEMPTS
+    wrong |= (answered & (ack_ns != recorded.column("left_ns")[rows] + SIFS_NS)) | (acked & ~answered)
+    wrong |= answered & ~(arrived | duplicate)
+    frame = recorded.frame[rows]
+    index = np.unique(frame, return_inverse=True)[1]
+    single = (np.bincount(index, weights=attempt == 1) == 1)[index]  # faults may send a frame several times
+    order = np.lexsort((attempt, frame))
+    order = order[single[order]]
+    same = np.diff(frame[order]) == 0
+    wrong[order[1:]] |= same & (acked[order[:-1]] | (np.diff(attempt[order]) != 1))
+    received = np.zeros(len(rows), bool)
+    for before, after in zip(order[:-1][same].tolist(), order[1:][same].tolist(), strict=True):
+        received[after] = received[before] or arrived[before]
+    return np.asarray(rows[wrong | (single & ((arrived & received) | (duplicate & ~received)))])
 
 
 def _too_idle(air: _Air) -> int:

@@ -30,7 +30,7 @@ def check_copies(recorded: RecordedRun) -> Finding:
     name = "copies"
     if not any(isinstance(planned.fault, DoS | Sybil | DataReplay) for planned in recorded.plan):
         return NotExercised(name, "no fault sends frames again" if recorded.plan else NO_FAULTS)
-    once = ~received_twice(recorded)
+    once = ~received_twice(recorded) & (recorded.attempt < 2)  # what is transmitted again is the MAC's
     first = _first_rows(recorded, once & ~_near_a_change(recorded) & ~_sent_by_rule(recorded))
     originals, copies = first[recorded.copy[first] == 0], first[recorded.copy[first] > 0]
     frame_ns = dict(_of(recorded, originals))

@@ -23,6 +23,7 @@ from emulator.export.tables import write_csv
 from emulator.records.atomic import atomically, disk_errors
 from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.unicast_figures import UnicastFigures, unicast_figures
 from emulator.terminal.console import one_line_errors
 from vnet.errors import VnetError
 
@@ -70,7 +71,8 @@ def radio(
 ) -> None:
     """A run's radio in figures: delivery by distance, latency, time between receptions, age of information."""
     with one_line_errors():
-        metrics = radio_metrics(RecordedRun.open(run), bin_m)
+        recorded = RecordedRun.open(run)
+        metrics = radio_metrics(recorded, bin_m)
         if out is not None:
             tables = {"links": metrics.links, "vehicles": metrics.vehicles, "distances": metrics.distances}
             with disk_errors(out):
@@ -78,11 +80,13 @@ def radio(
             for name, table in tables.items():
                 with atomically(out / f"{name}.parquet") as part:
                     pq.write_table(table, part, compression="zstd")
-        _print(metrics, Console())
+        _print(metrics, unicast_figures(recorded), Console())
 
 
-def _print(metrics: RadioMetrics, console: Console) -> None:
+def _print(metrics: RadioMetrics, unicast: UnicastFigures | None, console: Console) -> None:
     totals = metrics.totals
+    if unicast is not None:
+        console.print(f"{'frames to one vehicle':24}{unicast}", highlight=False)
     if not totals["pairs"]:
         console.print("nobody sent anything to anybody in range")
         return

@@ -42,6 +42,9 @@ from vnet.reports import Report
 from vnet.transport import wire
 from vnet.units import NS_PER_S
 
+NO_CHOICES = None, None, None
+"""Power, bit rate and addressee of a frame without any of its own."""
+
 
 @dataclass(frozen=True)
 class PeriodView:
@@ -195,8 +198,8 @@ class Emulation:
         for part in traffic:
             for frame in part.frames:
                 queued = frames.setdefault(frame.node, [])
-                if frame.power_dbm is not None or frame.rate_mbps is not None:
-                    chosen = SendOptions(frame.power_dbm, frame.rate_mbps)
+                chosen = SendOptions(frame.power_dbm, frame.rate_mbps, frame.to, frame.number)
+                if chosen[:3] != NO_CHOICES:
                     options.setdefault(frame.node, {})[len(queued)] = chosen
                 queued.append(frame.payload)
             self._reports.extend(report for report in part.reports if self.up[report.node])

@@ -23,7 +23,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
-from emulator.drivers.protocol import ProtocolError, check_ownership, wire_packet
+from emulator.drivers.protocol import ProtocolError, check_yield, wire_packet
+from emulator.drivers.result_feed import ResultFeed
 from emulator.radio.stages import least_latency_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
@@ -70,24 +71,6 @@ class _Process:
         changed, self.clocks = self.clocks, []
         return changed
 
-    def check(self, message: wire.Yield, end_ns: int) -> None:
-        """Raise ProtocolError if a yield does not fit the window that ends at `end_ns`."""
-        if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
-            raise ProtocolError(
-                f"yield {message.seq} of {self.id}: its next timer, {message.next_timer_ns}, lies before the end "
-                f"of its window, {end_ns}"
-            )
-        check_ownership(self.nodes, wire.Traffic(), [*message.waiting_radio, *message.waiting_gnss])
-        earliest_ns = self.granted_ns
-        for step in message.steps:
-            if not earliest_ns <= step.time_ns < end_ns:
-                raise ProtocolError(
-                    f"yield {message.seq} of {self.id}: a step at {step.time_ns}, where {earliest_ns} to "
-                    f"{end_ns - 1} are allowed"
-                )
-            earliest_ns = step.time_ns + 1
-            check_ownership(self.nodes, step.traffic)
-
 
 class Lockstep:
     """The barrier of a run. `processes` are the node ids of each event loop; the first is its id.
@@ -117,6 +100,7 @@ class Lockstep:
         self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
         """Nodes (N,) that an arrival wakes."""
         self._yielded: list[_Process] = []
+        self._results = ResultFeed(emulation.engine, emulation.world.node_ids)
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
         self._end_ns = 0
@@ -170,7 +154,7 @@ class Lockstep:
         process = self._processes[process_id]
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
-        process.check(message, self._end_ns)
+        check_yield(process.nodes, message, process.granted_ns, self._end_ns)
         del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns
         process.waiting_radio = message.waiting_radio
@@ -253,7 +237,7 @@ class Lockstep:
         emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
         if len(listening):
             next_ns = min(next_ns, int(emulation.engine.next_arrivals_ns()[listening].min()))
-        return max(next_ns, self.now_ns)
+        return max(self._results.next_ns(next_ns), self.now_ns)
 
     def _hold(self, next_ns: int) -> bool:
         """Return whether what comes next lies beyond the horizon; all before it is then done and recorded."""
@@ -294,6 +278,7 @@ class Lockstep:
             inbox += packets
             if len(inbox) > INBOX_LIMIT:
                 self._crowded.add(node_ids[receiver])
+        self._results.show(time_ns)
 
     def _inbox(self, node: str) -> list[Packet]:
         """Return the packets that a node has yet to be granted."""
@@ -308,6 +293,10 @@ class Lockstep:
         for number in np.flatnonzero(self._listens & (arrivals_ns < self._end_ns)).tolist():
             process_id = self._process_of[self._emulation.world.node_ids[number]]
             wakes[process_id] = min(wakes.get(process_id, self._end_ns), int(arrivals_ns[number]))
+        for node, time_ns in self._results.firsts():
+            process = self._processes.get(self._process_of[node])
+            if process is not None and node not in process.paused:
+                wakes[process.id] = min(wakes.get(process.id, self._end_ns), time_ns)
         in_order = sorted(wakes, key=self._order.__getitem__)
         return {process_id: max(wakes[process_id], self.now_ns) for process_id in in_order}
 
@@ -322,6 +311,7 @@ class Lockstep:
         process = self._processes.pop(process_id, None)
         for node in () if process is None else process.nodes:
             self._listens[self._emulation.number[node]] = False
+        self._results.take(() if process is None else process.nodes)
 
     def _plan(self, process: _Process) -> None:
         """Note what a process waits for: an arrival, or a time that is known."""
@@ -386,6 +376,7 @@ class Lockstep:
 
     def _stop(self, node: str) -> None:
         process_id = self._process_of[node]
+        self._results.take([node])
         if self._hosts_all:
             self._processes[process_id].packets[node].clear()
         else:
@@ -409,7 +400,8 @@ class Lockstep:
         fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
         busy = self._emulation.busy.of(process.nodes, time_ns, self._end_ns)
-        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy)
+        results = self._results.take(process.running)
+        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy, results=results)
         if self._hosts_all:
             self._mail = Mail(packets, fixes)
         else:

@@ -25,6 +25,25 @@ def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequen
             raise ProtocolError(f"{action.node} asks for an acceleration that is no number")
 
 
+def check_yield(nodes: Sequence[str], message: wire.Yield, granted_ns: int, end_ns: int) -> None:
+    """Raise ProtocolError if a yield of these nodes' process breaks its window, `granted_ns` to `end_ns`."""
+    if message.next_timer_ns is not None and message.next_timer_ns < end_ns:
+        raise ProtocolError(
+            f"yield {message.seq} of {nodes[0]}: its next timer, {message.next_timer_ns}, lies before the end "
+            f"of its window, {end_ns}"
+        )
+    check_ownership(nodes, wire.Traffic(), [*message.waiting_radio, *message.waiting_gnss])
+    earliest_ns = granted_ns
+    for step in message.steps:
+        if not earliest_ns <= step.time_ns < end_ns:
+            raise ProtocolError(
+                f"yield {message.seq} of {nodes[0]}: a step at {step.time_ns}, where {earliest_ns} to "
+                f"{end_ns - 1} are allowed"
+            )
+        earliest_ns = step.time_ns + 1
+        check_ownership(nodes, step.traffic)
+
+
 def wire_packet(node: str, packet: Packet) -> wire.WirePacket:
     """Encode a packet for its receiver `node`."""
     sender, sent_ns, received_ns, payload = packet.sender, packet.sent_ns, packet.received_ns, packet.payload

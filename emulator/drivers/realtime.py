@@ -12,6 +12,7 @@ from typing import Any
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.protocol import check_ownership, wire_packet
+from emulator.drivers.result_feed import ResultFeed
 from emulator.radio.engine import Delivery
 from vnet.transport import wire
 from vnet.units import NS_PER_S
@@ -47,6 +48,7 @@ class RealTime:
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
+        self._results = ResultFeed(emulation.engine, emulation.world.node_ids)
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
         self._affected: set[str] = set()
         self._next_period = 0
@@ -67,6 +69,7 @@ class RealTime:
         """Time at which `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
+            self._emulation.engine.next_result_ns(),
             self._emulation.fix_time_ns(self._next_period),
             self._emulation.next_change_ns(),
             self._emulation.next_control_ns(),
@@ -119,11 +122,17 @@ class RealTime:
             self._act(change_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
+        informed = {self._process_of[node] for node, _ in self._results.firsts()}
         return {
             process_id: self._batch(process_id)
             for process_id in self._nodes
             if process_id in ready
-            and (process_id in self._packets or process_id in self._fixes or self._clocks[process_id])
+            and (
+                process_id in self._packets
+                or process_id in self._fixes
+                or process_id in informed
+                or self._clocks[process_id]
+            )
         }
 
     def take_actions(self) -> list[ProcessActions]:
@@ -140,6 +149,7 @@ class RealTime:
             self._unacknowledged[process_id].clear()
             self._packets.pop(process_id, None)
             self._fixes.pop(process_id, None)
+            self._results.take(self._nodes[process_id])
         paused = {self._process_of[node] for node in actions.paused}
         self._was_paused |= self._paused - paused
         self._paused = paused
@@ -165,6 +175,7 @@ class RealTime:
             process_id = self._process_of[node_ids[delivery.receiver]]
             if process_id in self._present:
                 self._packets.setdefault(process_id, []).append(delivery)
+        self._results.show(time_ns)
         while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= time_ns:
             for number, node in enumerate(node_ids):
                 fix = self._emulation.gnss.fix(self._next_period, number) if self._emulation.up[node] else None
@@ -183,7 +194,8 @@ class RealTime:
         held = process_id in self._was_paused
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
-        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy)
+        results = self._results.take(self._nodes[process_id])
+        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""

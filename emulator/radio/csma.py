@@ -1,4 +1,4 @@
-"""CSMA/CA: channel access of senders that share one medium (EDCA of 802.11p, broadcasts only).
+"""CSMA/CA: channel access of senders that share one medium (EDCA of 802.11p).
 
 **Events inside the engine.** The end of a frame, and the receivers that it reaches, depend on what others transmit
 before that. So this module has events of its own, at which no program runs: a frame is ready, a backoff ends, a
@@ -23,20 +23,21 @@ busy draws a backoff, and so does every sender after each of its frames. A backo
 that begins idle, and is frozen while the medium is busy. A busy medium is detected after 4 µs: senders that start
 within this time collide.
 
-Not modelled: acknowledgements, and with them retries and growing contention windows (broadcasts have none); and
-EIFS, the longer wait after a frame that could not be decoded.
+**Frames to one vehicle** (`unicast`) are acknowledged, and transmitted again. Those who can read one keep silent
+until its acknowledgement has ended (NAV); those who cannot wait for EIFS. What happens to such a frame is therefore
+decided as it ends, and not when somebody asks.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from typing import NamedTuple
 
 from emulator.radio.congestion import CongestionControl, congestion_control_of
-from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, SIFS_NS, SLOT_NS, airtime_ns
+from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.frames import Frame
 from emulator.radio.mac import Throttle
 from emulator.radio.medium import WINDOW_NS, Medium
@@ -44,11 +45,19 @@ from emulator.radio.outcomes import Outcome
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.radio.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
 from emulator.radio.stages import least_latency_ns
+from emulator.radio.unicast import (
+    ACK_TIMEOUT_NS,
+    MOST_ATTEMPTS,
+    Deferral,
+    Unicasts,
+    acknowledgement_of,
+    retry_of,
+)
 from emulator.scenario.radio import Mac, Receiver
 from emulator.scenario.scenario import Radio
 from vnet.units import NS_PER_MS
 
-END, READY, SLOWLY_READY, ACCESS = range(4)
+END, ACK_END, ACK_TIMEOUT, READY, SLOWLY_READY, ACCESS, ACK_BEGIN = range(7)
 
 _Event = tuple[int, int, int, int, Frame | None]
 """An event: its time in ns, kind, sender, number among the sender's events, and frame."""
@@ -62,7 +71,8 @@ class _Station:
     is. `held` is true while congestion control holds them back; it is polled next at `next_poll_ns`. `contends` is
     true while a frame waits for nothing but the medium. `slots` remain of the backoff, which counts from `from_ns`
     while the medium is idle and is frozen while it is `busy` at this sender. `planned` counts the planned events;
-    of the planned accesses only the one numbered `access` is valid.
+    of the planned accesses only the one numbered `access` is valid. `awaiting` is the frame for whose
+    acknowledgement it waits, `acking` the one that it acknowledges.
     """
 
     node: int
@@ -78,6 +88,8 @@ class _Station:
     busy: bool = False
     planned: int = 0
     access: int = 0
+    awaiting: Frame | None = None
+    acking: Frame | None = None
 
     @property
     def access_ns(self) -> int:
@@ -86,23 +98,47 @@ class _Station:
 
 
 class EdcaParameters(NamedTuple):
-    """Parameters of an access category: the interframe space AIFS in ns, and the largest backoff in slots."""
+    """Parameters of an access category: the interframe space AIFS in ns, and the largest backoff in slots.
+
+    `max_window` is the largest backoff of a frame that is transmitted again.
+    """
 
     aifs_ns: int
     window: int
+    max_window: int
+
+    def window_after(self, attempts: int) -> int:
+        """Return the largest backoff in slots after so many attempts without an acknowledgement."""
+        return min((self.window + 1 << attempts) - 1, self.max_window)
 
 
 def edca_parameters(mac: Mac) -> EdcaParameters:
     """Return the parameters of the access category that a scenario configures."""
     aifsn, window = AIFSN_AND_CW[mac.access_category]
-    return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window)
+    return EdcaParameters(SIFS_NS + aifsn * SLOT_NS, window, MAX_WINDOW[mac.access_category])
 
 
 class Csma:
-    """MAC of `count` vehicles that share one medium; see the module's docstring."""
+    """MAC of `count` vehicles that share one medium; see the module's docstring.
+
+    The engine sets what is decided outside of the MAC: `judge` notes in a frame that ends who could read it,
+    `next_copy` numbers the copies of a sender's frame, `is_up` tells of vehicles that are up, and
+    `acknowledged` is called when the acknowledgement of a frame begins, or reaches its sender.
+    """
+
+    judge: Callable[[Frame], None]
+    next_copy: Callable[[int, int], int]
+    is_up: Callable[[int], bool]
+    acknowledged: Callable[[Frame], None]
 
     def __init__(self, mac: Mac, radio: Radio, signals: Signals, count: int, seed: int) -> None:
-        self._aifs_ns, self._window = edca_parameters(mac)
+        self._edca = edca_parameters(mac)
+        self._aifs_ns = self._edca.aifs_ns
+        self.has_eifs = mac.eifs
+        """True if vehicles wait for EIFS after broadcasts, too."""
+        self._deferral = Deferral(count) if mac.eifs else None
+        self._count = count
+        self.unicasts = Unicasts(least_latency_ns(radio))
         self._signals = signals
         self._jitter_ns = radio.access_jitter_ms * NS_PER_MS
         self._limit = radio.queue_frames
@@ -126,9 +162,9 @@ class Csma:
 
     def enqueue(self, frame: Frame) -> None:
         """Take a frame; it is ready after its access jitter, and not before the sender's earlier frames."""
-        station = self._stations.get(frame.sender)
-        if station is None:
-            station = self._stations[frame.sender] = _Station(frame.sender)
+        station = self._station(frame.sender)
+        if frame.attempt and self._deferral is None:
+            self._deferral = Deferral(self._count)
         frame.signal = self._signals.of(frame)
         ready_ns = frame.sent_ns
         if self._jitter_ns:
@@ -148,6 +184,12 @@ class Csma:
             else:
                 station.coming += 1
                 self._plan(station.ready_ns, READY, station, frame)
+
+    def _station(self, node: int) -> _Station:
+        station = self._stations.get(node)
+        if station is None:
+            station = self._stations[node] = _Station(node)
+        return station
 
     def _is_full(self, station: _Station) -> bool:
         return station.coming + len(station.queue) >= self._limit
@@ -196,6 +238,9 @@ class Csma:
         elif kind == END:
             assert frame is not None
             self._end(station, frame, now_ns)
+        elif kind in (ACK_BEGIN, ACK_END, ACK_TIMEOUT):
+            assert frame is not None
+            self._exchange(kind, station, frame, now_ns)
         elif kind == SLOWLY_READY and self._is_full(station):
             assert frame is not None
             self._leave(frame, Outcome.queue_full, now_ns)
@@ -207,7 +252,7 @@ class Csma:
         """Process a frame that is ready, or (None) poll the sender's congestion control again."""
         if frame is not None:
             station.queue.append(frame)
-        if station.queue and not station.contends and not station.on_air:
+        if station.queue and not station.contends and not station.on_air and station.awaiting is None:
             self._contend(station, now_ns)
 
     def _passes_congestion_control(self, station: _Station, congestion: CongestionControl, now_ns: int) -> bool:
@@ -236,7 +281,8 @@ class Csma:
     def _contend(self, station: _Station, now_ns: int) -> None:
         """Plan the transmission of a station's first frame as early as the access rules allow."""
         congestion = self._congestion
-        if congestion is not None and not self._passes_congestion_control(station, congestion, now_ns):
+        is_retry = station.queue[0].attempt > 1
+        if not (congestion is None or is_retry or self._passes_congestion_control(station, congestion, now_ns)):
             return
         station.contends = True
         node = station.node
@@ -251,16 +297,27 @@ class Csma:
         if station.busy and noticed_ns <= now_ns:
             station.slots = self._draw(station.queue[0], BACKOFF)
             return
-        free_ns = int(self.medium.idle_ns[node]) + self._aifs_ns
+        free_ns = self._free_ns(node, int(self.medium.idle_ns[node]))
+        if self._deferral is not None and not station.busy and self._deferral.reserved_ns(node) > now_ns:
+            station.slots, station.from_ns = self._draw(station.queue[0], BACKOFF), free_ns
+            self._plan(station.access_ns, ACCESS, station)
+            return
         station.from_ns = free_ns + SLOT_NS * max(0, (now_ns - free_ns) // SLOT_NS + 1)
         if not station.busy or station.from_ns < noticed_ns:
             self._plan(station.from_ns, ACCESS, station)
 
-    def _draw(self, frame: Frame, which: int) -> int:
-        return int(sender_draw(frame, which) * (self._window + 1))
+    def _draw(self, frame: Frame, which: int, attempts: int = 0) -> int:
+        return int(sender_draw(frame, which) * (self._edca.window_after(attempts) + 1))
+
+    def _free_ns(self, node: int, idle_ns: int) -> int:
+        """Return when AIFS is over at a vehicle whose medium is idle since `idle_ns`."""
+        return (idle_ns if self._deferral is None else self._deferral.until_ns(node, idle_ns)) + self._aifs_ns
 
     def _begin(self, station: _Station, now_ns: int) -> None:
         """Start to transmit a station's first frame."""
+        if station.acking is not None:  # which it does not sense: its own transmission ends before it counts on
+            station.slots, station.busy, station.access = 0, True, 0
+            return
         frame = station.queue.popleft()
         station.contends, station.on_air = False, True
         self._counting.pop(station.node, None)
@@ -273,16 +330,87 @@ class Csma:
         self._update_backoffs(now_ns)
 
     def _end(self, station: _Station, frame: Frame, now_ns: int) -> None:
-        """End a transmission; its sender draws a backoff before its next frame."""
+        """End a transmission; its sender draws a backoff before its next frame, or waits for an acknowledgement."""
         station.on_air = False
         self.medium.end(frame, now_ns)
         self._leave(frame, Outcome.pending, now_ns)
-        station.slots = self._draw(frame, NEXT_BACKOFF)
-        station.busy, station.from_ns = self.medium.is_sensed(station.node), now_ns + self._aifs_ns
+        if frame.attempt or self.has_eifs:
+            self._hear(frame, now_ns)
+        if not frame.attempt:
+            self._back_off(station, frame, now_ns)
+            return
+        station.awaiting = frame
+        if frame.decoded is not None and frame.decoded[frame.to]:
+            self._plan(now_ns + SIFS_NS, ACK_BEGIN, self._station(frame.to), frame)
+        self._plan(now_ns + ACK_TIMEOUT_NS, ACK_TIMEOUT, station, frame)
+        self._update_backoffs(now_ns)
+
+    def _hear(self, frame: Frame, now_ns: int) -> None:
+        """Decide who could read a frame that ends, and how long others therefore keep silent."""
+        assert self._deferral is not None
+        self.judge(frame)
+        self._deferral.hear(frame, now_ns)
+
+    def _back_off(self, station: _Station, frame: Frame, now_ns: int, attempts: int = 0) -> None:
+        """Draw a backoff after a frame, which had so many attempts without an acknowledgement."""
+        station.slots = self._draw(frame, NEXT_BACKOFF, attempts)
+        station.busy, station.from_ns = self.medium.is_sensed(station.node), self._free_ns(station.node, now_ns)
         self._counting[station.node] = station
         self._update_backoffs(now_ns)
         if station.queue:
             self._contend(station, now_ns)
+
+    # Acknowledgements.
+
+    def _exchange(self, kind: int, station: _Station, frame: Frame, now_ns: int) -> None:
+        """Process what follows a frame to one vehicle: the acknowledgement begins, ends, or has not come."""
+        if kind == ACK_BEGIN:
+            if self.is_up(station.node) and not station.on_air and station.acking is None:
+                self._begin_ack(station, frame, now_ns)
+        elif kind == ACK_END:
+            self._end_ack(station, frame, now_ns)
+        elif station.awaiting is frame and not self._is_hearing_ack(station, frame):
+            self._conclude(station, frame, now_ns)
+
+    def _begin_ack(self, station: _Station, frame: Frame, now_ns: int) -> None:
+        station.acking, frame.ack = frame, acknowledgement_of(frame)
+        frame.ack.signal = self._signals.of(frame.ack)
+        frame.ack.on_air_ns = now_ns
+        self.acknowledged(frame)
+        self.medium.begin(frame.ack, now_ns)
+        self._plan(now_ns + airtime_ns(frame.ack.size_bytes, frame.ack.bitrate_mbps), ACK_END, station, frame)
+        self._update_backoffs(now_ns)
+
+    def _is_hearing_ack(self, station: _Station, frame: Frame) -> bool:
+        """Return true if the sender of a frame receives its acknowledgement, which decides when it ends."""
+        return frame.ack is not None and bool(self.medium.locked(frame.ack)[station.node])
+
+    def _end_ack(self, station: _Station, frame: Frame, now_ns: int) -> None:
+        assert frame.ack is not None
+        station.acking, frame.ack.end_ns = None, now_ns
+        self.medium.end(frame.ack, now_ns)
+        self._hear(frame.ack, now_ns)
+        sender = self._stations[frame.sender]
+        if sender.awaiting is not frame:
+            self._update_backoffs(now_ns)
+            return
+        assert frame.ack.decoded is not None
+        frame.acked = bool(frame.ack.decoded[frame.sender])
+        self.acknowledged(frame)
+        self._conclude(sender, frame, now_ns)
+
+    def _conclude(self, station: _Station, frame: Frame, now_ns: int) -> None:
+        """End an attempt: tell its result, or transmit the frame again after a longer backoff."""
+        station.awaiting = None
+        attempts = 0
+        if frame.acked or frame.attempt >= MOST_ATTEMPTS:
+            self.unicasts.finish(frame, now_ns)
+        else:
+            attempts = frame.attempt
+            retry = retry_of(frame, self.next_copy(frame.sender, frame.seq))
+            retry.signal = self._signals.of(retry)
+            station.queue.appendleft(retry)
+        self._back_off(station, frame, now_ns, attempts)
 
     def _update_backoffs(self, now_ns: int) -> None:
         """Update every backoff after the medium changed: freeze, resume or end it."""
@@ -296,7 +424,7 @@ class Csma:
                 continue
             station.busy = busy
             if not busy:
-                station.from_ns = now_ns + self._aifs_ns
+                station.from_ns = self._free_ns(station.node, now_ns)
                 if station.contends:
                     self._plan(station.access_ns, ACCESS, station)
                 continue

@@ -25,8 +25,10 @@ SIFS_NS = 32_000
 DETECTION_NS = 4_000
 """Time until a signal is detected: 802.11 allows 8 µs in 10 MHz, ns-3 uses 4."""
 AIFSN_AND_CW = {"VO": (2, 3), "VI": (3, 7), "BE": (6, 15), "BK": (9, 15)}
-"""AIFSN and CWmin of the access categories outside a basic service set (802.11-2020, table 9-156). Broadcasts are
-never retried, so the contention window never grows."""
+"""AIFSN and CWmin of the access categories outside a basic service set (802.11-2020, table 9-156)."""
+MAX_WINDOW = {"VO": 7, "VI": 15, "BE": 1023, "BK": 1023}
+"""CWmax of the access categories (the same table). Only frames that are acknowledged are sent again, with a larger
+contention window."""
 
 # Bit rate in Mbit/s: bits a subcarrier, numerator and denominator of the code rate (table 17-4).
 _MODES = {
@@ -81,7 +83,7 @@ def airtimes_ns(radio: Radio, size_bytes: NDArray[np.int64], bitrate_mbps: Array
 def abilities_of(radio: Radio) -> RadioAbilities:
     """Return what programs may choose for a frame with this radio."""
     power_dbm = None if radio.path_loss is None else radio.path_loss.tx_power_dbm
-    return RadioAbilities(power_dbm, RATES_MBPS if radio.is_physical else ())
+    return RadioAbilities(power_dbm, RATES_MBPS if radio.is_physical else (), radio.mac is not None)
 
 
 def cost(snr: Array, bitrate_mbps: float) -> NDArray[np.int64]:

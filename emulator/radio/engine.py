@@ -11,7 +11,6 @@ after it has been sent, over all frames at once that have been sent since the la
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,16 +21,16 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
 from emulator.radio.byte_flips import flipped
+from emulator.radio.choices import Choices, allowed_choices
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.csma import Csma
-from emulator.radio.frames import Frame, Receptions, Stage
+from emulator.radio.frames import BROADCAST, Frame, Receptions, Stage
 from emulator.radio.in_flight import NO_ARRIVAL_NS, Deliveries, Delivery, InFlight
 from emulator.radio.link_faults import LinkFaults
 from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
-from emulator.radio.propagation import DIGITS
 from emulator.radio.reception import Reception
 from emulator.radio.sender_faults import Outgoing, SenderFaults
 from emulator.radio.signals import Signals
@@ -47,11 +46,11 @@ from emulator.radio.stages import (
 )
 from emulator.radio.topology import Topology
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
-from emulator.scenario.radio import RATES_MBPS
+from emulator.radio.unicast import Result, address, address_all
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
-from vnet.radio import MIN_POWER_DBM, SendOptions
+from vnet.radio import SendOptions
 from vnet.types import IntArray
 
 NO_OPTIONS: Mapping[int, SendOptions] = {}
@@ -91,6 +90,9 @@ class Engine:
             Csma(radio.mac, radio, signals, count, seed) if radio.mac is not None and signals is not None else None
         )
         self._mac: Mac = self._csma or TransmitQueue(seed, radio)
+        if self._csma is not None:
+            self._csma.judge, self._csma.next_copy = self._judge, self._next_copy
+            self._csma.is_up, self._csma.acknowledged = self._topology.is_up, self._acknowledged
         self._rules = rules or OwnRules(seed, node_ids)
         self._rules.tx_power_dbm = radio.path_loss.tx_power_dbm if radio.path_loss is not None else None
         self._links = LinkFaults(seed, self._mac, count, self._rules)
@@ -109,8 +111,9 @@ class Engine:
         self._trace = Trace(node_ids, self._csma is not None, knows_power=radio.path_loss is not None)
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
-        self._choices = self._default_choices = 0.0, radio.bitrate_mbps
-        """Power above the scenario's in dB, and bit rate in Mbit/s, of the frame that is enqueued."""
+        self._choices = self._default_choices = Choices(0.0, radio.bitrate_mbps)
+        """Choices for the frame that is enqueued."""
+        self._number = {node: number for number, node in enumerate(node_ids)}
         self._copies: Counter[tuple[int, int]] = Counter()
         self._in_flight = InFlight(len(node_ids))
         self.on_payload: Callable[[int, int, int, bytes], None] | None = None
@@ -140,6 +143,8 @@ class Engine:
     def set_up(self, node: int, up: bool) -> None:
         """Set a node up or down. A node that is down sends nothing; what arrives there is `receiver_down`."""
         self._topology.set_up(node, up)
+        if not up and self._csma is not None:
+            self._csma.unicasts.forget(node)
 
     def set_faults(self, active: Sequence[PlannedFault], time_ns: int) -> None:
         """Let exactly these faults act from `time_ns` on. Receptions in flight are not affected."""
@@ -170,7 +175,9 @@ class Engine:
         self._mac.run(time_ns)
         self._topology.advance(time_ns)
         for index, payload in enumerate(payloads):
-            self._choices = self._allowed(options[index]) if index in options else self._default_choices
+            self._choices = self._default_choices
+            if index in options and not self._choose(time_ns, node, options[index]):
+                continue
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
             if self.on_payload is not None:
@@ -182,12 +189,27 @@ class Engine:
             for outgoing in self._senders.frames(time_ns, node, seq, payload):
                 self._enqueue(time_ns, node, outgoing)
 
+    def _choose(self, time_ns: int, node: int, options: SendOptions) -> bool:
+        """Take the choices for the next frame; returns false for one to nobody, which is not sent."""
+        self._choices = allowed_choices(self._radio, options)
+        if self._choices != self._default_choices:
+            self._trace.begin_choices(self._radio.bitrate_mbps)
+        if options.to is None or self._csma is None:
+            return options.to is None
+        to = self._number.get(options.to, BROADCAST)
+        if to in (node, BROADCAST):
+            self._csma.unicasts.refuse(node, options.number, time_ns)
+            return False
+        ticket = self._csma.unicasts.register(node, options.number)
+        self._choices = self._choices._replace(to=to, ticket=ticket)
+        self._trace.acknowledges = True
+        return True
+
     def _frame(self, time_ns: int, node: int, outgoing: Outgoing) -> Frame:
-        gain_db, bitrate_mbps = self._choices
         return Frame(
             sender=node,
-            bitrate_mbps=bitrate_mbps,
-            gain_db=gain_db,
+            bitrate_mbps=(choices := self._choices).bitrate_mbps,
+            gain_db=choices.gain_db,
             seq=outgoing.seq,
             sent_ns=time_ns,
             size_bytes=len(outgoing.payload),
@@ -198,20 +220,10 @@ class Engine:
             payload=outgoing.payload,
             name=outgoing.alias or self._node_ids[node],
             cause=outgoing.cause,
+            to=choices.to,
+            attempt=int(choices.to != BROADCAST),
+            ticket=0 if outgoing.copy else choices.ticket,
         )
-
-    def _allowed(self, options: SendOptions) -> tuple[float, float]:
-        """Return the power above the scenario's in dB and the bit rate of a frame, as far as the radio has them."""
-        gain_db, bitrate_mbps = self._default_choices
-        radio = self._radio
-        if options.power_dbm is not None and radio.path_loss is not None and math.isfinite(options.power_dbm):
-            power_dbm = max(options.power_dbm, MIN_POWER_DBM)
-            gain_db = round(min(power_dbm - radio.path_loss.tx_power_dbm, 0.0), DIGITS)
-        if radio.is_physical and options.rate_mbps in RATES_MBPS:
-            bitrate_mbps = float(options.rate_mbps or bitrate_mbps)
-        if (gain_db, bitrate_mbps) != self._default_choices:
-            self._trace.begin_choices(radio.bitrate_mbps)
-        return gain_db, bitrate_mbps
 
     def _enqueue(self, time_ns: int, node: int, outgoing: Outgoing) -> None:
         frame = self._frame(time_ns, node, outgoing)
@@ -233,7 +245,24 @@ class Engine:
             receptions = Receptions.of(frames, len(self._node_ids))
             for stage in self.chain:
                 stage(frames, receptions)
+            if self._csma is not None:
+                address_all(frames, receptions, self._csma)
             self._book(frames, receptions)
+
+    def _judge(self, frame: Frame) -> None:
+        """Decide the receptions of a frame that ends now, or of an acknowledgement, which has no rows."""
+        if self._mac.sent:
+            self._settle()
+        if frame.decoded is None:
+            receptions = Receptions.of([frame], len(self._node_ids))
+            for stage in self.chain[:-2]:  # without latency
+                stage([frame], receptions)
+            if self._csma is not None:
+                address(frame, receptions.outcome[0], self._csma.medium.locked(frame), receptions.cause[0])
+
+    def _acknowledged(self, frame: Frame) -> None:
+        assert frame.ack is not None
+        self._trace.acknowledge(frame.row, frame.ack.on_air_ns, frame.acked)
 
     def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Append the receptions in range to the trace, and put the pending ones in flight."""
@@ -241,9 +270,14 @@ class Engine:
         for (number, column), flips in receptions.flips.items():
             frames[number].altered[int(receivers[number, column])] = flipped(frames[number].payload, flips)
         near = receptions.outcome != OUT_OF_RANGE
+        for number, frame in enumerate(frames):
+            if frame.attempt:  # its row stands also if nobody could receive it
+                near[number, frame.to] = True
         each = np.count_nonzero(near, axis=1)
         receiver = receivers[near]
-        self._counts[Outcome.out_of_range] += len(frames) * (len(self._node_ids) - 1) - len(receiver)
+        broadcasts = [number for number, frame in enumerate(frames) if not frame.attempt]
+        near_ones = int(each[broadcasts].sum())
+        self._counts[Outcome.out_of_range] += len(broadcasts) * (len(self._node_ids) - 1) - near_ones
         self._enter(
             frames, each, receiver, receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
         )
@@ -273,6 +307,8 @@ class Engine:
         columns = dict(zip(_COLUMNS, np.array([_OF_FRAME(frame) for frame in frames], np.int64).T, strict=True))
         if self._trace.chooses:
             columns.update(zip(CHOSEN, np.array([_CHOICES(frame) for frame in frames]).T, strict=True))
+        if self._trace.acknowledges:
+            columns["attempt"] = np.array([frame.attempt for frame in frames])
         digests = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
         frame_index = np.repeat(np.arange(len(frames)), each)
         powers_db = None
@@ -282,6 +318,7 @@ class Engine:
             {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns, powers_db
         )
         for number, frame in enumerate(frames):
+            frame.row = first + int(each[: number + 1].sum()) - 1 if frame.attempt else -1
             for node, payload in frame.altered.items():
                 for row in np.flatnonzero((frame_index == number) & (receiver == node)).tolist():
                     self._trace.alter(first + row, payload_digest(payload))
@@ -312,7 +349,7 @@ class Engine:
         return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
     def look_ahead(self, time_ns: int, nodes: Sequence[int] | IntArray) -> None:
-        """Process the events of the MAC up to `time_ns`, or up to the first arrival at one of these nodes.
+        """Process the events of the MAC up to `time_ns`, the first arrival at one of these nodes, or a result.
 
         The caller guarantees that no frame is enqueued before that.
         """
@@ -321,12 +358,25 @@ class Engine:
         until_ns = self._first_ns(time_ns, nodes)
         while (next_ns := self._csma.next_ns()) is not None and next_ns < until_ns:
             self._csma.step()
-            if self._csma.sent:
+            if self._csma.sent or self._csma.unicasts.are_open:
                 until_ns = self._first_ns(time_ns, nodes)
 
     def _first_ns(self, time_ns: int, nodes: Sequence[int] | IntArray) -> int:
-        """Return `time_ns`, or the first arrival at one of these nodes if that is earlier."""
-        return min(time_ns, int(self.next_arrivals_ns()[nodes].min())) if len(nodes) else time_ns
+        """Return `time_ns`, or the first arrival at one of these nodes or the first result if that is earlier."""
+        first_ns = min(time_ns, int(self.next_arrivals_ns()[nodes].min())) if len(nodes) else time_ns
+        result_ns = self.next_result_ns()
+        return first_ns if result_ns is None else min(first_ns, result_ns)
+
+    def next_result_ns(self) -> int | None:
+        """Return the time of the next result of a frame to a single vehicle, as far as it is known, or None."""
+        if self._csma is None or not self._csma.unicasts.are_open:
+            return None
+        self._settle()
+        return self._csma.unicasts.next_ns()
+
+    def take_results(self, time_ns: int) -> list[Result]:
+        """Remove and return the results up to `time_ns` of frames to single vehicles, in order."""
+        return [] if self.next_result_ns() is None or self._csma is None else self._csma.unicasts.take(time_ns)
 
     def pending_rows(self) -> list[int]:
         """Return the row numbers of the trace whose receptions are in flight."""

@@ -22,6 +22,8 @@ NO_CAUSE = -1
 """Number of the causing fault, if there is none."""
 NOT_ON_AIR = -1
 """Start of the transmission of a frame that was never transmitted, or whose start is not modelled."""
+BROADCAST = -1
+"""Addressee of a frame to all."""
 
 
 @dataclass(slots=True, eq=False)
@@ -45,7 +47,7 @@ class Signal:
 
 @dataclass(slots=True, eq=False)
 class Frame:
-    """One broadcast. `sender` is a node's number; `seq` counts the sender's frames.
+    """One transmission. `sender` is a node's number; `seq` counts the sender's frames.
 
     `copy` counts the times that a fault sends the frame again. Such a copy has rows and random draws of its own:
     `draw` distinguishes its draws from the original's, and depends only on the fault and on the repeated frame. Its
@@ -55,9 +57,15 @@ class Frame:
 
     `topology` and `effects` are those of the time it was enqueued. `sender_outcome` is decided at the sender:
     oversize, queue_full, held_back, fault (a rule dropped it), or pending for a frame that is sent. The frame is
-    on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`. `altered` are the payloads that arrive
-    with other bytes, by receiver. `answers` are those of rules of the user's own, by fault, with the columns that
-    they speak of.
+    on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`.
+
+    `to` is the number of its addressee, or BROADCAST; then it is transmission number `attempt`, from 1 on, and
+    `row` is its row of the trace, and `ticket` names what its program waits for. `was_received` says that an
+    earlier attempt was. `decoded` marks the vehicles (N,) that could read this one, `garbled` those that could not,
+    although they were locked on it. `ack` is its acknowledgement, and `acked` says that its sender received that.
+
+    `altered` are the payloads that arrive with other bytes, by receiver. `answers` are those of rules of the user's
+    own, by fault, with the columns that they speak of.
     """
 
     sender: int
@@ -77,6 +85,15 @@ class Frame:
     on_air_ns: int = NOT_ON_AIR
     end_ns: int = 0
     signal: Signal | None = None
+    to: int = BROADCAST
+    attempt: int = 0
+    row: int = -1
+    was_received: bool = False
+    ticket: int = 0
+    decoded: NDArray[np.bool_] | None = None
+    garbled: NDArray[np.bool_] | None = None
+    ack: Frame | None = None
+    acked: bool = False
     altered: dict[int, bytes] = field(default_factory=dict)
     answers: dict[int, tuple[NDArray[np.intp], Answered]] = field(default_factory=dict)
 

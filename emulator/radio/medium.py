@@ -102,6 +102,11 @@ class Medium:
             taken |= known.locked
         signal.locked = self._threshold.detects(signal.power_mw, total_mw) & ~taken
 
+    def locked(self, frame: Frame) -> NDArray[np.bool_]:
+        """Return the mask (N,) of the receivers that are locked on a frame, or were until it ended."""
+        signal = _signal(frame)
+        return signal.power_mw >= self._threshold.alone_mw if signal.locked is None else signal.locked
+
     def end(self, frame: Frame, time_ns: int) -> None:
         """End the transmission of a frame."""
         self.count(time_ns)

@@ -75,7 +75,10 @@ class Outcome(IntEnum):
         1,
         Facts(meaning="it arrived, at `arrival_ns`", stage=Stage.ARRIVAL, colour="green", sign="█"),
     )
-    out_of_range = 2, Facts(meaning="counted in `verdict.json`, and has no row")
+    out_of_range = (
+        2,
+        Facts(meaning="counted in `verdict.json`, and has no row, but for a frame to this vehicle alone"),
+    )
     peer_cap = (
         3,
         Facts(
@@ -157,6 +160,14 @@ class Outcome(IntEnum):
             colour="navy",
             sign="▦",
             is_possible=lambda scenario, vehicles: scenario.radio.congestion is not None,
+        ),
+    )
+    duplicate = (
+        13,
+        Facts(
+            meaning="it was received before: its sender has missed the acknowledgement, and sent it again",
+            stage=Stage.RECEPTION,
+            is_possible=lambda scenario, vehicles: scenario.radio.mac is not None,
         ),
     )
 

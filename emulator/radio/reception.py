@@ -75,8 +75,8 @@ class Reception:
     def powers_db(self, frames: Sequence[Frame], frame_index: IntArray, receiver: IntArray) -> Array:
         """Return received powers in dBm, and their ratios to noise and interference in dB, as an array (2, n).
 
-        `frame_index` and `receiver` (n,) name the receptions, which are in range. Interference is averaged over the
-        payload. Both are NaN for a frame that was not sent.
+        `frame_index` and `receiver` (n,) name the receptions. Interference is averaged over the payload. Both are
+        NaN for a frame that was not sent, and out of range.
         """
         own_mw, others_mw = np.full((2, len(frames), self._signals.count), np.nan)
         for index, frame in enumerate(frames):
@@ -85,6 +85,7 @@ class Reception:
                 own_mw[index] = signal.power_mw
                 others_mw[index] = self._threshold.noise_mw + self._interference_mw(frame, signal)
         power_mw = own_mw[frame_index, receiver]
+        power_mw[power_mw == 0] = np.nan
         return np.asarray(10 * np.log10([power_mw, power_mw / others_mw[frame_index, receiver]]))
 
     def _interference_mw(self, frame: Frame, signal: Signal) -> Array | float:

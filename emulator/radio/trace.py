@@ -41,8 +41,13 @@ _FRAME = np.dtype(
         ("copy", "<i2"),
         ("gain_db", "<f8"),
         ("bitrate_mbps", "<f8"),
+        ("attempt", "<i2"),
+        ("ack_on_air_ns", "<i8"),
+        ("acked", "?"),
     ]
 )
+ACKNOWLEDGED = ("attempt", "ack_on_air_ns", "acked")
+"""Columns of the trace where programs send frames to single vehicles."""
 CHOSEN = ("gain_db", "bitrate_mbps")
 """Columns of the trace where programs choose powers or bit rates."""
 _RECEPTION = np.dtype(
@@ -79,6 +84,7 @@ UNKNOWN_POWER = -(1 << 15)
 """Power of a reception of a frame that was never on air."""
 UNHASHED = ("rssi_dbm", "snr_db")
 """Columns that the hash leaves out. What decides a reception is in others, and powers have been added later."""
+_NULLABLE = ("arrival_ns", "on_air_ns", "ack_on_air_ns")
 _NAMED = ("sender", "receiver", "outcome", "cause")
 
 
@@ -131,6 +137,8 @@ class Trace:
         self.knows_power = knows_power
         self.chooses = False
         """True if a program has chosen a power or a bit rate."""
+        self.acknowledges = False
+        """True if a program has sent a frame to a single vehicle."""
         self._altered: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -176,6 +184,11 @@ class Trace:
         if not self.chooses:
             self.chooses = True
             self._frames.records["bitrate_mbps"] = bitrate_mbps
+
+    def acknowledge(self, row: int, ack_on_air_ns: int, acked: bool) -> None:
+        """Set when the acknowledgement of the frame of a row began, and whether its sender received it."""
+        frame = self._receptions.records["frame"][row]
+        self._frames.records["ack_on_air_ns"][frame], self._frames.records["acked"][frame] = ack_on_air_ns, acked
 
     def powers(self, rows: IntArray) -> tuple[list[float], list[float]]:
         """Return received powers in dBm, and their ratios to noise and interference in dB, of rows (n,)."""
@@ -224,7 +237,9 @@ class Trace:
         With `[radio.mac]` there are two more columns: `on_air_ns`, the start of a frame's transmission (null if it
         never started), and `left_ns`, the time at which it ended or the frame was dropped. With a path loss there
         are `rssi_dbm` and `snr_db`, null for a frame that was never on air. Where programs have chosen a power or a
-        bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`.
+        bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`. Where they have
+        sent frames to single vehicles, there are `attempt` (0 for a broadcast), `ack_on_air_ns`, the start of the
+        acknowledgement (null without one), and `acked`, whether the sender received that.
         """
         rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -238,6 +253,7 @@ class Trace:
 
         times = ("arrival_ns", "on_air_ns")
         chosen = self._frames.records[self._receptions.records["frame"][order]] if self.chooses else None
+        exchanged = self._frames.records[self._receptions.records["frame"][order]] if self.acknowledges else None
         powers = self._powers.records[order] if self.knows_power else None
         arrival, on_air = (pa.array(rows[name], mask=rows[name] == NOT_ARRIVING) for name in times)
         return pa.table(
@@ -254,6 +270,7 @@ class Trace:
                 "copy": pa.array(rows["copy"]),
                 **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
                 **({} if chosen is None else {name: pa.array(chosen[name]) for name in CHOSEN}),
+                **({} if exchanged is None else _exchanges(exchanged)),
                 **({} if powers is None else {name: _in_db(powers[name]) for name in UNHASHED}),
             }
         )
@@ -265,6 +282,13 @@ class Trace:
     def write(self, path: Path) -> None:
         """Write the trace as Parquet. Raise OSError if the file cannot be written."""
         pq.write_table(self.to_table(), path, compression="zstd")
+
+
+def _exchanges(frames: NDArray[np.void]) -> dict[str, pa.Array]:
+    """Return the columns `ACKNOWLEDGED` of rows, from their frames (n,)."""
+    began_ns = frames["ack_on_air_ns"]
+    columns = pa.array(frames["attempt"]), pa.array(began_ns, mask=began_ns == 0), pa.array(frames["acked"])
+    return dict(zip(ACKNOWLEDGED, columns, strict=True))
 
 
 def _in_db(power: NDArray[np.int16]) -> pa.Array:
@@ -280,7 +304,7 @@ def sha256_of_table(table: pa.Table) -> str:
             codes, names = _canonical_codes(array)
             digest.update(json.dumps([column, names]).encode())
         else:
-            filled = pc.fill_null(array, NOT_ARRIVING) if column in ("arrival_ns", "on_air_ns") else array
+            filled = pc.fill_null(array, NOT_ARRIVING) if column in _NULLABLE else array
             codes = filled.to_numpy(zero_copy_only=False)
             digest.update(json.dumps([column]).encode())
         digest.update(np.ascontiguousarray(codes, dtype=codes.dtype.newbyteorder("<")).tobytes())

@@ -1,8 +1,8 @@
 """Radio metrics of a run: packet delivery ratio, also against distance, inter-packet gap, age of information,
 latency; by link (a sender and a receiver), by vehicle and over all, from a run's trace and states.
 
-A pair is a frame, as its sender handed it over, and a receiver in range that was up. What faults send again, or let
-arrive again, is not counted. A link is in *contact* from one frame to the next unless frames in between were no
+A pair is a broadcast, as its sender handed it over, and a receiver in range that was up. What faults send again, or
+let arrive again, is not counted. A link is in *contact* from one frame to the next unless frames in between were no
 pairs (out of range, receiver down) or one of the two was not in the network; times between receptions, and ages,
 are those within contacts.
 """
@@ -123,7 +123,8 @@ def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M, has_busy: bool = 
 
 
 def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
-    rows = np.flatnonzero((recorded.copy == 0) & ~recorded.outcome_is("receiver_down"))
+    original = (recorded.copy == 0) & (recorded.attempt == 0)
+    rows = np.flatnonzero(original & ~recorded.outcome_is("receiver_down"))
     link = recorded.sender[rows] * count + recorded.receiver[rows]
     if (np.diff(recorded.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
         order = np.argsort(link.astype(np.uint16) if count <= 256 else link, kind="stable")
@@ -131,7 +132,7 @@ def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
         order = np.lexsort((recorded.seq[rows], link))
     rows, link = rows[order], link[order]
     seq, sent_ns = recorded.seq[rows], recorded.sent_ns[rows]
-    breaks = (np.diff(link) != 0) | (np.diff(seq) != 1)
+    breaks = (np.diff(link) != 0) | (np.diff(seq - _unicasts_before(recorded, recorded.sender[rows], seq)) != 1)
     if recorded.moves:
         breaks |= _was_away(recorded, recorded.sender[rows], sent_ns)
         breaks |= _was_away(recorded, recorded.receiver[rows], sent_ns)
@@ -139,6 +140,14 @@ def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
     distance_m = recorded.places.pair_distances_m(recorded.sender[rows], recorded.receiver[rows], sent_ns)
     delivered = recorded.outcome_is("delivered")[rows]
     return _Pairs(link, seq, sent_ns, recorded.arrival_ns[rows], delivered, distance_m, contact)
+
+
+def _unicasts_before(recorded: RecordedRun, sender: NDArray[np.intp], seq: IntArray) -> IntArray:
+    """Number (n,) of the frames to single vehicles that these senders sent before their frames of these numbers."""
+    rows = (recorded.copy == 0) & (recorded.attempt > 0)
+    most = int(recorded.seq.max(initial=0)) + 1
+    sent = np.sort(recorded.sender[rows] * most + recorded.seq[rows])
+    return np.asarray(np.searchsorted(sent, sender * most + seq) - np.searchsorted(sent, sender * most))
 
 
 def _was_away(recorded: RecordedRun, node: NDArray[np.intp], sent_ns: IntArray) -> Mask:

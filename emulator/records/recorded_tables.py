@@ -169,6 +169,27 @@ class RecordedTables:
         return np.asarray(self.trace[name].to_numpy(), dtype=np.float64)
 
     @cached_property
+    def attempt(self) -> IntArray:
+        """Number of the transmission of a frame to a single vehicle, from 1 on; 0 for broadcasts."""
+        return self._exchanged("attempt", 0)
+
+    @cached_property
+    def ack_on_air_ns(self) -> IntArray:
+        """Begin of the acknowledgement of each row's frame; -1 without one."""
+        return self._exchanged("ack_on_air_ns", -1)
+
+    @cached_property
+    def acked(self) -> Mask:
+        """Mask of the rows whose frame's sender received an acknowledgement."""
+        return self._exchanged("acked", 0) > 0
+
+    def _exchanged(self, name: str, default: int) -> IntArray:
+        """Return a column that the trace has where frames are sent to single vehicles, or else the default."""
+        if name not in self.trace.column_names:
+            return np.full(len(self.trace), default)
+        return np.asarray(pc.fill_null(self.trace[name].cast(pa.int64()), default).to_numpy(), np.int64)
+
+    @cached_property
     def seq(self) -> IntArray:
         """Sequence number of each row's frame."""
         return self.column("seq")

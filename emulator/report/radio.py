@@ -9,6 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from emulator.pages.page import Table, table
+from emulator.records.unicast_figures import unicast_figures
 from emulator.report.source import Source
 from vnet.errors import VnetError
 
@@ -66,6 +67,8 @@ def radio_section(source: Source) -> RadioSection | str:
         for title, (name, unit) in TOTALS.items()
         if (value := metrics.totals[name]) is not None
     }
+    if (unicast := unicast_figures(source.recorded)) is not None:
+        totals["frames to one vehicle"] = str(unicast)
     vehicles = metrics.vehicles.sort_by([("heard_delivery_ratio", "ascending"), ("node", "ascending")])
     tables = _listed("By vehicle, the lowest packet delivery ratio (PDR) first", vehicles, VEHICLES)
     return RadioSection(totals, tables | _listed("The worst links", metrics.worst_links(MOST_ROWS), LINKS))

@@ -140,6 +140,8 @@ class Mac(Section):
     """Access category of EDCA; it sets the interframe space and the contention window."""
     carrier_sense_dbm: float = Field(-85.0, ge=-300, le=100)
     """Total received power from which the medium is busy."""
+    eifs: bool = False
+    """True if vehicles wait for EIFS also after broadcasts that they could not decode."""
 
 
 class EtsiReactive(Section):

@@ -25,6 +25,7 @@ from vnet.errors import WireError
 from vnet.reports import Report
 from vnet.transport import keys, wire
 from vnet.transport.orders import Deviation, Order
+from vnet.transport.send_results import WireSendResult
 
 PAGE = Layouts()
 OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}
@@ -46,6 +47,7 @@ PARTS = {
     "Fix": wire.WireFix,
     "ClockError": wire.ClockError,
     "BusyRatios": wire.BusyRatios,
+    "SendResult": WireSendResult,
 }
 welcomes = st.builds(
     wire.Welcome,
@@ -190,7 +192,7 @@ def test_an_agent_that_knows_nothing_of_exceptions_is_understood() -> None:
 def test_a_reader_that_is_told_nonsense_says_so() -> None:
     assert "Hello.pid" in PAGE.problem_of("Hello", ["v01", "v01", b"n", "1", "here", False, None, 2, True])
     assert "not 9 values" in PAGE.problem_of("Hello", ["v01"])
-    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, 1, [], [], [], 0, [], None, []])
+    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, 1, [], [], [], 0, [], None, [], []])
     assert "Lateness.counts" in PAGE.problem_of("Lateness", [[0] * 79])
     assert "Scene: fields" in PAGE.problem_of("Scene", {"name": "a run"})
 

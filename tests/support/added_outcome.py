@@ -16,7 +16,7 @@ from tests.support.paths import ROOT
 
 MEMBER = """
     jammed = (
-        13,
+        14,
         Facts(
             meaning="an interferer was on the air",
             stage=Stage.RECEPTION,

@@ -107,7 +107,7 @@ class RunAhead:
     def _may_pass(self, next_timer_ns: int | None) -> bool:
         """Return whether the process may go on to its next instant beyond the window by itself."""
         wake_ns = self._wake_ns(next_timer_ns)
-        listens = any(node.radio.inbox.waiting for node in self._host.nodes.values())
+        listens = any(node.radio.inbox.waiting or node.radio.is_sending for node in self._host.nodes.values())
         return wake_ns is not None and wake_ns < self._quiet_ns and not listens
 
     def _wake_ns(self, next_timer_ns: int | None) -> int | None:

@@ -187,3 +187,9 @@ def suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
         coroutine = coroutine.cr_await
+
+
+async def all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
+    """Wait until tasks are done, and retrieve no exception: whether a program does is what matters."""
+    if tasks:
+        await asyncio.wait(tasks)

@@ -32,6 +32,7 @@ from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
 from vnet.runtime.programs import Program, Programs, error_line
+from vnet.runtime.send_results import SendResults
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
@@ -78,6 +79,7 @@ class Host:
         self._orders = {welcome.node: welcome.order for welcome in welcomes}
         self.mail = MailDelivery(self.nodes, self._clocks)
         self.busy = MeasuredBusyRatios([*self.nodes], clock)
+        self.results = SendResults(self.nodes.__getitem__)
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
@@ -95,7 +97,7 @@ class Host:
             max_payload=welcome.max_payload,
             incarnation=welcome.incarnation,
             control_ns=welcome.control_ns,
-            abilities=RadioAbilities(welcome.max_power_dbm, welcome.rates_mbps),
+            abilities=RadioAbilities(welcome.max_power_dbm, welcome.rates_mbps, welcome.acknowledges),
             disk=partial(self._disks.of, welcome.node),
         )
 
@@ -184,6 +186,7 @@ class Host:
         gone.disconnect()
         self._active[node] = False
         self._window.drop(node)
+        self.results.drop(node)
         if killed:
             self._unhandled.silence(gone)
             self._killed[gone] = self._tasks_of(gone)
@@ -253,6 +256,7 @@ class Host:
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
         self.busy.add(grant.busy)
+        self.results.add(grant.results)
         self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 
@@ -264,6 +268,7 @@ class Host:
         self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
+        next_ns = self.results.first_ns(self._paused, next_ns)
         if window.has_packets:
             awaiting = {id for id, node in self.nodes.items() if self._active[id] and node.radio.inbox.waiting}
             next_ns = min(next_ns, window.first_packet_ns(awaiting - self._paused))
@@ -276,6 +281,7 @@ class Host:
         packets = self._window.take_packets(time_ns, self._paused)
         due = {node: some for node, some in packets.items() if self._active[node]}
         self.mail.deliver(Mail(due, fixes), time_ns)
+        self.results.settle(time_ns, self._paused)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""
@@ -373,7 +379,7 @@ class Host:
         with contextlib.suppress(LoopAbandonedError, SpinError):
             while True:
                 try:
-                    loop.finish(_all_done(tasks))
+                    loop.finish(asyncio_internals.all_done(tasks))
                     break
                 except SystemExit as leave:
                     self.end_exited(leave)
@@ -440,8 +446,3 @@ class Host:
 def _owner(handle: asyncio.Handle) -> Node | None:
     """The node on whose behalf a callback is scheduled."""
     return asyncio_internals.context_of(handle).get(current_node)
-
-
-async def _all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:
-    if tasks:
-        await asyncio.wait(tasks)  # which retrieves no exception: whether a program does is what matters

@@ -21,6 +21,7 @@ from vnet.node import Fix
 from vnet.radio import Packet
 from vnet.reports import Report
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
+from vnet.transport.send_results import WireSendResult
 
 VERSION = 2
 """Version of the messages. 2: a grant is for a window, and a yield has steps."""
@@ -86,12 +87,17 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
-    """One broadcast that `node` enqueues, with the scenario's power and bit rate where it has none of its own."""
+    """One frame that `node` enqueues, with the scenario's power and bit rate where it has none of its own.
+
+    It is a broadcast, or addressed `to` one node; then `number` counts such frames of the sender.
+    """
 
     node: str
     payload: bytes
     power_dbm: float | None = None
     rate_mbps: float | None = None
+    to: str | None = None
+    number: Count = 0
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
@@ -246,6 +252,7 @@ class Welcome(Message, frozen=True):
     control_ns: Count = 0
     max_power_dbm: float | None = None
     rates_mbps: Sequence[float] = ()
+    acknowledges: bool = False
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):
@@ -282,7 +289,8 @@ class Grant(Message, frozen=True):
 
     `time_ns` is the first instant at which the process has something to do. `packets` are those that arrive before
     the end, each at its `received_ns`; `fixes` are due at the first instant. `clocks` are the clock errors that
-    have changed, `busy` the channel busy ratios of the window if vehicles share a medium.
+    have changed, `busy` the channel busy ratios of the window if vehicles share a medium,
+    `results` those of frames to single nodes, each at its `time_ns`.
 
     Instants before `quiet_ns` may be passed beyond the window as long as they are quiet; `next_fixes`, at
     `next_fixes_ns`, belong to such an instant. They are given only to processes that have said `ahead`.
@@ -298,6 +306,7 @@ class Grant(Message, frozen=True):
     next_fixes: Sequence[WireFix] = ()
     next_fixes_ns: TimeNs | None = None
     busy: Sequence[BusyRatios] = ()
+    results: Sequence[WireSendResult] = ()
 
 
 class Batch(Message, frozen=True):
@@ -316,6 +325,7 @@ class Batch(Message, frozen=True):
     held: bool = False
     clocks: Sequence[ClockError] = ()
     busy: Sequence[BusyRatios] = ()
+    results: Sequence[WireSendResult] = ()
 
 
 class StackRequest(Message, frozen=True):

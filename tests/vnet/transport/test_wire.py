@@ -11,6 +11,7 @@ from vnet.node import Fix
 from vnet.reports import Report
 from vnet.transport import wire
 from vnet.transport.orders import Deviation
+from vnet.transport.send_results import WireSendResult
 
 times = st.integers(min_value=0, max_value=2**62)
 names = st.text(min_size=1, max_size=8)
@@ -37,7 +38,8 @@ reports = st.builds(
     st.none() | st.tuples(reals, reals, reals, reals),
     st.dictionaries(names, reals | st.lists(reals, max_size=4), max_size=3),
 )
-frames = st.builds(wire.Frame, names, st.binary(max_size=64), powers, powers)
+frames = st.builds(wire.Frame, names, st.binary(max_size=64), powers, powers, st.none() | names, times)
+results = st.lists(st.builds(WireSendResult, names, times, times, st.booleans(), times), max_size=2)
 actions = st.builds(Action, names, st.none() | st.floats(-1e6, 1e6), st.integers(-1, 1))
 endings = st.builds(wire.Ending, names, st.sampled_from(["finished", "crashed", "spun"]), names, names)
 unhandled = st.builds(wire.Unhandled, names, st.none() | times, names, names, names)
@@ -96,6 +98,7 @@ emulator_messages = st.one_of(
         st.lists(fixes, max_size=2),
         st.none() | times,
         busy,
+        results,
     ),
     st.builds(
         wire.Batch,
@@ -107,6 +110,7 @@ emulator_messages = st.one_of(
         st.booleans(),
         clocks,
         busy,
+        results,
     ),
     st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.StackRequest()),
