@@ -93,8 +93,8 @@ class Buildings(Section):
     2011): `wall_db` for each outer wall on the straight way, and `inside_db_per_m` for each metre inside."""
 
     path: Path | None = None
-    """Outlines, relative to the scenario file: OpenStreetMap's XML or PBF, GeoJSON, or CSV in metres with the
-    columns building, x_m, y_m, a row for each corner. Those of the file of `[map]` if left out."""
+    """Outlines, relative to the scenario file: OpenStreetMap's XML or PBF, GeoJSON, SUMO's `.poly.xml`, or CSV in
+    metres with the columns building, x_m, y_m, a row for each corner. Those of the file of `[map]` if left out."""
     origin_deg: OriginDeg | None = None
     """Latitude and longitude of x = y = 0 m, if the file is in degrees, and neither map nor trips say it."""
     wall_db: float = Field(9.0, ge=0, le=300)

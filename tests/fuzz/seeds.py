@@ -258,6 +258,7 @@ OSM_BUILDING = b"""<osm version="0.6"><node id="1" lat="42.28" lon="-83.74"/>
 <tag k="building" v="yes"/></way></osm>
 """
 BUILDINGS = b"building,x_m,y_m\na,0,0\na,9,0\na,9,9\nb,20,0\nb,29,0\nb,29,9\nb,20,0\n"
+SUMO_POLYGONS = b"""<additional><poly id="1" type="building" shape="0,0 9,0 9,9"/></additional>"""
 LINK_TABLE = b"time_s,sender,receiver,loss\n0,a,b,0.5\n0,b,a,0\n1.5,a,b,\n"
 POLYGON = (
     b'{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"building": "yes"}, '

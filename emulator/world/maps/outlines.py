@@ -1,4 +1,4 @@
-"""Outlines of buildings in files: OpenStreetMap, GeoJSON, and corners in metres as CSV.
+"""Outlines of buildings in files: OpenStreetMap, GeoJSON, SUMO's polygons, and corners in metres as CSV.
 
 OpenStreetMap's are closed ways and multipolygons with the tag `building`, GeoJSON's the polygons that have it as a
 property; `building=no` is none. Courts are rings of their own.
@@ -20,6 +20,7 @@ from emulator.world.csv_file import check_columns, number_within, open_csv
 from emulator.world.maps.geojson import check_on_earth, read_collection
 from emulator.world.maps.osm import osm_errors
 from emulator.world.maps.roads import MAX_POINTS
+from emulator.world.maps.sumo import read_sumo_polygons
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame
 from vnet.errors import ScenarioError, shown
@@ -41,12 +42,16 @@ def read_buildings(path: Path, frame: Callable[[], Frame]) -> Buildings:
     ending = path.suffix.lower()
     if ending == ".csv":
         return Buildings.of(_some(path, _read_csv(path)))
+    if path.name.lower().endswith(".poly.xml"):
+        return Buildings.of(_some(path, [[np.array(corners)] for corners in read_sumo_polygons(path)]))
     if ending in (".osm", ".pbf"):
         found = _read_osm(path)
     elif ending in (".geojson", ".json"):
         found = _read_geojson(path)
     else:
-        raise ScenarioError(f"{path}: no buildings are read from it; allowed are *.csv, *.osm, *.pbf, *.geojson")
+        raise ScenarioError(
+            f"{path}: no buildings are read from it; allowed are *.csv, *.osm, *.pbf, *.geojson, *.poly.xml"
+        )
     return _projected(path, Buildings.of(_some(path, found)), frame())
 
 

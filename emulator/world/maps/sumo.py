@@ -1,4 +1,4 @@
-"""SUMO road networks (.net.xml): the lanes that passenger cars may use, each as a road of its own.
+"""SUMO road networks (.net.xml), the lanes that passenger cars may use, each as a road of its own; and polygons.
 
 Files are read by expat as a stream, within bounds. SUMO's own reader (sumolib) cannot name lines in its errors, and
 expands all entities that a file declares; here a file that declares any is refused. Coordinates remain SUMO's, so
@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from emulator.world.buildings import LEAST_CORNERS
 from emulator.world.maps.classes import MAX_LANE_WIDTH_M, MIN_LANE_WIDTH_M, NUMBER, UNKNOWN
 from emulator.world.maps.roads import MAX_POINTS, Roads, RoadsBuilder
 from emulator.world.networks import MAX_COORDINATE_M
@@ -160,6 +161,38 @@ class _Reader:
         if self._points_left < 0:
             raise self.wrong(f"more than {MAX_POINTS} points; cut out a part first")
         return points
+
+
+class _Polygons(_Reader):
+    """Handlers for a file of polygons, as polyconvert writes it."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.buildings: list[list[tuple[float, float]]] = []
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth == 1 and name not in ("additional", "shapes"):
+            raise self.wrong(f"<{printable(name)}>: a file of SUMO's polygons starts with <additional>")
+        if name != "poly" or not attributes.get("type", "").startswith("building"):
+            return
+        where = f"poly {printable(attributes.get('id', ''))}"
+        if attributes.get("geo", "0") in ("1", "true", "yes"):
+            raise self.wrong(f"{where}: geo = {attributes['geo']}: polygons in metres are needed")
+        points = self._points(attributes.get("shape", ""), f"{where}: shape")
+        if len(set(points)) < LEAST_CORNERS:
+            raise self.wrong(f"{where}: shape: three corners or more are needed")
+        self.buildings.append(points[:-1] if points[0] == points[-1] else points)
+
+
+def read_sumo_polygons(path: Path) -> list[list[tuple[float, float]]]:
+    """Return the corners in metres of each polygon whose type begins with `building`.
+
+    Raise ScenarioError, naming the line, for a bad file.
+    """
+    reader = _Polygons(path)
+    reader.read()
+    return reader.buildings
 
 
 def _for_cars(lane: dict[str, str]) -> bool:

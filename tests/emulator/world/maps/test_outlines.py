@@ -90,6 +90,20 @@ def test_geojson_has_polygons_that_are_buildings(tmp_path: Path) -> None:
     assert rings(found) == [house_m, court_m, court_m, house_m]
 
 
+def polygons(*rows: str) -> str:
+    return (
+        '<?xml version="1.0"?>\n<additional>\n' + "\n".join(f"<poly {row}/>" for row in rows) + "\n</additional>\n"
+    )
+
+
+def test_sumo_has_polygons_in_metres(tmp_path: Path) -> None:
+    path = tmp_path / "town.poly.xml"
+    house = 'id="1" type="building.school" color="1,0,0" shape="20,10 50.0,10 50,40,3.5 20,40 20,10"'
+    path.write_text(polygons(house, 'id="2" type="landuse" shape="0,0 1,1 2,0"'))
+    found = read_buildings(path, lambda: pytest.fail("no degrees"))
+    assert rings(found) == [[list(p) for p in HOUSE]] and len(found.corner_m) == 4
+
+
 def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
     path = tmp_path / "b.csv"
     path.write_text(CSV + "hut,60,10\nhut,70,10\nhut,70,20\nhut,60,10\n")
@@ -120,6 +134,23 @@ def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
         ("b.osm", osm_xml(), "no buildings in it"),
         ("b.osm", "<osm", "not an OpenStreetMap file"),
         ("b.geojson", collection(), "no buildings in it"),
+        (
+            "b.poly.xml",
+            polygons('id="a" type="building" shape="0,0 1,1 0,0"'),
+            "line 3: poly a: shape: three",
+        ),
+        (
+            "b.poly.xml",
+            polygons('id="a" type="building" geo="1" shape="0,0"'),
+            "line 3: poly a: geo = 1: polygons",
+        ),
+        (
+            "b.poly.xml",
+            polygons('id="a" type="building" shape="0,x"'),
+            "line 3: poly a: shape: '0,x': x,y",
+        ),
+        ("b.poly.xml", sumo_net(), "line 2: <net>: a file of SUMO's polygons starts with <additional>"),
+        ("b.poly.xml", polygons(), "no buildings in it"),
         ("b.net.xml", sumo_net(), r"no buildings are read from it; allowed are \*.csv"),
         (
             "b.geojson",
