@@ -32,7 +32,7 @@ ACK_TIMEOUT_NS = SIFS_NS + SLOT_NS + PREAMBLE_NS
 """Time from the end of a frame until its acknowledgement must have begun to be received."""
 EIFS_NS = SIFS_NS + airtime_ns(ACK_BYTES, BASIC_RATES_MBPS[0])
 """Time for which AIFS begins later after a frame that was received in error: EIFS - DIFS."""
-IN_ERROR = np.array([Outcome.faded.value, Outcome.collided.value, Outcome.lost.value])
+IN_ERROR = (Outcome.faded.value, Outcome.collided.value, Outcome.lost.value)
 """Outcomes after which a receiver that was locked on the frame waits for EIFS."""
 _ACK_DRAW, _ATTEMPT_BITS, _SENDER_BITS = 1 << 62, 48, 40
 """Places of what distinguishes the random draws of attempts and acknowledgements."""
@@ -192,7 +192,10 @@ def address(frame: Frame, outcome: NDArray[np.uint8], locked: Mask, cause: NDArr
     the vehicles whose receivers were locked on the frame.
     """
     frame.decoded = outcome == Outcome.pending.value
-    frame.garbled = locked & np.isin(outcome, IN_ERROR)
+    in_error = np.zeros(len(outcome), bool)
+    for each in IN_ERROR:
+        in_error |= outcome == each
+    frame.garbled = locked & in_error
     if frame.to == BROADCAST:
         return
     others = np.arange(len(outcome)) != frame.to

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.ns3 import buildings
+from benchmarks.ns3 import acknowledged, buildings
 from benchmarks.ns3.compare import BUSY_LIMIT, CURVE_LIMIT, LEAST_PAIRS, Comparison
 from benchmarks.ns3.figure import draw
 from benchmarks.ns3.ground import RATE_HZ, Curve, Outcome, ScheduleConstraints
@@ -18,6 +18,7 @@ from tests.support.paths import ROOT
 
 SECONDS = 60.0
 RECORDED = json.loads((ROOT / "benchmarks" / "ns3" / "recorded.json").read_text())
+ACKNOWLEDGED = json.loads((ROOT / "benchmarks" / "ns3" / "acknowledged.json").read_text())
 
 
 def curve(pairs: list[int], share: list[float]) -> Curve:
@@ -94,3 +95,25 @@ def test_buildings_cut_the_same_rays_as_in_ns3_where_it_is_installed(capsys: pyt
         assert "apt-get install" in capsys.readouterr().err
         pytest.skip("ns-3 is not installed, which Debian's libns3-dev is for")
     assert (status, capsys.readouterr().out) == (0, "19,900 rays: 12,026 cut in ns-3, 12,026 in vnet; 0 differ\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [1, 3, 6])
+def test_frames_to_one_vehicle_fare_as_in_ns3(number: int) -> None:
+    recorded = ACKNOWLEDGED[number]
+    case = acknowledged.Case(**recorded["case"])
+    found = acknowledged.Comparison(
+        case, acknowledged.Exchange(**recorded["theirs"]), acknowledged.our_exchange(case, 2.0)
+    )
+    assert found.holds, found.row()
+
+
+def test_an_exchange_agrees_only_within_its_limits() -> None:
+    case, theirs = acknowledged.Case(2, 0.0), acknowledged.Exchange(0.9, 2.0, 1000.0)
+    for figures, holds in (
+        ((0.905, 2.05, 1020.0), True),
+        ((0.92, 2.0, 1000.0), False),
+        ((0.9, 2.2, 1000.0), False),
+        ((0.9, 2.0, 950.0), False),
+    ):
+        assert acknowledged.Comparison(case, theirs, acknowledged.Exchange(*figures)).holds is holds
