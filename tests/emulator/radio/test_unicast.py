@@ -60,6 +60,7 @@ def rows_of(subject: Engine) -> list[dict[str, Any]]:
     return subject.trace.to_table().to_pylist()
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(sends, radios, st.integers(0, 1000), st.lists(st.integers(0, 60 * MS), max_size=12))
 def test_every_frame_ends_and_is_delivered_at_most_once(
@@ -99,6 +100,7 @@ def test_every_frame_ends_and_is_delivered_at_most_once(
         assert result.delivered or result.attempts in (0, MOST_ATTEMPTS)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(st.sampled_from([*AIFSN_AND_CW]), st.integers(0, 10_000))
 def test_the_window_doubles_until_the_largest(category: str, seed: int) -> None:
@@ -117,6 +119,7 @@ def test_the_window_doubles_until_the_largest(category: str, seed: int) -> None:
     assert result.time_ns == last_ns + LATENCY_NS
 
 
+@pytest.mark.slow
 def test_windows_are_drawn_evenly() -> None:
     subject = engine(line(0, 5000), 7, **{**PHYSICAL, "queue_frames": 500})
     transmit(subject, [(0, 0, 1)] * 200)
@@ -172,6 +175,7 @@ def test_who_cannot_decode_a_broadcast_waits_longer_only_if_asked_to(eifs: bool)
     assert rest == 0 and 0 <= slots <= 15
 
 
+@pytest.mark.slow
 def test_a_lost_acknowledgement_has_the_frame_sent_again_and_delivered_once() -> None:
     subject = engine(line(0, 50), 3, **{**PHYSICAL, "loss": 0.5})
     results = transmit(subject, [(0, 0, 1)] * 40)
