@@ -18,8 +18,20 @@ if TYPE_CHECKING:
     from emulator.radio.own_rules import RadioFrame
     from emulator.radio.rule_answers import Answer
     from emulator.report.notebook import Run
+    from emulator.world.own_sensors import SensedTruth
 
-__all__ = ["Answer", "Moment", "RadioFrame", "Result", "Run", "environment", "run", "simulate", "sweep"]
+__all__ = [
+    "Answer",
+    "Moment",
+    "RadioFrame",
+    "Result",
+    "Run",
+    "SensedTruth",
+    "environment",
+    "run",
+    "simulate",
+    "sweep",
+]
 
 _PUBLIC = {
     "Answer": "emulator.radio.rule_answers",
@@ -27,6 +39,7 @@ _PUBLIC = {
     "RadioFrame": "emulator.radio.own_rules",
     "Result": "emulator.checks.own",
     "Run": "emulator.report.notebook",
+    "SensedTruth": "emulator.world.own_sensors",
     "environment": "emulator.learning.environment",
     "run": "emulator.api",
     "simulate": "emulator.api",

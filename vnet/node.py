@@ -8,8 +8,9 @@ estimates. The source of the packets (lockstep or real time, one process or fift
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -36,6 +37,10 @@ LEVELS = ("debug", "info", "warning", "error", "critical")
 """Levels of a line of a node's log."""
 
 
+NOTHING_SENSED: Mapping[str, float | tuple[float, ...]] = MappingProxyType({})
+"""Readings of a vehicle without sensors of the scenario's own."""
+
+
 @dataclass(frozen=True, slots=True)
 class Fix:
     """One GNSS fix: position (2,) in m east-north, covariance (2, 2) in m², heading in radians or None.
@@ -44,7 +49,8 @@ class Fix:
     heading where the scenario says so, for example while the vehicle stands. `speed_m_s` is the vehicle's own speed
     as its receiver measures it, with noise; None if the emulator does not tell it. Where `[world.ranging]` says
     so, driven vehicles measure at the same instant `gap_m`, the clear distance to the vehicle ahead in their lane,
-    and its rate of change `gap_rate_m_s`, negative while it closes; None where nobody is ahead in range.
+    and its rate of change `gap_rate_m_s`, negative while it closes; None where nobody is ahead in range. `sensors`
+    has what sensors of the scenario's own (`[world.sensor.NAME]`) read at that instant, by their names.
     """
 
     time_ns: int
@@ -54,6 +60,7 @@ class Fix:
     speed_m_s: float | None = None
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
+    sensors: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: NOTHING_SENSED)
 
 
 class NodeTransport(RadioTransport, Protocol):

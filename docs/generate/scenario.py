@@ -13,6 +13,7 @@ from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.program import ProgramException
 from emulator.scenario.scenario import Scenario
+from emulator.scenario.world import OwnSensor
 
 INTRODUCTION = """
 A scenario is a TOML file. Every key has a default, so that an empty file is a run; a key that does not exist is
@@ -35,13 +36,15 @@ def page() -> str:
 def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
     """The section at `path` and all below it."""
     if path:
-        yield from _section(f"[{path}]", model, without=("exceptions",))
+        yield from _section(f"[{path}]", model, without=("exceptions", "sensor"))
     for name, kinds in subsections(model).items():
         below = f"{path}.{name}" if path else name
         if len(kinds) == 1:
             yield from _sections(below, kinds[0])
         else:
             yield from _choice(below, key_docstrings(model).get(name, ""), kinds)
+    if path == "world":
+        yield from _section("[world.sensor.NAME]", OwnSensor)
     if path == "program":
         yield from _section("[[program.exceptions]]", ProgramException)
     if not path:

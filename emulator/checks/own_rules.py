@@ -17,16 +17,21 @@ def check_own_rules(recorded: RecordedRun) -> Finding:
     name = "own_rules"
     rules = [fault for fault in recorded.scenario.fault if isinstance(fault, OwnRule)]
     failed = recorded.event("rule_failed")
-    if not rules and not failed:
-        return NotExercised(name, "no rule of your own")
-    text = f"{counted(len(rules), 'rule')} of your own answered every frame"
+    sensors = recorded.scenario.world.sensor
+    if not rules and not sensors and not failed:
+        return NotExercised(name, "no rule and no sensor of your own")
+    answered = [f"{counted(len(rules), 'rule')} of your own answered every frame"] if rules else []
+    answered += [f"{counted(len(sensors), 'sensor')} of your own answered every period"] if sensors else []
+    text = " and ".join(answered)
     broken_text = "; ".join(map(_told, failed))
     return result(name, len(failed), text, broken_text, list(map(_row, failed)), failed=len(failed))
 
 
 def _told(event: Event) -> str:
     said = event.details
-    when = f"at {event.time_ns / NS_PER_S:.3f} s, on a frame of {said.get('sender')}"
+    when = f"at {event.time_ns / NS_PER_S:.3f} s"
+    if (sender := said.get("sender")) is not None:
+        when += f", on a frame of {sender}"
     return f"{said.get('fault')} ({said.get('rule')}) {said.get('error')}, {when}"
 
 

@@ -36,6 +36,7 @@ from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
+from emulator.world.own_sensors import SensorFailure
 from emulator.world.world import Instant, World, components
 from vnet.radio import SendOptions
 from vnet.reports import Report
@@ -97,6 +98,7 @@ class Emulation:
         self._rules = OwnRules(scenario.run.seed, world.node_ids)
         self._rules.load(scenario.fault, scenario.program)
         self._rules.on_failure = self._rule_failed
+        world.own_sensors.on_failure = self._sensor_failed
         self.engine = Engine(
             world.node_ids, scenario.radio, scenario.run.seed, start.position_m, world.radio_inputs, self._rules
         )
@@ -343,6 +345,10 @@ class Emulation:
 
     def _rule_failed(self, failure: RuleFailure) -> None:
         details = {"fault": failure.fault, "rule": failure.rule, "sender": failure.sender, "error": failure.error}
+        self.folder.event(failure.time_ns, "rule_failed", None, **details, where=failure.where)
+
+    def _sensor_failed(self, failure: SensorFailure) -> None:
+        details = {"fault": f"world.sensor.{failure.sensor}", "rule": failure.model, "error": failure.error}
         self.folder.event(failure.time_ns, "rule_failed", None, **details, where=failure.where)
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:

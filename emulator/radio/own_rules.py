@@ -10,7 +10,6 @@ A rule that raises, answers nonsense or does not answer is told once, and then l
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -22,15 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.faults.plan import PlannedFault
-from emulator.radio import rule_watch
 from emulator.radio.byte_flips import flips_between, random_flips
 from emulator.radio.frames import NO_CAUSE, Copied, Frame, Receptions
 from emulator.radio.outcomes import PENDING
 from emulator.radio.propagation import DIGITS
-from emulator.radio.rule_answers import Answer, Answered, NonsenseError, answered_by_link, answered_by_sender
+from emulator.radio.rule_answers import Answer, Answered, answered_by_link, answered_by_sender
 from emulator.radio.topology import TopologySnapshot
+from emulator.scenario import rule_watch
 from emulator.scenario.fault_families import OwnRule
-from emulator.scenario.own_functions import in_words, line_of, load_function, outside
+from emulator.scenario.own_functions import load_function
 from emulator.scenario.program import Program
 from emulator.scenario.random_streams import Draws, frame_stream
 from vnet.errors import shown
@@ -42,8 +41,6 @@ __all__ = ["Answer", "OwnRules", "RadioFrame", "RuleFailure", "RuledLinks"]
 
 T = TypeVar("T")
 Rule = Callable[["RadioFrame", dict[str, Any]], Any]
-WATCHED = (__file__, rule_watch.__file__)
-"""Files of vnet in the traceback of a rule that fails."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +147,7 @@ class OwnRules:
             return None if answer is None else understood(answer)
         except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
             self._failed.add(planned.number)
-            said, where = _told(error)
+            said, where = rule_watch.told(error, __file__)
             self.on_failure(RuleFailure(planned.label, fault.rule, seen.time_ns, seen.sender, said, where))
             return None
 
@@ -273,19 +270,6 @@ def load_rules(faults: Sequence[object], program: Program) -> dict[str, Rule]:
         search_programs_in(program.folders)
     usage = "of a frame and a state: def {}(frame, state)"
     return {entry: load_function("fault.rule", entry, program, usage) for entry in entries}
-
-
-def _told(error: BaseException) -> tuple[str, str]:
-    """Return in one line how a rule failed, with its line, and the traceback from its own module on."""
-    if isinstance(error, NonsenseError):
-        return f"answers {error}", ""
-    frames = outside(error, *WATCHED)
-    said = f"raises {in_words(error)}"
-    if isinstance(error, rule_watch.NoAnswerError):
-        said = f"does not answer within {error}"
-    if frames is None:
-        return said, ""
-    return f"{said} ({line_of(frames)})", "".join(traceback.format_exception(error.with_traceback(frames)))
 
 
 def _fixed(values: Array) -> Array:

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vnet.errors import VnetError, shown
+from emulator.scenario.own_functions import NonsenseError
+from vnet.errors import shown
 from vnet.types import Mask
 from vnet.units import NS_PER_S
 
@@ -48,10 +49,6 @@ class Answered:
     payload: Mapping[int, bytes]
     copies: NDArray[np.int64]
     copy_delay_ns: int
-
-
-class NonsenseError(VnetError):
-    """An answer that is none."""
 
 
 def answered_by_link(answer: Any, receivers: Sequence[str], size_bytes: int) -> Answered:

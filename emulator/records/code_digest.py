@@ -46,12 +46,13 @@ def rule_digests(scenario: Scenario) -> dict[str, str]:
 
 
 def rules_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the entries of all rules of the user's own in a scenario, and of its own network, sorted."""
+    """Return the entries of a scenario's rules, sensors and network of the user's own, sorted."""
     from emulator.scenario.fault_families import OwnRule  # whoever has a scenario has imported it
 
     entries = {fault.rule for fault in scenario.fault if isinstance(fault, OwnRule)}
     network = scenario.network.function
-    return tuple(sorted(entries | ({network} if network else set())))
+    sensors = {sensor.model for sensor in scenario.world.sensor.values()}
+    return tuple(sorted(entries | sensors | ({network} if network else set())))
 
 
 def digests_of(entries: tuple[str, ...], folders: tuple[Path, ...] = ()) -> dict[str, str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from emulator.scenario.fault_families import DEFAULT_RULE, Fault, OwnRule
 from emulator.scenario.program import Program, split_file
+from emulator.scenario.world import WorldSection
 from vnet.errors import ScenarioError, shown
 from vnet.runtime.own_packages import OWN
 
@@ -19,6 +20,7 @@ DEFAULT_FUNCTIONS = {
     "program.checks": "check",
     "fault.rule": DEFAULT_RULE,
     "network.function": "network",
+    "world.sensor.model": "sensor",
 }
 """Functions of a file that is named without one, by key."""
 
@@ -57,6 +59,21 @@ def with_network(program: Program, function: str, base: Path | None, source: str
     found = _Modules(program.folders, base, f"{source}: " if source else "")
     entry = found.entry("network.function", function)
     return program.model_copy(update={"folders": found.folders}), entry
+
+
+def with_sensors(
+    program: Program, world: WorldSection, base: Path | None, source: str
+) -> tuple[Program, WorldSection]:
+    """Return `[program]` with the folders of the models of `[world.sensor]`, and `[world]` with them as modules.
+
+    Raises ScenarioError for a file that is not there.
+    """
+    found = _Modules(program.folders, base, f"{source}: " if source else "")
+    sensors = {
+        name: sensor.model_copy(update={"model": found.entry("world.sensor.model", sensor.model)})
+        for name, sensor in world.sensor.items()
+    }
+    return program.model_copy(update={"folders": found.folders}), world.model_copy(update={"sensor": sensors})
 
 
 class _Modules:

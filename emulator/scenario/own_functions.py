@@ -11,9 +11,13 @@ from types import TracebackType
 from typing import Any
 
 from emulator.scenario.program import Program
-from vnet.errors import ScenarioError, printable
+from vnet.errors import ScenarioError, VnetError, printable
 
 LONGEST_ERROR = 300
+
+
+class NonsenseError(VnetError):
+    """An answer of a function of the user's own that is none."""
 
 
 def load_function(key: str, entry: str, program: Program, usage: str) -> Callable[..., Any]:

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from emulator.scenario.driven import Driven
 from emulator.scenario.faults import AnyFault
 from emulator.scenario.limits import DAY_S, FAR_M
-from emulator.scenario.modules import with_network, with_rules
+from emulator.scenario.modules import with_network, with_rules, with_sensors
 from emulator.scenario.network import Map, Network
 from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
@@ -289,6 +289,9 @@ def scenario_from(
             program, function = with_network(program, function, path.parent, str(path))
             network = scenario.network.model_copy(update={"function": function})
             scenario = scenario.model_copy(update={"network": network})
+        if scenario.world.sensor:
+            program, world = with_sensors(program, scenario.world, path.parent, str(path))
+            scenario = scenario.model_copy(update={"world": world})
     except ScenarioError as error:
         raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
     scenario = scenario.model_copy(update={"program": program, "fault": faults})

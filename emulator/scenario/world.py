@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from emulator.scenario.driven import Driven, Ranging, control_step_ns
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
+from emulator.scenario.program import Entry
 from emulator.scenario.sections import Section
 from vnet.units import NS_PER_S
 
@@ -84,6 +85,19 @@ class Lateral(Section):
     """Correlation time of the offset."""
 
 
+class OwnSensor(Section):
+    """`[world.sensor.NAME]`: a sensor of your own in each vehicle."""
+
+    model: Entry
+    """Function that is called each period with the truth and a state, and returns the readings of vehicles:
+    `FILE.py:function` or `module:function`; a file's is `sensor` if left out."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """Given to the model as `truth.options`; what is allowed is its own business."""
+
+
+SensorName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]{0,39}$")]
+
+
 class WorldSection(Section):
     """`[world]`: the truth that the vehicles never see."""
 
@@ -92,6 +106,8 @@ class WorldSection(Section):
     lateral: Lateral = Lateral()
     ranging: Ranging | None = None
     """Sensor of driven vehicles for the one ahead."""
+    sensor: dict[SensorName, OwnSensor] = Field(default_factory=dict)
+    """Sensors of your own, by name."""
 
 
 def check_driving(driven: Driven, control_hz: float, period_ns: int, world: WorldSection) -> None:

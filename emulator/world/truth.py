@@ -12,12 +12,13 @@ from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import Gnss
 from emulator.world.common_error import common_errors
 from emulator.world.links import load_links
+from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
 from emulator.world.projection import Frame
 from emulator.world.radio_inputs import RadioInputs, load_buildings
 from emulator.world.receivers import MotionSensors, further_error_m, noise_m, speed_mps
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
-from vnet.node import Fix
+from vnet.node import NOTHING_SENSED, Fix
 from vnet.roads.lanes import LaneMap
 from vnet.roads.road_map import RoadMap
 from vnet.types import Array
@@ -96,6 +97,8 @@ class World:
         )
         self._fix_heading_rad = sensors.heading_rad(self._heading_rad, speed)
         self._fix_speed_mps = sensors.speed_mps(speed)
+        self._true_speed_mps = speed
+        self.own_sensors = OwnSensors(scenario.run.seed, scenario.world.sensor, scenario.program)
 
     def present(self, period: int) -> NDArray[np.bool_]:
         """Return the mask (N,) of the vehicles that are present in `period`."""
@@ -150,6 +153,21 @@ class World:
             covariance_m2,
             None if math.isnan(heading_rad) else heading_rad,
             self._fix_speed_mps[period, node].item(),
+            sensors=self.sensed(period, node) if self.own_sensors else NOTHING_SENSED,
+        )
+
+    def sensed(self, period: int, node: int) -> dict[str, Reading]:
+        """Return what the sensors of the user's own in vehicle number `node` read at the start of `period`."""
+        return self.own_sensors.readings(period, self.node_ids[node], self._sensed_truth)
+
+    def _sensed_truth(self, period: int) -> SensedTruth:
+        there = np.flatnonzero(self.present(period))
+        return SensedTruth(
+            time_ns=period * self.period_ns,
+            node_ids=tuple(self.node_ids[number] for number in there.tolist()),
+            position_m=self.course_m[period, there],
+            heading_rad=self._heading_rad[period, there],
+            speed_m_s=self._true_speed_mps[period, there],
         )
 
 

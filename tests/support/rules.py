@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from emulator import Answer, RadioFrame
-from emulator.radio import rule_watch
+from emulator.scenario import rule_watch
 
 State = dict[str, Any]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from vnet.driving import Action
 from vnet.errors import WireError, printable
-from vnet.node import Fix
+from vnet.node import NOTHING_SENSED, Fix
 from vnet.radio import Packet
 from vnet.reports import Report
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
@@ -69,6 +69,7 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
     speed_m_s: float | None = None
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
+    sensors: dict[str, float | tuple[float, ...]] | None = None
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:
@@ -77,13 +78,13 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
         a, b, c, d = fix.covariance_m2.ravel().tolist()
         covariance = (a, b, c, d)
         seen = fix.heading_rad, fix.speed_m_s, fix.gap_m, fix.gap_rate_m_s
-        return cls(node, fix.time_ns, (x, y), covariance, *seen)
+        return cls(node, fix.time_ns, (x, y), covariance, *seen, dict(fix.sensors) or None)
 
     def fix(self) -> Fix:
         """Return the fix as the program sees it."""
         covariance = np.array(self.covariance_m2).reshape(2, 2)
         seen = self.heading_rad, self.speed_m_s, self.gap_m, self.gap_rate_m_s
-        return Fix(self.time_ns, np.array(self.position_m), covariance, *seen)
+        return Fix(self.time_ns, np.array(self.position_m), covariance, *seen, self.sensors or NOTHING_SENSED)
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):

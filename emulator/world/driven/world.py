@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -113,6 +114,7 @@ class DrivenWorld(World):
         self._fix_m[period] = position_m + self._common_m[period] + self._noise_m[period]
         self._fix_heading_rad[rows] = self._sensors.heading_rad(heading_rad[None], speed, rows)
         self._fix_speed_mps[rows] = self._sensors.speed_mps(speed, rows)
+        self._true_speed_mps[rows] = speed
         if self._ranging is not None:
             gap_m, rate_mps = self.vehicles.gaps(self._ranging.range_m)
             noise = self._ranging_normal[period]
@@ -126,8 +128,7 @@ class DrivenWorld(World):
         gap_m = self._gap_m[period, node].item()
         if math.isnan(gap_m):
             return fix
-        seen = fix.heading_rad, fix.speed_m_s, gap_m, self._gap_rate_mps[period, node].item()
-        return Fix(fix.time_ns, fix.position_m, fix.covariance_m2, *seen)
+        return replace(fix, gap_m=gap_m, gap_rate_m_s=self._gap_rate_mps[period, node].item())
 
 
 def _nothing(periods: int, count: int) -> tuple[Array, Array]:

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.drivers.signals import signals_handled
-from emulator.radio import rule_watch
 from emulator.radio.own_rules import OwnRules
+from emulator.scenario import rule_watch
 from emulator.scenario.program import Program
 from emulator.scenario.scenario import Scenario
 from tests.support import rules

@@ -5,7 +5,7 @@ import sys
 
 PROGRAM = """
 import sys
-from emulator.radio import rule_watch
+from emulator.scenario import rule_watch
 
 rule_watch.LIMIT_S = rule_watch.LOOK_EVERY_S = 0.01
 

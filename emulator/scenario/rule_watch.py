@@ -15,10 +15,13 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, TypeVar
+
+from emulator.scenario.own_functions import NonsenseError, in_words, line_of, outside
 
 LIMIT_S = 10.0
 """Processor time of one call: a thousand times what a rule for hundreds of receivers takes."""
@@ -197,3 +200,17 @@ def call_bounded(function: Callable[..., T], *arguments: object) -> T:
     except NoAnswerError:
         _WATCH.end(call)  # it may have been raised while the call ended
         raise
+
+
+def told(error: BaseException, *files: str) -> tuple[str, str]:
+    """Return in one line how a function of the user's own failed, with its line, and the traceback from there on.
+
+    `files` are those of vnet in the traceback, besides this one.
+    """
+    if isinstance(error, NonsenseError):
+        return f"answers {error}", ""
+    frames = outside(error, __file__, *files)
+    said = f"does not answer within {error}" if isinstance(error, NoAnswerError) else f"raises {in_words(error)}"
+    if frames is None:
+        return said, ""
+    return f"{said} ({line_of(frames)})", "".join(traceback.format_exception(error.with_traceback(frames)))

@@ -1,0 +1,138 @@
+"""Sensors of the user's own: what functions make of the truth, once a period, for vehicles to read.
+
+Functions are called period after period, whoever reads first, so that a run is the same in any division into
+processes. One that raises, answers nonsense or does not answer is told once, and then gives no readings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from emulator.scenario import rule_watch
+from emulator.scenario.own_functions import NonsenseError, load_function
+from emulator.scenario.program import Program
+from emulator.scenario.random_streams import frame_stream
+from emulator.scenario.world import OwnSensor
+from vnet.errors import shown
+from vnet.runtime.program_path import search_programs_in
+from vnet.types import Array
+from vnet.units import NS_PER_S
+
+MOST_NUMBERS = 64
+"""Numbers of one reading."""
+USAGE = "of the truth and a state: def {}(truth, state)"
+Reading = float | tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class SensedTruth:
+    """The truth at the start of a period, as the model of a sensor sees it.
+
+    time_ns: emulated time. node_ids: the n vehicles that are present. position_m: (n, 2) in m east-north.
+    heading_rad: (n,), counter-clockwise from east. speed_m_s: (n,). options: those of the scenario. rng: a random
+    generator of this sensor and period, from which nothing else draws. Arrays are copies.
+    """
+
+    time_ns: int
+    node_ids: tuple[str, ...]
+    position_m: Array
+    heading_rad: Array
+    speed_m_s: Array
+    options: Mapping[str, Any] = field(default_factory=dict)
+    rng: np.random.Generator = field(default_factory=np.random.default_rng)
+
+    @property
+    def time_s(self) -> float:
+        """Emulated time in seconds."""
+        return self.time_ns / NS_PER_S
+
+
+@dataclass(frozen=True)
+class SensorFailure:
+    """The failure of a sensor: its name, model, when, what is wrong, and the traceback."""
+
+    sensor: str
+    model: str
+    time_ns: int
+    error: str
+    where: str = ""
+
+
+class OwnSensors:
+    """The sensors of one run, their states and readings. `on_failure` is told of each that fails."""
+
+    def __init__(self, seed: int, sensors: Mapping[str, OwnSensor], program: Program) -> None:
+        """Import the models. Raises ScenarioError for one that cannot be imported."""
+        if sensors:
+            search_programs_in(program.folders)
+        self.on_failure: Callable[[SensorFailure], None] = lambda failure: None
+        self._seed = seed
+        self._sensors = dict(sensors)
+        self._functions = {
+            name: load_function(f"world.sensor.{name}.model", sensor.model, program, USAGE)
+            for name, sensor in sensors.items()
+        }
+        self._states: dict[str, dict[str, Any]] = {name: {} for name in sensors}
+        self._failed: set[str] = set()
+        self._readings: list[dict[str, dict[str, Reading]]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._sensors)
+
+    def readings(self, period: int, node: str, truth: Callable[[int], SensedTruth]) -> dict[str, Reading]:
+        """Return what a vehicle reads in a period, by sensor; `truth` has that of a period, without options."""
+        while len(self._readings) <= period:
+            self._readings.append(self._sense(truth(len(self._readings)), len(self._readings)))
+        return dict(self._readings[period].get(node, {}))
+
+    def _sense(self, truth: SensedTruth, period: int) -> dict[str, dict[str, Reading]]:
+        """Return the readings of a period, by vehicle and sensor."""
+        found: dict[str, dict[str, Reading]] = {}
+        for name in [name for name in self._sensors if name not in self._failed]:
+            for node, reading in self._ask(name, truth, period).items():
+                found.setdefault(node, {})[name] = reading
+        return found
+
+    def _ask(self, name: str, truth: SensedTruth, period: int) -> dict[str, Reading]:
+        sensor = self._sensors[name]
+        seen = replace(
+            truth,
+            position_m=truth.position_m.copy(),
+            heading_rad=truth.heading_rad.copy(),
+            speed_m_s=truth.speed_m_s.copy(),
+            options=deepcopy(sensor.options),
+            rng=frame_stream(self._seed, f"sensor {name}", 0, period),
+        )
+        try:
+            answer = rule_watch.call_bounded(self._functions[name], seen, self._states[name])
+            return _understood(answer, truth.node_ids)
+        except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
+            self._failed.add(name)
+            self.on_failure(SensorFailure(name, sensor.model, truth.time_ns, *rule_watch.told(error, __file__)))
+            return {}
+
+
+def _understood(answer: Any, node_ids: Sequence[str]) -> dict[str, Reading]:
+    """Return readings as plain numbers. Raises NonsenseError."""
+    if not isinstance(answer, Mapping):
+        raise NonsenseError(f"{shown(answer)}: a dict from vehicles to readings is needed")
+    if unknown := [node for node in answer if node not in node_ids]:
+        raise NonsenseError(f"{shown(unknown[0])}: no vehicle that is present")
+    return {node: _reading(node, value) for node, value in answer.items() if value is not None}
+
+
+def _reading(node: str, value: Any) -> Reading:
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.full(1, math.nan)
+    if numbers.ndim > 1 or numbers.size > MOST_NUMBERS or not np.isfinite(numbers).all():
+        needed = f"a finite number, or at most {MOST_NUMBERS} of them, is needed"
+        raise NonsenseError(f"{shown(value)} for {node}: {needed}")
+    return numbers.item() if numbers.ndim == 0 else tuple(numbers.tolist())

@@ -1,0 +1,127 @@
+"""Sensors of the user's own: readings of the truth, the same in any division into processes."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator import SensedTruth
+from emulator.drivers.emulation import Emulation
+from emulator.scenario.scenario import load_scenario
+from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from vnet.errors import ScenarioError
+from vnet.node import NOTHING_SENSED, Fix
+from vnet.transport import wire
+
+HERE = "tests.emulator.world.test_own_sensors"
+
+
+def counts(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
+    """Return the number of the period by the state, and something by chance."""
+    state["period"] = state.get("period", -1) + 1
+    return {node: (state["period"], truth.rng.random()) for node in truth.node_ids}
+
+
+def places(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
+    """Return where each vehicle is, its heading and its speed; the first reads nothing."""
+    rows = np.column_stack([truth.position_m, truth.heading_rad, truth.speed_m_s])
+    return dict(zip(truth.node_ids, rows, strict=True)) | {truth.node_ids[0]: None}
+
+
+def spoils(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
+    """Write to the truth, which must not matter."""
+    truth.position_m[:] = 0
+    truth.options["more"] = 1
+    return {node: len(truth.options) for node in truth.node_ids}
+
+
+def stumbles(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
+    """Raise after half a second."""
+    return dict.fromkeys(truth.node_ids, 1 / (0.5 - truth.time_s))
+
+
+def answers(truth: SensedTruth, state: dict[str, Any]) -> Any:
+    """Return what the options say."""
+    return {"nothing": None, "unknown": {"x99": 1.0}, "text": {"v01": "far"}, "many": {"v01": range(65)}}.get(
+        truth.options["kind"], {"v01": float("nan")}
+    )
+
+
+def scenario(*functions: str, **sections: Any) -> Any:
+    sensor = {name: {"model": f"{HERE}:{name}"} for name in functions}
+    run = {"duration_s": 1.0, "settle_s": 0.0, "seed": 3}
+    return scenario_of(
+        [],
+        "tests.support.sensor_programs:tells",
+        3,
+        **{"run": run, "world": {"gnss": {"rate_hz": 10}, "sensor": sensor}, **sections},
+    )
+
+
+def readings(emulation: Emulation) -> list[tuple[str, int, str, list[float]]]:
+    told = [event for event in emulation.folder.events if event.kind == "event"]
+    said = [(event.node or "", event.time_ns, event.details["details"]) for event in told]
+    return sorted((node, ns, each["sensor"], list(map(float, each["value"].split()))) for node, ns, each in said)
+
+
+def test_programs_read_what_the_function_says_wherever_they_run() -> None:
+    plan = scenario("counts", "places")
+    emulation = run_together(plan)
+    read = readings(emulation)
+    assert readings(run_apart(plan)) == read
+    periods = [(node, time_ns, values[0]) for node, time_ns, sensor, values in read if sensor == "counts"]
+    assert periods == [(f"v0{n}", p * 100_000_000, p) for n in (1, 2, 3) for p in range(10)]
+    assert len({values[1] for _, _, sensor, values in read if sensor == "counts"}) == 30, (
+        "draws of every vehicle and period"
+    )
+    told = {node: values for node, _, sensor, values in read if sensor == "places"}
+    assert told.keys() == {"v02", "v03"}
+    for node, values in told.items():
+        number = emulation.number[node]
+        np.testing.assert_allclose(values[:2], emulation.world.position_m(9)[number])
+
+
+def test_a_function_cannot_change_the_truth() -> None:
+    emulation = run_together(scenario("spoils"))
+    assert {values[0] for *_, values in readings(emulation)} == {1.0}
+    assert np.abs(emulation.world.position_m(0)).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("function", "options", "said"),
+    [
+        ("stumbles", {}, "raises ZeroDivisionError: float division by zero (test_own_sensors.py:"),
+        ("answers", {"kind": "nothing"}, "answers None: a dict from vehicles to readings is needed"),
+        ("answers", {"kind": "unknown"}, "answers 'x99': no vehicle that is present"),
+        ("answers", {"kind": "text"}, "answers 'far' for v01: a finite number, or at most 64 of them, is needed"),
+        ("answers", {"kind": "many"}, "for v01: a finite number, or at most 64 of them, is needed"),
+        ("answers", {"kind": "none"}, "answers nan for v01: a finite number"),
+    ],
+)
+def test_a_sensor_that_fails_is_named_once(function: str, options: dict[str, Any], said: str) -> None:
+    sensor = {"radar": {"model": f"{HERE}:{function}", "options": options}, "other": {"model": f"{HERE}:counts"}}
+    emulation = run_together(scenario(world={"gnss": {"rate_hz": 10}, "sensor": sensor}))
+    (failed,) = [event for event in emulation.folder.events if event.kind == "rule_failed"]
+    assert failed.time_ns == (500_000_000 if function == "stumbles" else 0)
+    assert failed.details["fault"] == "world.sensor.radar"
+    assert said in failed.details["error"]
+    assert len([1 for _, _, name, _ in readings(emulation) if name == "other"]) == 30, "others go on"
+
+
+def test_what_is_no_function_is_said_before_a_run(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text('[world.sensor.radar]\nmodel = "nowhere.py"\n')
+    with pytest.raises(ScenarioError, match=r"world.sensor.model = 'nowhere.py': no such file"):
+        load_scenario(path)
+    path.write_text('[world.sensor."a b"]\nmodel = "nowhere.py"\n')
+    with pytest.raises(ScenarioError, match=r"world\.sensor"):
+        load_scenario(path)
+
+
+def test_readings_pass_the_wire() -> None:
+    fix = Fix(1, np.zeros(2), np.eye(2), None, sensors={"radar": (1.0, 2.5), "heat": 20.0})
+    sent = wire.encode(wire.Grant(0, 1, 2, [], [wire.WireFix.of("v01", fix)]))
+    (again,) = wire.decode_rx(sent).fixes
+    assert again.fix().sensors == fix.sensors
+    assert wire.WireFix.of("v01", Fix(1, np.zeros(2), np.eye(2), None)).fix().sensors is NOTHING_SENSED
