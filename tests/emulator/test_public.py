@@ -46,6 +46,7 @@ def test_the_public_names_are_these_and_no_more() -> None:
         "RadioFrame",
         "Result",
         "Run",
+        "SensedTruth",
         "environment",
         "run",
         "simulate",

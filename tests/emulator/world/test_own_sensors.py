@@ -122,6 +122,8 @@ def test_what_is_no_function_is_said_before_a_run(tmp_path: Path) -> None:
 def test_readings_pass_the_wire() -> None:
     fix = Fix(1, np.zeros(2), np.eye(2), None, sensors={"radar": (1.0, 2.5), "heat": 20.0})
     sent = wire.encode(wire.Grant(0, 1, 2, [], [wire.WireFix.of("v01", fix)]))
-    (again,) = wire.decode_rx(sent).fixes
+    grant = wire.decode_rx(sent)
+    assert isinstance(grant, wire.Grant)
+    (again,) = grant.fixes
     assert again.fix().sensors == fix.sensors
     assert wire.WireFix.of("v01", Fix(1, np.zeros(2), np.eye(2), None)).fix().sensors is NOTHING_SENSED
