@@ -32,7 +32,7 @@ def places(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
 def spoils(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
     """Write to the truth, which must not matter."""
     truth.position_m[:] = 0
-    truth.options["more"] = 1
+    truth.options["more"] = 1  # type: ignore[index]
     return {node: len(truth.options) for node in truth.node_ids}
 
 
