@@ -76,15 +76,14 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
         """Return the fix in its form on the wire."""
         x, y = fix.position_m.tolist()
         a, b, c, d = fix.covariance_m2.ravel().tolist()
-        covariance = (a, b, c, d)
-        seen = fix.heading_rad, fix.speed_m_s, fix.gap_m, fix.gap_rate_m_s
-        return cls(node, fix.time_ns, (x, y), covariance, *seen, dict(fix.sensors) or None)
+        seen = fix.heading_rad, fix.speed_m_s, fix.gap_m, fix.gap_rate_m_s, dict(fix.sensors) or None
+        return cls(node, fix.time_ns, (x, y), (a, b, c, d), *seen)
 
     def fix(self) -> Fix:
         """Return the fix as the program sees it."""
-        covariance = np.array(self.covariance_m2).reshape(2, 2)
-        seen = self.heading_rad, self.speed_m_s, self.gap_m, self.gap_rate_m_s
-        return Fix(self.time_ns, np.array(self.position_m), covariance, *seen, self.sensors or NOTHING_SENSED)
+        position_m, covariance_m2 = np.array(self.position_m), np.array(self.covariance_m2).reshape(2, 2)
+        seen = self.heading_rad, self.speed_m_s, self.gap_m, self.gap_rate_m_s, self.sensors or NOTHING_SENSED
+        return Fix(self.time_ns, position_m, covariance_m2, *seen)
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
