@@ -1,0 +1,117 @@
+"""Run the study of docs/how-to/intersection.md, print its table and draw its figure.
+
+python docs/examples/intersection/figure.py intersection.png --losses 0,0.9 --seeds 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Mapping
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+import emulator
+from vnet.types import Array
+
+SCENARIO = Path(__file__).parent / "crossing.toml"
+CROSSING_M, BEHIND_M, CRUISE_M_S = 1500.0, 50.0, 14.0
+HALF_BOX_M = (4.5 + 1.8) / 2
+"""Two vehicles of crossing roads overlap while both are nearer to the crossing: half a length and half a width."""
+
+
+class Crossing(NamedTuple):
+    """Result of a run: mean delay in s, pairs of vehicles that overlapped on the crossing, vehicles not past."""
+
+    delay_s: float
+    overlaps: int
+    not_past: int
+
+
+def starts(seed: int, vehicles: int) -> list[float]:
+    """Return positions at the start in m: the unit's, then each vehicle's, 65 m apart in the mean."""
+    gaps_m = 15 + np.random.default_rng(seed).exponential(50, (vehicles // 2, 2))
+    return [CROSSING_M, *np.round(1400 - np.cumsum(gaps_m, axis=0), 1).ravel().tolist()]
+
+
+def cross(changes: Mapping[str, object], seed: int, places: list[float]) -> Crossing:
+    """Return the result of a run in which the unit and the vehicles start at `places` in m."""
+    changes = {**changes, "network.driven.start_m": places}
+    with tempfile.TemporaryDirectory() as folder:
+        run = emulator.simulate(SCENARIO, seed=seed, set=changes, out=Path(folder) / "run")
+        table = run.driven
+        crashed = [event.node for event in run.events if event.kind == "crashed"]
+    if table is None or crashed:  # a crashed program's vehicle goes on, and would count as any other
+        raise RuntimeError(f"seed {seed}: programs of {crashed} crashed")
+    count = len(places)
+    time_s = table["time_ns"].to_numpy()[::count] / 1e9
+    along_m = table["along_m"].to_numpy().reshape(-1, count)[:, 1:]
+    return measured(time_s, along_m, np.array(places[1:]))
+
+
+def measured(time_s: Array, along_m: Array, start_m: Array) -> Crossing:
+    """Return delays and overlaps of vehicles (N,), of the two roads in turn, from their positions (K, N)."""
+    is_past = along_m >= CROSSING_M + BEHIND_M
+    past_s = np.where(is_past.any(axis=0), time_s[is_past.argmax(axis=0)], time_s[-1])
+    free_s = (CROSSING_M + BEHIND_M - start_m) / CRUISE_M_S
+    on = np.abs(along_m - CROSSING_M) < HALF_BOX_M
+    pairs = combinations(range(along_m.shape[1]), 2)
+    overlaps = sum(bool((on[:, a] & on[:, b]).any()) for a, b in pairs if (a + b) % 2)
+    return Crossing(float((past_s - free_s).mean()), overlaps, int((~is_past.any(axis=0)).sum()))
+
+
+def main() -> None:
+    """Simulate, print and draw."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("picture")
+    parser.add_argument("--losses", default="0,0.5,0.8,0.9")
+    parser.add_argument("--seeds", type=int, default=4)
+    options = parser.parse_args()
+    losses = [float(text) for text in options.losses.split(",")]
+    seeds = range(1, options.seeds + 1)
+    figure = Figure(figsize=(8.0, 3.4), layout="constrained")
+    both = figure.subplots(1, 2)
+    for waits, colour, name in ((True, "#0072b2", "waits for a grant"), (False, "#d55e00", "without the unit")):
+        settings = [
+            {"radio.loss": loss, "program.options.waits": waits} for loss in (losses if waits else losses[:1])
+        ]
+        figures = np.array(
+            [[cross(changes, seed, starts(seed, 20)) for seed in seeds] for changes in settings], dtype=float
+        )
+        mean, width = figures.mean(axis=1), np.zeros((len(settings), 3))
+        if options.seeds > 1:
+            width = stats.t.ppf(0.975, options.seeds - 1) * stats.sem(figures, axis=1)
+        for changes, row, spread in zip(settings, mean, width, strict=True):
+            shown = [
+                f"{value:.1f}" + (f" ± {wide:.1f}" if options.seeds > 1 else "")
+                for value, wide in zip(row, spread, strict=True)
+            ]
+            label = f"loss {changes['radio.loss']:4.0%}" if waits else name
+            print(f"{label}: delay {shown[0]} s, overlaps {shown[1]}, not past {shown[2]}")
+        for column, axes in enumerate(both):
+            x = np.array(losses) * 100
+            axes.errorbar(
+                x,
+                np.broadcast_to(mean[:, column], x.shape),
+                np.broadcast_to(width[:, column], x.shape),
+                color=colour,
+                marker="o",
+                capsize=3,
+                label=name,
+            )
+    for axes, label in zip(both, ("mean delay (s)", "pairs that overlap on the crossing"), strict=True):
+        axes.set_xlabel("packet loss (%)")
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+    both[0].legend()
+    figure.savefig(options.picture, dpi=110, metadata={"Software": None})
+
+
+if __name__ == "__main__":
+    main()
