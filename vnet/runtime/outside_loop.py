@@ -24,12 +24,21 @@ Taker = Callable[[Node, BaseException, str], bool]
 
 
 class _Collector:
-    """Knows whether the garbage collector runs; registered once for the whole process."""
+    """Knows whether the garbage collector runs in the present thread; registered once for the whole process.
 
-    runs = False
+    What a collection discards may give way to other threads. What they raise meanwhile is not of its finding.
+    """
+
+    def __init__(self) -> None:
+        self._thread: int | None = None
 
     def __call__(self, phase: str, info: dict[str, int]) -> None:
-        self.runs = phase == "start"
+        self._thread = threading.get_ident() if phase == "start" else None
+
+    @property
+    def runs(self) -> bool:
+        """True in the thread that collects, while it does."""
+        return self._thread == threading.get_ident()
 
 
 collector = _Collector()

@@ -163,10 +163,10 @@ class UnhandledExceptions:
         self._failures[id(future)] = _Failure(weakref.ref(future), self._now_ns(owner), owner, place)
 
     def _forget_retrieved(self) -> None:
-        futures = {key: failure.future() for key, failure in self._failures.items()}
+        futures = {key: failure.future() for key, failure in list(self._failures.items())}
         for key, future in futures.items():
             if future is None or not asyncio_internals.is_unretrieved(future):
-                del self._failures[key]
+                self._failures.pop(key, None)  # a collection in another thread may have told of it
         self._most = 2 * len(self._failures) + FIRST_CLEANING
 
     def _unhandled(self, context: dict[str, Any]) -> bool:

@@ -197,6 +197,48 @@ def test_what_the_collector_finds_is_left_to_python() -> None:
     assert exceptions(emulation) == []
 
 
+class WaitsWhenDiscarded:
+    """Part of a cycle; a collection that finds it goes on once it may."""
+
+    def __init__(self, found: threading.Event, may_go_on: threading.Event) -> None:
+        self.itself, self.found, self.may_go_on = self, found, may_go_on
+
+    def __del__(self) -> None:
+        self.found.set()
+        self.may_go_on.wait(60)
+
+
+async def fails_while_a_thread_collects(node: Node) -> None:
+    found, may_go_on = threading.Event(), threading.Event()
+
+    def collect() -> None:
+        gc.disable()  # or another thread's collection finds it
+        try:
+            WaitsWhenDiscarded(found, may_go_on)
+            gc.collect()
+        finally:
+            gc.enable()
+
+    await asyncio.sleep(0.5)
+    thread = threading.Thread(target=collect)
+    thread.start()
+    assert found.wait(60)
+    loop = asyncio.get_running_loop()
+    loop.call_soon(int, "x")
+    loop.call_soon(may_go_on.set)
+    loop.call_soon(thread.join)
+    await sends(node)
+
+
+def test_what_fails_while_another_thread_collects_is_told_at_once() -> None:
+    """It counts although the vehicle is killed later; what a collection has found by then does not."""
+    kill = {"kind": "kill", "at_s": 1.0, "duration_s": 9.0, "nodes": {"ids": ["v01"]}}
+    emulation = run_together(scenario_of([kill], entry(fails_while_a_thread_collects), vehicles=1))
+    assert [(event.node, event.time_ns) for event in emulation.folder.events if event.kind == "exception"] == [
+        ("v01", 500_000_000)
+    ]
+
+
 async def has_groups_in_tasks(node: Node) -> None:
     async def group() -> None:
         async with asyncio.TaskGroup() as group:
