@@ -23,7 +23,7 @@ from vnet.runtime.host import Host
 from vnet.runtime.mail import Mail
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
-from vnet.transport import wire
+from vnet.transport import lateness, wire
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
 from vnet.transport.session import open_client
@@ -160,7 +160,7 @@ class _RealTimeAgent:
         self._seq = 0
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
-        self._lateness = [0] * wire.LATENESS_BINS
+        self._lateness = [0] * lateness.LATENESS_BINS
         self._orphan_timer: asyncio.TimerHandle | None = None
 
     def _now_ns(self) -> int:
@@ -175,6 +175,8 @@ class _RealTimeAgent:
         self._attachment.on_message = self._wake
         for node in self._host.nodes.values():
             node.radio.inbox.refill = node.gnss.inbox.refill = self._drain
+            if node.backbone is not None:
+                node.backbone.inbox.refill = self._drain
         self._wake(b"")
         acknowledging = self._loop.create_task(self._acknowledge())
         try:
@@ -197,7 +199,10 @@ class _RealTimeAgent:
 
     def _awaits(self, packets_only: bool) -> bool:
         return any(
-            node.radio.inbox.awaited or (node.gnss.inbox.awaited and not packets_only)
+            node.radio.inbox.awaited
+            or node.radio.is_sending
+            or (node.gnss.inbox.awaited and not packets_only)
+            or (node.backbone is not None and node.backbone.inbox.awaited)
             for node in self._host.nodes.values()
         )
 
@@ -245,11 +250,10 @@ class _RealTimeAgent:
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
         self._host.busy.add(batch.busy)
-        self._host.results.add(batch.results)
         for packet in () if batch.held else batch.packets:
-            self._lateness[wire.lateness_bin(now_ns - packet.received_ns)] += 1
+            self._lateness[lateness.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
-        self._host.results.settle(max((result.time_ns for result in batch.results), default=0))
+        self._host.mail.deliver_news([*batch.results, *batch.messages])
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:

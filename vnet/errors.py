@@ -80,10 +80,10 @@ class TransportError(VnetError):
 
 
 class PayloadTooLargeError(VnetError):
-    """A broadcast larger than `radio.max_payload_bytes`."""
+    """A payload larger than `radio.max_payload_bytes`, or than another `key` of the scenario."""
 
-    def __init__(self, size_bytes: int, max_payload_bytes: int) -> None:
-        super().__init__(f"payload of {size_bytes} bytes exceeds radio.max_payload_bytes = {max_payload_bytes}")
+    def __init__(self, size_bytes: int, max_payload_bytes: int, key: str = "radio.max_payload_bytes") -> None:
+        super().__init__(f"payload of {size_bytes} bytes exceeds {key} = {max_payload_bytes}")
         self.size_bytes = size_bytes
         self.max_payload_bytes = max_payload_bytes
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from vnet.backbone import Backbone, BackboneTransport, UnitAbilities
 from vnet.driving import Action, checked_action
 from vnet.mailbox import Mailbox
 from vnet.radio import NO_ABILITIES, Radio, RadioAbilities, RadioTransport, SendOptions
@@ -63,7 +64,7 @@ class Fix:
     sensors: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: NOTHING_SENSED)
 
 
-class NodeTransport(RadioTransport, Protocol):
+class NodeTransport(RadioTransport, BackboneTransport, Protocol):
     """Interface of a node to the process that hosts it."""
 
     def now_ns(self, node: str) -> int:
@@ -118,6 +119,9 @@ class Node:
         period_ns: time between two fixes in nanoseconds.
         control_ns: time between two control instants in nanoseconds; 0 where programs do not drive.
         incarnation: number of restarts of the program so far.
+        surveyed_position_m: true position (2,) in m of a roadside unit, which a surveyor has found; None for a
+            vehicle.
+        backbone: the unit's end of the wired network among roadside units; None for a vehicle.
     """
 
     def __init__(
@@ -134,6 +138,7 @@ class Node:
         control_ns: int = 0,
         abilities: RadioAbilities = NO_ABILITIES,
         disk: Callable[[], Path] | None = None,
+        unit: UnitAbilities | None = None,
     ) -> None:
         self._is_text: dict[str, bool] = {}  # by the name of each reported value
         self.id = node_id
@@ -145,6 +150,11 @@ class Node:
         self.period_ns = period_ns
         self.incarnation = incarnation
         self.control_ns = control_ns
+        self.surveyed_position_m: Array | None = None
+        self.backbone: Backbone | None = None
+        if unit is not None:
+            self.surveyed_position_m = np.array(unit.position_m)
+            self.backbone = Backbone(node_id, transport, unit.peers, unit.max_message_bytes)
         self._transport = transport
         self._disk = disk
 
@@ -178,7 +188,9 @@ class Node:
 
     def disconnect(self) -> None:
         """Disconnect the rest of the program from the world, after the vehicle's process has ended."""
-        self._transport = self.radio._transport = _Disconnected(self.now_ns)
+        self._transport = self.radio._transport = disconnected = _Disconnected(self.now_ns)
+        if self.backbone is not None:
+            self.backbone._transport = disconnected
 
     def report(
         self,
@@ -260,6 +272,9 @@ class _Disconnected:
         return self._now_ns
 
     def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
+        pass
+
+    def send_message(self, node: str, to: str | None, payload: bytes) -> None:
         pass
 
     def busy_ratio(self, node: str) -> float | None:

@@ -11,6 +11,7 @@ from docs.generate.markdown import attribute_docstrings, docstring, table
 from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
+from emulator.records.backbone_table import BACKBONE
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
@@ -37,6 +38,7 @@ FOLDER = {
     "states.parquet": "[a row for each vehicle and period](#statesparquet): truth and beliefs",
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "driven.parquet": "[a row for each control instant and vehicle](#drivenparquet), where programs drive",
+    "backbone.parquet": "[a row for each message and receiver](#backboneparquet), where there are roadside units",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
     "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
@@ -138,6 +140,16 @@ DRIVEN = {
     "speed_m_s": "truth: its speed",
     "acceleration_m_s2": "truth: its acceleration",
     "command_m_s2": "the acceleration that it was told from this instant on, within its limits",
+}
+ON_BACKBONE = {
+    "sent_ns": "when it was sent",
+    "sender": "id of the roadside unit that has sent it",
+    "number": "counts the messages of the sender, from 0",
+    "receiver": "id of a unit that it was meant for",
+    "size_bytes": "length of the payload",
+    "payload_digest": "as in the trace",
+    "arrival_ns": "when it arrived, or would have; null if it was lost",
+    "outcome": "`delivered`, `loss`, `receiver_down`, or `in_flight` at the end of the run",
 }
 STATE = {
     "period": "counts from 0",
@@ -248,6 +260,7 @@ VERDICT = {
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
     "figures": "means of some metrics, after the first fifth of the run",
+    "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
@@ -278,6 +291,7 @@ def page() -> str:
     parts += ["## `payloads.parquet`", "No hash depends on it.", columns(PAYLOADS, PAYLOAD)]
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += ["## `driven.parquet`", columns(driven_table(Log(), ["v01"]).schema, DRIVEN)]
+    parts += ["## `backbone.parquet`", columns(BACKBONE, ON_BACKBONE)]
     parts += [
         "## `metrics.parquet`",
         docstring(PeriodFigures),

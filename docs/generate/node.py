@@ -12,6 +12,7 @@ import msgspec
 import vnet
 from docs.generate.markdown import docstring, sentence, table
 from docs.generate.markdown import page as whole_page
+from vnet.backbone import Backbone, BackboneMessage
 from vnet.errors import PayloadTooLargeError
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import GnssReceiver
@@ -41,7 +42,9 @@ PARTS = {
     "Node": vnet.Node,
     "node.radio": Radio,
     "node.gnss": GnssReceiver,
+    "node.backbone": Backbone,
     "Packet": vnet.Packet,
+    "BackboneMessage": BackboneMessage,
     "SendResult": SendResult,
     "Fix": vnet.Fix,
     "node.map": LaneMap,

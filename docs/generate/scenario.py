@@ -12,6 +12,7 @@ from docs.generate.keys import key_docstrings, key_table, option_table, subsecti
 from docs.generate.markdown import docstring, sentence
 from docs.generate.markdown import page as whole_page
 from emulator.scenario.program import ProgramException
+from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.world import OwnSensor
 
@@ -48,6 +49,7 @@ def _sections(path: str, model: type[BaseModel]) -> Iterator[str]:
     if path == "program":
         yield from _section("[[program.exceptions]]", ProgramException)
     if not path:
+        yield from _section("[[roadside]]", RoadsideUnit)
         yield "## `[[fault]]`"
         yield "What breaks, where, from when and for how long: [faults.md](faults.md)."
 

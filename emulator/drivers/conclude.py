@@ -23,6 +23,7 @@ from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
+from emulator.records.backbone_table import backbone_figures
 from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
 from emulator.records.driven_table import driving_figures
@@ -33,6 +34,7 @@ from emulator.records.reported import reported_figures
 from emulator.records.run import Run
 from emulator.records.run_folder import (
     AGAIN,
+    BACKBONE_FILE,
     BUSY_FILE,
     DRIVEN_FILE,
     FORMAT,
@@ -70,6 +72,7 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         folder.events,
         busy=_busy(emulation),
         driven=emulation.driving.table(),
+        backbone=emulation.backbone.table(),
         world=RecordedWorld.of(emulation.world),
     )
 
@@ -118,6 +121,7 @@ def conclude(
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
         "figures": summarize(emulation.metrics.rows),
         "driving": driving_figures(recorded.driven, recorded.events),
+        "backbone": backbone_figures(recorded.backbone),
         "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
         "cost": asdict(cost),
         "reproduce": reproduce,
@@ -140,6 +144,7 @@ def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
         METRICS_FILE: recorded.metrics,
         BUSY_FILE: recorded.busy,
         DRIVEN_FILE: recorded.driven,
+        BACKBONE_FILE: recorded.backbone,
     }
     for name, table in tables.items():
         if table is not None:

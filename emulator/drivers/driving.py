@@ -19,7 +19,8 @@ class Driving:
 
     def __init__(self, world: World, folder: RunFolder, number: Mapping[str, int]) -> None:
         self._world = world if isinstance(world, DrivenWorld) else None
-        self._node_ids = world.node_ids
+        self._node_ids = () if self._world is None else self._world.driven
+        self._drive = frozenset(self._node_ids)
         self._folder = folder
         self._number = number
 
@@ -28,10 +29,9 @@ class Driving:
         """The next control instant within the run; None if there is none."""
         return None if self._world is None else self._world.next_control_ns()
 
-    @property
-    def control_ns(self) -> int:
-        """Time between two control instants; 0 where programs do not drive."""
-        return 0 if self._world is None else self._world.vehicles.step_ns
+    def control_ns(self, node: str) -> int:
+        """Return the time between two control instants; 0 for a node that its program does not drive."""
+        return 0 if self._world is None or node not in self._drive else self._world.vehicles.step_ns
 
     def table(self) -> pa.Table | None:
         """Return what vehicles did at each control instant; None where programs do not drive."""
@@ -41,6 +41,8 @@ class Driving:
         """Take what programs of vehicles that are up ask for at `time_ns`."""
         if self._world is not None:
             for action in actions:
+                if action.node not in self._drive:  # a roadside unit
+                    continue
                 self._tell(self._world.vehicles.take(time_ns, self._number[action.node], action))
 
     def release(self, time_ns: int, node: str) -> None:

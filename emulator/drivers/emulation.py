@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.drivers.backbone import BackboneNetwork
 from emulator.drivers.busy_feed import BusyFeed
 from emulator.drivers.driving import Driving
 from emulator.drivers.log_book import LogBook
@@ -25,14 +26,15 @@ from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import abilities_of
 from emulator.radio.engine import NO_OPTIONS, Deliveries, Delivery, Engine
 from emulator.radio.own_rules import OwnRules, RuleFailure
-from emulator.radio.stages import least_latency_ns
 from emulator.records.costs import Costs
 from emulator.records.metrics import Metrics
 from emulator.records.payloads import PayloadRecorder
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.fault_families import Fault, Infrastructure, OwnRule, ProcessFault
+from emulator.scenario.lookahead import least_latency_ns
 from emulator.scenario.program import Program
+from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.world.gnss_faults import FaultyGnss, clock_of
 from emulator.world.neighbours import Links
@@ -126,6 +128,7 @@ class Emulation:
         self.costs = Costs()
         self.log_book = LogBook(folder, self.number)
         self.orders = Orders(scenario)
+        self.backbone = BackboneNetwork(scenario, self.up)
         self.busy = BusyFeed(self.engine, world.node_ids, least_latency_ns(scenario.radio))
 
     def _nodes_at(self, period: int) -> Nodes:
@@ -180,9 +183,13 @@ class Emulation:
             not self.presence.has_ended(node),
             wire.VERSION,
             self.orders.of_node(node, incarnation),
-            self.driving.control_ns,
-            *abilities_of(scenario.radio),
+            self.driving.control_ns(node),
+            *abilities_of(scenario.radio, self._unit_of(node)),
+            self.backbone.abilities(node),
         )
+
+    def _unit_of(self, node: str) -> RoadsideUnit | None:
+        return next((unit for unit in self.scenario.roadside if unit.id == node), None)
 
     def take(self, time_ns: int, traffic: Iterable[wire.Traffic]) -> None:
         """Take what nodes enqueue at `time_ns`: frames to the engine in node order, reports, endings.
@@ -209,6 +216,7 @@ class Emulation:
             unhandled.extend(part.unhandled)
             notes.extend(part.notes)
             self.orders.take(part.deviations)
+            self.backbone.send(time_ns, [message for message in part.messages if self.up[message.node]])
             self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
         if frames:
             self._place(time_ns // self.world.period_ns)
@@ -377,6 +385,7 @@ class Emulation:
     def advance(self, time_ns: int) -> list[Delivery]:
         """Everything that arrives up to `time_ns`, having closed the periods that end by then."""
         self.close_periods(time_ns)
+        self.backbone.decide(time_ns)
         arrived = [*self._arrived, self.engine.advance(time_ns)]
         self._arrived = []
         return [delivery for deliveries in arrived for delivery in deliveries]
@@ -384,6 +393,7 @@ class Emulation:
     def pass_to(self, time_ns: int) -> None:
         """As `advance`, where everything that arrives by then has been foreseen and handed out."""
         self.close_periods(time_ns)
+        self.backbone.decide(time_ns)
         self.engine.advance(time_ns)
         self._arrived = []
 

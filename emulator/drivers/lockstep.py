@@ -4,7 +4,7 @@ Lockstep is a conservative discrete-event simulation whose entities are event lo
 yields and says which processes to grant which window of time. The live driver moves these messages over Zenoh,
 `vnet simulate` by calling; so both give the same trace.
 
-No frame arrives sooner than L, `least_latency_ns`, after it was sent. So what arrives in a window [T, T + L) was
+No frame arrives sooner than L, `lookahead_ns`, after it was sent. So what arrives in a window [T, T + L) was
 sent before T, the next instant at which anything happens: each process may pass through the window by itself.
 Arrivals are *shown* to processes before the window, and *decided* after it, in the order of time with what the
 processes did: a program that ends within the window does not receive what arrives later. A window ends with the
@@ -23,9 +23,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import ProtocolError, check_yield, wire_packet
-from emulator.drivers.result_feed import ResultFeed
-from emulator.radio.stages import least_latency_ns
+from emulator.scenario.lookahead import lookahead_ns
 from vnet.mailbox import INBOX_LIMIT
 from vnet.node import Fix
 from vnet.radio import Packet
@@ -100,7 +100,7 @@ class Lockstep:
         self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
         """Nodes (N,) that an arrival wakes."""
         self._yielded: list[_Process] = []
-        self._results = ResultFeed(emulation.engine, emulation.world.node_ids)
+        self._news = NewsFeed(emulation)
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
         self._end_ns = 0
@@ -109,8 +109,7 @@ class Lockstep:
         self._mail: Mail | None = None
         self.ahead: Collection[str] = ()
         """Processes that run ahead."""
-        radio = emulation.scenario.radio
-        self._lookahead_ns = least_latency_ns(radio) if emulation.scenario.run.windows else 1
+        self._lookahead_ns = lookahead_ns(emulation.scenario) if emulation.scenario.run.windows else 1
         self.owed: dict[str, int] = {}
         self.now_ns = 0
         """Emulated time: the beginning of the window, or the last change."""
@@ -198,6 +197,14 @@ class Lockstep:
         emulation.pass_to(self._end_ns - 1)
 
     def _go_on(self) -> dict[str, wire.Grant]:
+        while self._come_to_window():
+            if wakes := self._wakes_in_window():
+                return self._grant(wakes)
+            self._settle()  # what has come is for nodes that are down or paused
+        return {}
+
+    def _come_to_window(self) -> bool:
+        """Open the next window, having done what comes before it; returns false at the end, or if held."""
         emulation = self._emulation
         while True:
             next_ns = self._next_instant_ns()
@@ -206,15 +213,15 @@ class Lockstep:
             if self._drive(first_ns):
                 continue
             if self._hold(first_ns):
-                return {}
+                return False
             if change_ns is None or change_ns > next_ns or change_ns >= emulation.duration_ns:
                 break
             self._act(change_ns)
         if next_ns >= emulation.duration_ns:
             emulation.finish(emulation.duration_ns)
-            return {}
+            return False
         self._open_window(next_ns)
-        return self._grant(self._wakes_in_window())
+        return True
 
     def _drive(self, next_ns: int) -> bool:
         """Have vehicles drive to a control instant that is not after `next_ns`; returns whether there was one."""
@@ -237,7 +244,7 @@ class Lockstep:
         emulation.engine.look_ahead(min(time_ns for time_ns in until_ns if time_ns is not None), listening)
         if len(listening):
             next_ns = min(next_ns, int(emulation.engine.next_arrivals_ns()[listening].min()))
-        return max(self._results.next_ns(next_ns), self.now_ns)
+        return max(min(next_ns, self._news.next_ns() or next_ns), self.now_ns)
 
     def _hold(self, next_ns: int) -> bool:
         """Return whether what comes next lies beyond the horizon; all before it is then done and recorded."""
@@ -278,7 +285,7 @@ class Lockstep:
             inbox += packets
             if len(inbox) > INBOX_LIMIT:
                 self._crowded.add(node_ids[receiver])
-        self._results.show(time_ns)
+        self._news.show(time_ns)
 
     def _inbox(self, node: str) -> list[Packet]:
         """Return the packets that a node has yet to be granted."""
@@ -293,7 +300,7 @@ class Lockstep:
         for number in np.flatnonzero(self._listens & (arrivals_ns < self._end_ns)).tolist():
             process_id = self._process_of[self._emulation.world.node_ids[number]]
             wakes[process_id] = min(wakes.get(process_id, self._end_ns), int(arrivals_ns[number]))
-        for node, time_ns in self._results.firsts():
+        for node, time_ns in self._news.firsts():
             process = self._processes.get(self._process_of[node])
             if process is not None and node not in process.paused:
                 wakes[process.id] = min(wakes.get(process.id, self._end_ns), time_ns)
@@ -311,7 +318,7 @@ class Lockstep:
         process = self._processes.pop(process_id, None)
         for node in () if process is None else process.nodes:
             self._listens[self._emulation.number[node]] = False
-        self._results.take(() if process is None else process.nodes)
+        self._news.take(() if process is None else process.nodes)
 
     def _plan(self, process: _Process) -> None:
         """Note what a process waits for: an arrival, or a time that is known."""
@@ -376,7 +383,7 @@ class Lockstep:
 
     def _stop(self, node: str) -> None:
         process_id = self._process_of[node]
-        self._results.take([node])
+        self._news.take([node])
         if self._hosts_all:
             self._processes[process_id].packets[node].clear()
         else:
@@ -400,8 +407,10 @@ class Lockstep:
         fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
         packets, clocks = process.take_packets(), process.take_clocks()
         busy = self._emulation.busy.of(process.nodes, time_ns, self._end_ns)
-        results = self._results.take(process.running)
-        grant = wire.Grant(process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy, results=results)
+        results, messages = self._news.take(process.running)
+        grant = wire.Grant(
+            process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy, results=results, messages=messages
+        )
         if self._hosts_all:
             self._mail = Mail(packets, fixes)
         else:

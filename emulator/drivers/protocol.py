@@ -15,9 +15,10 @@ class ProtocolError(VnetError):
 
 def check_ownership(nodes: Sequence[str], traffic: wire.Traffic, waiting: Sequence[str] = ()) -> None:
     """Raise ProtocolError if the traffic of the process of `nodes`, or its `waiting` nodes, are not its own."""
-    told = (traffic.frames, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations)
+    sent = traffic.frames, traffic.messages, traffic.actions
+    told = *sent, traffic.reports, traffic.endings, traffic.unhandled, traffic.notes, traffic.deviations
     own = frozenset(nodes)  # of a simulation a thousand, each of which is looked for several times
-    for node in [part.node for parts in (*told, traffic.actions) for part in parts] + [*waiting]:
+    for node in [part.node for parts in told for part in parts] + [*waiting]:
         if node not in own:
             raise ProtocolError(f"the process of {nodes[0]} speaks for {node}, which is not its own")
     for action in traffic.actions:

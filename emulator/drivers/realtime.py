@@ -11,10 +11,10 @@ from itertools import accumulate
 from typing import Any
 
 from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import check_ownership, wire_packet
-from emulator.drivers.result_feed import ResultFeed
 from emulator.radio.engine import Delivery
-from vnet.transport import wire
+from vnet.transport import lateness, wire
 from vnet.units import NS_PER_S
 
 WORST_PROCESSES = 8
@@ -48,7 +48,7 @@ class RealTime:
         self._actions: list[ProcessActions] = []
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
-        self._results = ResultFeed(emulation.engine, emulation.world.node_ids)
+        self._news = NewsFeed(emulation)
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
         self._affected: set[str] = set()
         self._next_period = 0
@@ -69,7 +69,7 @@ class RealTime:
         """Time at which `due` must be called next: the next arrival, fix or fault."""
         candidates = [
             self._emulation.engine.next_time(),
-            self._emulation.engine.next_result_ns(),
+            self._news.next_ns(),
             self._emulation.fix_time_ns(self._next_period),
             self._emulation.next_change_ns(),
             self._emulation.next_control_ns(),
@@ -122,7 +122,7 @@ class RealTime:
             self._act(change_ns)
         self._collect(now_ns)
         ready = self._present - self._paused
-        informed = {self._process_of[node] for node, _ in self._results.firsts()}
+        informed = {self._process_of[node] for node, _ in self._news.firsts()}
         return {
             process_id: self._batch(process_id)
             for process_id in self._nodes
@@ -149,7 +149,7 @@ class RealTime:
             self._unacknowledged[process_id].clear()
             self._packets.pop(process_id, None)
             self._fixes.pop(process_id, None)
-            self._results.take(self._nodes[process_id])
+            self._news.take(self._nodes[process_id])
         paused = {self._process_of[node] for node in actions.paused}
         self._was_paused |= self._paused - paused
         self._paused = paused
@@ -175,7 +175,7 @@ class RealTime:
             process_id = self._process_of[node_ids[delivery.receiver]]
             if process_id in self._present:
                 self._packets.setdefault(process_id, []).append(delivery)
-        self._results.show(time_ns)
+        self._news.show(time_ns)
         while (due_ns := self._emulation.fix_time_ns(self._next_period)) is not None and due_ns <= time_ns:
             for number, node in enumerate(node_ids):
                 fix = self._emulation.gnss.fix(self._next_period, number) if self._emulation.up[node] else None
@@ -194,8 +194,8 @@ class RealTime:
         held = process_id in self._was_paused
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
-        results = self._results.take(self._nodes[process_id])
-        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results)
+        results, messages = self._news.take(self._nodes[process_id])
+        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""
@@ -227,7 +227,7 @@ class RealTime:
 
 def _late(counts: Sequence[int]) -> int:
     """Number of deliveries of a lateness histogram over the limit."""
-    return sum(counts[wire.lateness_bin(wire.LATENESS_LIMIT_NS) :])
+    return sum(counts[lateness.lateness_bin(lateness.LATENESS_LIMIT_NS) :])
 
 
 def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
@@ -240,7 +240,7 @@ def lateness_figures(counts: Sequence[int]) -> dict[str, Any]:
         index = next(i for i, c in enumerate(cumulative) if c >= share * total)
         below = cumulative[index] - counts[index]
         inside = (share * total - below) / counts[index]
-        low_ms, high_ms = wire.lateness_edge_ms(index - 1), wire.lateness_edge_ms(index)
+        low_ms, high_ms = lateness.lateness_edge_ms(index - 1), lateness.lateness_edge_ms(index)
         return low_ms + inside * (high_ms - low_ms)
 
     return {

@@ -21,10 +21,10 @@ from rich.text import Text
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from emulator.radio.connectivity import connectivity_of
-from emulator.radio.stages import least_latency_ns
 from emulator.radio.topology import Topology
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import METRICS_FILE
+from emulator.scenario.lookahead import lookahead_ns
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import World, build_world, components
 from vnet.cmm.linear_model import convergence_factor, deviation_covariance
@@ -55,7 +55,7 @@ def analyze(scenario: Scenario, run: Path | None = None) -> dict[str, Any]:
     hears = hears_matrix(scenario, world)
     weak = components(world.at(0).position_m, scenario.radio.range_m, hears)
     result = {"weak_components": _sizes(weak)} | analyze_graph(hears)
-    result["lookahead_ms"] = least_latency_ns(scenario.radio) / NS_PER_MS
+    result["lookahead_ms"] = lookahead_ns(scenario) / NS_PER_MS
     if run is not None:
         result["measured"] = _measured(run, result["rules"])
     return result

@@ -49,7 +49,7 @@ def connectivity_of(radio: Radio, seed: int, inputs: RadioInputs | None = None) 
         obstacles = None
         if radio.buildings is not None and inputs.buildings is not None:
             obstacles = Obstacles(inputs.buildings, radio.buildings)
-        mean = MeanPower(radio.path_loss, radio.shadowing, seed)
+        mean = MeanPower(radio.path_loss, radio.shadowing, seed, inputs.units)
         return AboveFloor(mean, radio.path_loss.floor_dbm, obstacles)
     if isinstance(inputs.links, LinkTable):
         return Measured(inputs.links)

@@ -44,7 +44,6 @@ from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.radio.signals import BACKOFF, JITTER, NEXT_BACKOFF, Signals, sender_draw
-from emulator.radio.stages import least_latency_ns
 from emulator.radio.unicast import (
     ACK_TIMEOUT_NS,
     MOST_ATTEMPTS,
@@ -53,6 +52,7 @@ from emulator.radio.unicast import (
     acknowledgement_of,
     retry_of,
 )
+from emulator.scenario.lookahead import least_latency_ns
 from emulator.scenario.radio import Mac, Receiver
 from emulator.scenario.scenario import Radio
 from vnet.units import NS_PER_MS

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.scenario.radio import RATES_MBPS
+from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Radio
 from vnet.radio import RadioAbilities
 from vnet.types import Array
@@ -80,9 +81,11 @@ def airtimes_ns(radio: Radio, size_bytes: NDArray[np.int64], bitrate_mbps: Array
     return airtimes
 
 
-def abilities_of(radio: Radio) -> RadioAbilities:
-    """Return what programs may choose for a frame with this radio."""
+def abilities_of(radio: Radio, unit: RoadsideUnit | None = None) -> RadioAbilities:
+    """Return what programs of vehicles, or of a roadside unit, may choose for a frame with this radio."""
     power_dbm = None if radio.path_loss is None else radio.path_loss.tx_power_dbm
+    if power_dbm is not None and unit is not None and unit.tx_power_dbm is not None:
+        power_dbm = unit.tx_power_dbm
     return RadioAbilities(power_dbm, RATES_MBPS if radio.is_physical else (), radio.mac is not None)
 
 

@@ -31,22 +31,15 @@ from emulator.radio.mac import Mac, TransmitQueue
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import OUT_OF_RANGE, PENDING, Outcome
 from emulator.radio.own_rules import OwnRules
+from emulator.radio.propagation import transmit_powers_dbm
 from emulator.radio.reception import Reception
 from emulator.radio.sender_faults import Outgoing, SenderFaults
 from emulator.radio.signals import Signals
-from emulator.radio.stages import (
-    MIN_LATENCY_NS,
-    Latency,
-    Loss,
-    change_by_faults,
-    in_range,
-    lose_by_faults,
-    peer_cap,
-    sender_side,
-)
+from emulator.radio.stages import Latency, Loss, change_by_faults, in_range, lose_by_faults, peer_cap, sender_side
 from emulator.radio.topology import Topology
 from emulator.radio.trace import CHOSEN, Trace, payload_digest
 from emulator.radio.unicast import Result, address, address_all
+from emulator.scenario.lookahead import MIN_LATENCY_NS
 from emulator.scenario.scenario import Radio
 from emulator.world.neighbours import Links
 from emulator.world.radio_inputs import RadioInputs
@@ -94,7 +87,7 @@ class Engine:
             self._csma.judge, self._csma.next_copy = self._judge, self._next_copy
             self._csma.is_up, self._csma.acknowledged = self._topology.is_up, self._acknowledged
         self._rules = rules or OwnRules(seed, node_ids)
-        self._rules.tx_power_dbm = radio.path_loss.tx_power_dbm if radio.path_loss is not None else None
+        self._rules.tx_power_dbm = transmit_powers_dbm(radio.path_loss, count, inputs.units if inputs else ())
         self._links = LinkFaults(seed, self._mac, count, self._rules)
         self._senders = SenderFaults(self._node_ids, self._next_copy, self._ask_sender)
         self._reception = Reception(radio, signals) if signals is not None else None
@@ -191,7 +184,7 @@ class Engine:
 
     def _choose(self, time_ns: int, node: int, options: SendOptions) -> bool:
         """Take the choices for the next frame; returns false for one to nobody, which is not sent."""
-        self._choices = allowed_choices(self._radio, options)
+        self._choices = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
         if self._choices != self._default_choices:
             self._trace.begin_choices(self._radio.bitrate_mbps)
         if options.to is None or self._csma is None:

@@ -103,12 +103,12 @@ class RuleFailure:
 class OwnRules:
     """The rules of one run, their states, and which of them have failed.
 
-    `on_failure` is told of each that does. `tx_power_dbm` is the power of frames whose program has chosen none;
-    None without a path loss.
+    `on_failure` is told of each that does. `tx_power_dbm` are the powers (N,) of frames whose program has chosen
+    none; None without a path loss.
     """
 
     def __init__(self, seed: int, node_ids: Sequence[str]) -> None:
-        self.tx_power_dbm: float | None = None
+        self.tx_power_dbm: Sequence[float] | None = None
         self._seed = seed
         self._node_ids = tuple(node_ids)
         self._number = {node: number for number, node in enumerate(node_ids)}
@@ -158,6 +158,7 @@ class OwnRules:
         if number not in self._options:
             self._options[number] = MappingProxyType(deepcopy(fault.options))
         receivers = columns if topology.receiver is None else topology.receiver[frame.sender, columns]
+        largest_dbm = self.largest_dbm(frame.sender)
         return RadioFrame(
             sender=self._node_ids[frame.sender],
             sequence=frame.seq,
@@ -168,12 +169,16 @@ class OwnRules:
             distance_m=_fixed(topology.distance_m[frame.sender, columns]),
             position_m=_fixed(topology.position_m[receivers]),
             sender_position_m=_fixed(topology.position_m[frame.sender]),
-            power_dbm=None if self.tx_power_dbm is None else round(self.tx_power_dbm + frame.gain_db, DIGITS),
+            power_dbm=None if largest_dbm is None else round(largest_dbm + frame.gain_db, DIGITS),
             rate_mbps=frame.bitrate_mbps,
             options=self._options[number],
             _position_of=lambda vehicle: self._where(topology, vehicle),
             _stream=(self._seed, f"fault {number} rule", frame.sender, frame.seq, frame.draw),
         )
+
+    def largest_dbm(self, node: int) -> float | None:
+        """Return the power of frames of a node that has chosen none; None without a path loss."""
+        return None if self.tx_power_dbm is None else self.tx_power_dbm[node]
 
     def _where(self, topology: TopologySnapshot, vehicle: str) -> Array:
         if vehicle not in self._number:

@@ -6,6 +6,7 @@ vehicles nor on the way by which the two came there. Fading is drawn for each fr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -13,10 +14,13 @@ from numpy.typing import NDArray
 
 from emulator.scenario.radio import DualSlope, Fading, FreeSpace, LogDistance, Shadowing, TwoRay
 from emulator.scenario.random_streams import Draws
+from emulator.scenario.roadside import RoadsideUnit
 from vnet.types import Array
 
 LIGHT_M_S = 299_792_458.0
 """Speed of light in m/s."""
+VEHICLE_ANTENNA_M = 1.5
+"""Height of a vehicle's antenna above the ground where the path loss does not say it."""
 NEAREST_M = 1.0
 """Least distance of the path loss models: below it, antennas are in each other's near field."""
 WAVES = 512
@@ -28,9 +32,26 @@ DIGITS = 6
 the number of vehicles, then decides nothing."""
 
 
-def loss_db(model: FreeSpace | LogDistance | DualSlope | TwoRay, distance_m: Array) -> Array:
-    """Return the path loss in dB over distances of any shape."""
+PathLossModel = FreeSpace | LogDistance | DualSlope | TwoRay
+"""A model of the path loss."""
+
+
+def vehicle_antenna_m(model: PathLossModel) -> float:
+    """Return the height in m of the antennas of vehicles."""
+    return model.antenna_m if isinstance(model, TwoRay) else VEHICLE_ANTENNA_M
+
+
+def loss_db(model: PathLossModel, distance_m: Array, height_m: tuple[Array, Array] | None = None) -> Array:
+    """Return the path loss in dB over distances of any shape.
+
+    `distance_m` are distances on the ground, and `height_m` the heights of both antennas; those of vehicles if
+    left out.
+    """
     far_m = np.maximum(distance_m, NEAREST_M)
+    if isinstance(model, TwoRay):
+        return _two_ray_db(model, far_m, *(height_m or (model.antenna_m, model.antenna_m)))
+    if height_m is not None:
+        far_m = np.maximum(np.hypot(distance_m, height_m[0] - height_m[1]), NEAREST_M)
     match model:
         case FreeSpace():
             return 20 * np.log10(4 * np.pi * far_m * model.frequency_ghz * 1e9 / LIGHT_M_S)
@@ -40,20 +61,28 @@ def loss_db(model: FreeSpace | LogDistance | DualSlope | TwoRay, distance_m: Arr
             near = 10 * model.exponent * np.log10(np.minimum(far_m, model.break_m))
             beyond = 10 * model.far_exponent * np.log10(np.maximum(far_m, model.break_m) / model.break_m)
             return model.reference_db + near + beyond
-        case TwoRay():
-            return _two_ray_db(model, far_m)
 
 
-def _two_ray_db(model: TwoRay, distance_m: Array) -> Array:
-    """Return the two-ray path loss (Sommer, Joerer and Dressler 2012, equations 3 to 6), antennas at one height."""
+def _two_ray_db(model: TwoRay, distance_m: Array, here_m: Array | float, there_m: Array | float) -> Array:
+    """Return the two-ray path loss (Sommer, Joerer and Dressler 2012, equations 3 to 6) between two heights."""
     wavelength_m = LIGHT_M_S / (model.frequency_ghz * 1e9)
-    reflected_m = np.hypot(distance_m, 2 * model.antenna_m)
-    phase_rad = 2 * np.pi * (distance_m - reflected_m) / wavelength_m
-    sine, cosine = 2 * model.antenna_m / reflected_m, distance_m / reflected_m
+    direct_m, reflected_m = np.hypot(distance_m, here_m - there_m), np.hypot(distance_m, here_m + there_m)
+    phase_rad = 2 * np.pi * (direct_m - reflected_m) / wavelength_m
+    sine, cosine = (here_m + there_m) / reflected_m, distance_m / reflected_m
     root = np.sqrt(model.permittivity - cosine**2)
     reflection = (sine - root) / (sine + root)
     rays = np.abs(1 + reflection * np.exp(1j * phase_rad))
-    return np.asarray(20 * np.log10(4 * np.pi * distance_m / wavelength_m / np.maximum(rays, 1e-9)))
+    return np.asarray(20 * np.log10(4 * np.pi * direct_m / wavelength_m / np.maximum(rays, 1e-9)))
+
+
+def transmit_powers_dbm(
+    model: PathLossModel | None, count: int, units: Sequence[RoadsideUnit] = ()
+) -> list[float] | None:
+    """Return the transmit powers in dBm of `count` nodes, of which the last are `units`; None without a model."""
+    if model is None:
+        return None
+    of_units = [model.tx_power_dbm if unit.tx_power_dbm is None else unit.tx_power_dbm for unit in units]
+    return [model.tx_power_dbm] * (count - len(units)) + of_units
 
 
 class ShadowField:
@@ -90,12 +119,20 @@ class ShadowField:
 
 
 class MeanPower:
-    """Mean received power of every link: transmit power less path loss and shadowing."""
+    """Mean received power of every link: transmit power less path loss and shadowing.
+
+    The last nodes are roadside `units`, with heights and powers of their own.
+    """
 
     def __init__(
-        self, path_loss: FreeSpace | LogDistance | DualSlope | TwoRay, shadowing: Shadowing | None, seed: int
+        self,
+        path_loss: PathLossModel,
+        shadowing: Shadowing | None,
+        seed: int,
+        units: Sequence[RoadsideUnit] = (),
     ) -> None:
         self._path_loss = path_loss
+        self._units = tuple(units)
         self._shadow = ShadowField(shadowing, seed) if shadowing is not None else None
 
     def dbm(self, position_m: Array, distance_m: Array) -> Array:
@@ -103,11 +140,21 @@ class MeanPower:
 
         `position_m` (N, 2) are positions, `distance_m` (N, N) the distances between them; NaN gives NaN.
         """
-        power_dbm = self._path_loss.tx_power_dbm - loss_db(self._path_loss, distance_m)
+        sent_dbm, height_m = self._antennas(len(position_m))
+        power_dbm = sent_dbm - loss_db(self._path_loss, distance_m, height_m)
         if self._shadow is not None:
             power_dbm = power_dbm - self._shadow.between(position_m, distance_m)
-        np.fill_diagonal(power_dbm, self._path_loss.tx_power_dbm)
+        np.fill_diagonal(power_dbm, sent_dbm)
         return np.round(power_dbm, DIGITS)
+
+    def _antennas(self, count: int) -> tuple[Array | float, tuple[Array, Array] | None]:
+        """Return transmit powers (N, 1) in dBm and heights (N, 1) and (1, N) in m; one power without units."""
+        if not self._units:
+            return self._path_loss.tx_power_dbm, None
+        of_vehicles_m = [vehicle_antenna_m(self._path_loss)] * (count - len(self._units))
+        height_m = np.array(of_vehicles_m + [unit.height_m for unit in self._units])
+        sent_dbm = np.array(transmit_powers_dbm(self._path_loss, count, self._units))
+        return sent_dbm[:, None], (height_m[:, None], height_m[None, :])
 
 
 @lru_cache(maxsize=16)

@@ -15,18 +15,11 @@ from numpy.typing import NDArray
 from emulator.radio.frames import Frame, Receptions, rows
 from emulator.radio.outcomes import PENDING, Outcome
 from emulator.radio.signals import latency_draws
+from emulator.scenario.lookahead import MIN_LATENCY_NS
 from emulator.scenario.random_streams import Draws
 from emulator.scenario.scenario import Radio
 from vnet.types import Array
 from vnet.units import NS_PER_MS
-
-MIN_LATENCY_NS = 1_000
-"""Least latency of a reception: time passes in every exchange between nodes."""
-
-
-def least_latency_ns(radio: Radio) -> int:
-    """Return the shortest time from the end of a frame to its arrival: faults and jitter only add to it."""
-    return max(int(radio.latency_ms * NS_PER_MS), MIN_LATENCY_NS)
 
 
 def frame_draws(draws: Draws, frames: Sequence[Frame], receptions: Receptions) -> Array:

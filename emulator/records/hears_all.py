@@ -42,6 +42,8 @@ def why_no_bound(scenario: Scenario, vehicles: int) -> str:
     """Return why a run has no such bound; "" if it has one."""
     if scenario.network.moves:
         return "vehicles that drive have no hears-all bound: it needs straight lanes"
+    if scenario.roadside:
+        return "there are roadside units, which stand on no lane: the hears-all bound needs straight lanes"
     if vehicles > MOST_VEHICLES:
         return f"the hears-all bound is computed for {MOST_VEHICLES} vehicles at most"
     if scenario.world.common_error.gradient_m_per_km:

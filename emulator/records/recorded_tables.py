@@ -52,6 +52,8 @@ class RecordedTables:
     """world.npz."""
     driven: pa.Table | None = None
     """driven.parquet, where programs drive."""
+    backbone: pa.Table | None = None
+    """backbone.parquet, where there are roadside units."""
 
     # Nodes and where they are.
 
@@ -90,6 +92,7 @@ class RecordedTables:
         """Inputs of the radio from files, as they were recorded; no input file is read."""
         radio, count = self.scenario.radio, len(self.node_ids)
         recorded = RadioInputs() if self.world is None else self.world.radio_inputs
+        recorded = replace(recorded, units=self.scenario.roadside)
         if radio.buildings is not None and recorded.buildings is None:
             raise VnetError("[radio.buildings]: no buildings were recorded")
         if not isinstance(radio.links, Path):

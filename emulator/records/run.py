@@ -139,6 +139,11 @@ class Run:
         return self._recorded.driven
 
     @property
+    def backbone(self) -> pa.Table | None:
+        """Table of the backbone: a row for each message of a roadside unit and receiver; None without a unit."""
+        return self._recorded.backbone
+
+    @property
     def metrics(self) -> pa.Table:
         """Table of periods: a row for each period, with errors and counts over all vehicles."""
         return self._recorded.metrics

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from emulator.radio.trace import Trace
+from emulator.records.backbone_table import BACKBONE
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
@@ -27,6 +28,7 @@ from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
+    BACKBONE_FILE,
     BUSY_FILE,
     DRIVEN_FILE,
     EVENTS_FILE,
@@ -65,6 +67,7 @@ TABLES: dict[str, pa.Schema] = {
     PAYLOADS_FILE: PAYLOADS,
     BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
     DRIVEN_FILE: driven_table(Log(), ["v01"]).schema,
+    BACKBONE_FILE: BACKBONE,
 }
 """The tables, with the columns that they must have."""
 Columns = Mapping[str, Collection[str]]
@@ -162,6 +165,11 @@ class RunFiles:
     def driven(self) -> pa.Table | None:
         """A row for each control instant and vehicle; None where programs do not drive."""
         return self._table(DRIVEN_FILE) if self.scenario.network.kind == "driven" else None
+
+    @cached_property
+    def backbone(self) -> pa.Table | None:
+        """A row for each message of a roadside unit and receiver; None where there is no unit."""
+        return self._table(BACKBONE_FILE) if self.scenario.roadside else None
 
     @cached_property
     def payloads(self) -> KeptPayloads | None:

@@ -41,6 +41,7 @@ class Record:
     metrics_sha256: str = ""
     reported: dict[str, ReportedFigure] = field(default_factory=dict)
     driving: dict[str, float | None] = field(default_factory=dict)
+    backbone: dict[str, int] = field(default_factory=dict)
     cost: RunCost | None = None
     versions: dict[str, str] = field(default_factory=dict)
 

@@ -17,7 +17,8 @@ _COLOURS = (BLUE, RED, GREEN, ORANGE, PURPLE, SKY)
 
 def speeds(source: Source) -> Drawing:
     """Draw the true speeds of driven vehicles against time, with the instants of collisions."""
-    table, nodes = source.recorded.driven, source.recorded.node_ids
+    table, units = source.recorded.driven, source.recorded.scenario.roadside
+    nodes = source.recorded.node_ids[: len(source.recorded.node_ids) - len(units)]
     if table is None or not len(table) or not nodes:
         raise NothingToShow("no program drives")
     time_s, speed = of_vehicles(table, "speed_m_s", len(nodes))

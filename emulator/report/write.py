@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from emulator.pages.page import Table, put_page, render, table
+from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS
 from emulator.records.key_figures import shown_figures
 from emulator.records.run_folder import REPORT, RUNS, SCENARIO_FILE, Event
@@ -188,6 +189,8 @@ def key_figures(record: Record) -> dict[str, str]:
         found["attempted receptions"] = f"{record.in_range:,}"
     if record.driving:
         found["collisions"] = f"{record.driving.get('collisions') or 0:g}"
+    if record.backbone:
+        found["messages on the backbone"] = on_backbone(record.backbone)
     found["emulated time"] = f"{record.emulated_s:.1f} s"
     found["wall-clock time"] = f"{record.wall_s:.1f} s"
     if record.real_time_factor is not None:

@@ -23,6 +23,7 @@ from emulator.scenario.overrides import apply_override, wrong_value
 from emulator.scenario.program import Program
 from emulator.scenario.radio import RATES_MBPS, Buildings, Congestion, Fading, Mac, PathLoss, Receiver, Shadowing
 from emulator.scenario.renamed import with_new_names
+from emulator.scenario.roadside import Backbone, RoadsideUnit, with_names, with_programs
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
@@ -186,9 +187,18 @@ class Scenario(Section):
     """The roads on which vehicles drive, if programs are to know them."""
     world: WorldSection = WorldSection()
     radio: Radio = Radio()
+    roadside: tuple[RoadsideUnit, ...] = ()
+    """Roadside units: nodes that stand beside the road."""
+    backbone: Backbone | None = None
+    """The wired network among them; it has its defaults if left out."""
     program: Program = Program()
     fault: tuple[AnyFault, ...] = ()
     """The faults, and when they act."""
+
+    @field_validator("roadside")
+    @classmethod
+    def _units_have_names(cls, units: tuple[RoadsideUnit, ...]) -> tuple[RoadsideUnit, ...]:
+        return with_names(units)
 
     @model_validator(mode="after")
     def _faults_start_in_time(self) -> Scenario:
@@ -284,22 +294,33 @@ def scenario_from(
         raise wrong_value(path, str(error), overrides) from None
     scenario = _with_absolute_paths(scenario, path)
     try:
-        program, faults = with_rules(scenario.program, scenario.fault, path.parent, checks, str(path))
-        if (function := scenario.network.function) is not None:
-            program, function = with_network(program, function, path.parent, str(path))
-            network = scenario.network.model_copy(update={"function": function})
-            scenario = scenario.model_copy(update={"network": network})
-        if scenario.world.sensor:
-            program, world = with_sensors(program, scenario.world, path.parent, str(path))
-            scenario = scenario.model_copy(update={"world": world})
+        scenario = with_own_modules(scenario, path.parent, checks, str(path))
     except ScenarioError as error:
         raise wrong_value(path, str(error).removeprefix(f"{path}: "), overrides) from None
-    scenario = scenario.model_copy(update={"program": program, "fault": faults})
     recorded = digests or {}
     for name, digest in input_digests(scenario).items():
         if recorded.get(name, digest) != digest:
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
     return scenario
+
+
+def with_own_modules(
+    scenario: Scenario, base: Path | None, checks: Sequence[str] = (), source: str = ""
+) -> Scenario:
+    """Return a scenario whose files of the user's own are modules; programs of roadside units are exceptions.
+
+    The arguments and exceptions are those of `with_modules`.
+    """
+    program = with_programs(scenario.program, scenario.roadside)
+    program, faults = with_rules(program, scenario.fault, base, checks, source)
+    network, world = scenario.network, scenario.world
+    if network.function is not None:
+        program, function = with_network(program, network.function, base, source)
+        network = network.model_copy(update={"function": function})
+    if world.sensor:
+        program, world = with_sensors(program, world, base, source)
+    parts = {"program": program, "fault": faults, "network": network, "world": world}
+    return scenario.model_copy(update=parts)
 
 
 def _instead(path: Path) -> str:

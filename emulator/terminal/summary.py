@@ -17,6 +17,7 @@ from rich.text import Text
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
 from emulator.pages.text import cell
+from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS, RunCost, read_cost
 from emulator.records.key_figures import shown_figures
 from emulator.records.reported import ReportedFigure
@@ -200,6 +201,8 @@ def _figures(verdict: dict[str, Any]) -> Table:
     table.add_row("real-time factor", f"{verdict['real_time_factor'] or 0:.2f}")
     if verdict.get("driving"):
         table.add_row("collisions", str(verdict["driving"]["collisions"]))
+    if verdict.get("backbone"):
+        table.add_row("messages on the backbone", on_backbone(verdict["backbone"]))
     for title, value in shown_figures(verdict["figures"]).items():
         table.add_row(f"{title} (mean after the first fifth)", f"{value:.3f} m")
     return table

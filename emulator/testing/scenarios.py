@@ -8,8 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from emulator.scenario.modules import with_rules
-from emulator.scenario.scenario import Scenario, load_scenario
+from emulator.scenario.scenario import Scenario, load_scenario, with_own_modules
 from emulator.scenario.sections import first_problem
 from emulator.scenario.shipped import find_scenario
 from vnet.errors import ScenarioError
@@ -49,8 +48,7 @@ def make_scenario(source: Source, changes: Mapping[str, Any], folders: Iterable[
             table = table.setdefault(section, {})
         table[key] = _plain(value)
     changed = _validated(data)
-    program, faults = with_rules(changed.program, changed.fault, base)
-    return changed.model_copy(update={"program": program, "fault": faults})
+    return with_own_modules(changed, base)
 
 
 def _loaded(source: Source, folders: Iterable[Path]) -> tuple[Scenario, Path | None]:

@@ -1,9 +1,10 @@
-"""Inputs of the radio from files, besides positions: links and buildings."""
+"""Inputs of the radio besides positions: links and buildings from files, antennas of roadside units."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from emulator.scenario.roadside import RoadsideUnit
 from emulator.scenario.scenario import Scenario
 from emulator.world.buildings import Buildings
 from emulator.world.link_table import LinkTable
@@ -17,11 +18,12 @@ class RadioInputs:
     """Inputs of the radio; None where a scenario has none.
 
     `links` is `radio.links`: a table, or a matrix (N, N) whose entry (i, j) is true if i receives j. `buildings`
-    are those of `[radio.buildings]`, as far as they are near vehicles.
+    are those of `[radio.buildings]`, as far as they are near nodes. `units` are the last nodes.
     """
 
     links: Mask | LinkTable | None = None
     buildings: Buildings | None = None
+    units: tuple[RoadsideUnit, ...] = ()
 
 
 def load_buildings(scenario: Scenario, frame: Frame | None, area_m: Array) -> Buildings | None:

@@ -16,6 +16,7 @@ from emulator.world.own_sensors import OwnSensors, Reading, SensedTruth
 from emulator.world.projection import Frame
 from emulator.world.radio_inputs import RadioInputs, load_buildings
 from emulator.world.receivers import MotionSensors, further_error_m, noise_m, speed_mps
+from emulator.world.roadside import with_units
 from emulator.world.trips.motion import Motion
 from vnet.errors import ScenarioError, first_names
 from vnet.node import NOTHING_SENSED, Fix
@@ -49,6 +50,8 @@ class Instant:
 class World:
     """The truth of a run: the `motion` of all vehicles, and the fixes of their receivers.
 
+    The scenario's roadside units are the last nodes, behind the vehicles of `motion`, and stand.
+
     `lane_map` is given to programs; `lane_of` (N,), the lane of each vehicle that stands on one, is not. `frame` is
     that of the metres, if it is known. `radio_inputs` is what the radio reads from files. `moves` is true if
     vehicles drive, enter and leave. `course_m` (K, N, 2) are the positions at the start of each period, NaN for an
@@ -65,6 +68,7 @@ class World:
         lane_of: NDArray[np.intp],
         frame: Frame | None = None,
     ) -> None:
+        motion = with_units(motion, scenario.roadside)
         count = len(motion.node_ids)
         self.node_ids = motion.node_ids
         self.moves = scenario.network.moves
@@ -75,7 +79,7 @@ class World:
         self.notes = motion.notes
         self.course_m, self._heading_rad = motion.position_m, motion.heading_rad
         buildings = load_buildings(scenario, frame, self.area_m)
-        self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings)
+        self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):
             self.notes = (*self.notes, "radio.buildings: none is near a vehicle; check its origin_deg")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])

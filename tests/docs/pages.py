@@ -135,7 +135,8 @@ class Page:
         found = _FILE.match(block.text)
         path = self._folder / (found.group(1) if found else "fragment.toml")
         path.write_text(block.text)
-        load_scenario(path)
+        for unit in load_scenario(path).program.exceptions:  # a run of the scenario runs them
+            self._programs.pop(f"{unit.entry.partition(':')[0]}.py", None)
 
     def _csv(self, block: Block) -> None:
         rows = list(csv.reader(io.StringIO(block.text)))

@@ -20,10 +20,12 @@ from emulator.world.world import build_world
 from tests.docs.layouts import Field, Layouts, split
 from tests.support.paths import ROOT
 from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times
+from vnet.backbone import UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.reports import Report
 from vnet.transport import keys, wire
+from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.transport.orders import Deviation, Order
 from vnet.transport.send_results import WireSendResult
 
@@ -48,6 +50,9 @@ PARTS = {
     "ClockError": wire.ClockError,
     "BusyRatios": wire.BusyRatios,
     "SendResult": WireSendResult,
+    "SentMessage": SentMessage,
+    "Message": WireMessage,
+    "UnitAbilities": UnitAbilities,
 }
 welcomes = st.builds(
     wire.Welcome,
@@ -75,8 +80,12 @@ def test_every_kind_of_message_is_on_the_page() -> None:
     documented = {**OF_AGENTS, **OF_THE_EMULATOR, **PARTS}
     assert PAGE.by_name.keys() - documented.keys() == {"Report", "Scene", "Period", "RunEnd"}
     for name, kind in documented.items():
-        assert [field.name for field in PAGE.by_name[name]] == list(kind.__struct_fields__), name
+        assert [field.name for field in PAGE.by_name[name]] == _fields_of(kind), name
     assert [field.name for field in PAGE.by_name["Report"]] == list(Report.__struct_fields__)
+
+
+def _fields_of(kind: Any) -> list[str]:
+    return list(kind._fields if issubclass(kind, tuple) else kind.__struct_fields__)
 
 
 # An independent reader.
@@ -152,7 +161,7 @@ def fields(kinds: dict[str, Any]) -> list[tuple[str, int, Field]]:
 
 def example(kind: str) -> list[Any]:
     """Values of a message that are as the page says, always the same."""
-    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[]] * 7}
+    zero = {"int": 1, "float": 0.5, "text": "v01", "bytes": b"n", "bool": False, "Traffic": [[]] * 8}
 
     def value(field: Field) -> Any:
         first = split(field.type, " or ")[0]
@@ -192,7 +201,7 @@ def test_an_agent_that_knows_nothing_of_exceptions_is_understood() -> None:
 def test_a_reader_that_is_told_nonsense_says_so() -> None:
     assert "Hello.pid" in PAGE.problem_of("Hello", ["v01", "v01", b"n", "1", "here", False, None, 2, True])
     assert "not 9 values" in PAGE.problem_of("Hello", ["v01"])
-    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, 1, [], [], [], 0, [], None, [], []])
+    assert "Grant.seq" in PAGE.problem_of("Grant", [-1, 0, 1, [], [], [], 0, [], None, [], [], []])
     assert "Lateness.counts" in PAGE.problem_of("Lateness", [[0] * 79])
     assert "Scene: fields" in PAGE.problem_of("Scene", {"name": "a run"})
 

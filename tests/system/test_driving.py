@@ -1,4 +1,4 @@
-"""Programs that drive, in real processes: the same as simulated."""
+"""Programs that drive, and roadside units, in real processes: the same as simulated."""
 
 from pathlib import Path
 
@@ -28,6 +28,18 @@ loss = 0.1
 
 [program]
 entry = "tests.support.driving_programs:platoon"
+
+[[roadside]]
+position_m = [0.0, 10.0]
+entry = "tests.support.roadside_programs:relay"
+
+[[roadside]]
+position_m = [0.0, 60.0]
+entry = "tests.support.roadside_programs:relay"
+
+[backbone]
+latency_ms = 1.5
+jitter_ms = 20.0
 """
 
 
@@ -38,4 +50,5 @@ def test_processes_drive_as_their_simulation_does(vnet: Vnet, tmp_path: Path) ->
     simulated = vnet("simulate", str(path))
     assert live.status == simulated.status == 0, live.stderr + simulated.stderr
     assert live.fingerprint == simulated.fingerprint
-    assert (live.folder / "driven.parquet").read_bytes() == (simulated.folder / "driven.parquet").read_bytes()
+    for name in ("driven.parquet", "backbone.parquet"):
+        assert (live.folder / name).read_bytes() == (simulated.folder / name).read_bytes()

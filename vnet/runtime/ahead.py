@@ -16,6 +16,7 @@ from typing import NoReturn
 from msgspec.structs import replace
 
 from vnet.errors import VirtualTimeError
+from vnet.node import Node
 from vnet.runtime.host import Host
 from vnet.runtime.mail import Mail
 from vnet.transport import wire
@@ -107,7 +108,7 @@ class RunAhead:
     def _may_pass(self, next_timer_ns: int | None) -> bool:
         """Return whether the process may go on to its next instant beyond the window by itself."""
         wake_ns = self._wake_ns(next_timer_ns)
-        listens = any(node.radio.inbox.waiting or node.radio.is_sending for node in self._host.nodes.values())
+        listens = any(_listens(node) for node in self._host.nodes.values())
         return wake_ns is not None and wake_ns < self._quiet_ns and not listens
 
     def _wake_ns(self, next_timer_ns: int | None) -> int | None:
@@ -131,3 +132,8 @@ class RunAhead:
         self._host.take_traffic()
         self._failure = None
         raise failure
+
+
+def _listens(node: Node) -> bool:
+    """Return whether something that comes for a node makes an instant: for a roadside unit every message does."""
+    return node.radio.inbox.waiting or node.radio.is_sending or node.backbone is not None

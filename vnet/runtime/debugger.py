@@ -30,7 +30,9 @@ _NOT_STEPPED_INTO = (
     "emulator.",
     "namedtuple_",  # what Python generates for named tuples
     "vnet.driving",
+    "vnet.backbone",
     "vnet.mailbox",
+    "vnet.payload",
     "vnet.node",
     "vnet.radio",
     "vnet.reports",

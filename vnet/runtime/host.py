@@ -26,24 +26,22 @@ from vnet.runtime.busy_ratios import MeasuredBusyRatios
 from vnet.runtime.current_node import current_node
 from vnet.runtime.disks import Disks
 from vnet.runtime.event_order import Chooser, chooser_of
-from vnet.runtime.log_handler import NodeLines, NodeLogHandler
+from vnet.runtime.log_handler import LONGEST_NOTE, NodeLines, NodeLogHandler
 from vnet.runtime.mail import Mail
 from vnet.runtime.mail_delivery import MailDelivery
+from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.send_results import SendResults
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
+from vnet.transport.backbone import SentMessage
 from vnet.transport.orders import Deviation, Order
 
 if TYPE_CHECKING:  # pdb, which few runs need
     from vnet.runtime.debugger import NodeDebugger
-
-LONGEST_NOTE = 4000
-"""Characters of a line of a log that are told to the emulator."""
 
 
 class Host:
@@ -79,7 +77,7 @@ class Host:
         self._orders = {welcome.node: welcome.order for welcome in welcomes}
         self.mail = MailDelivery(self.nodes, self._clocks)
         self.busy = MeasuredBusyRatios([*self.nodes], clock)
-        self.results = SendResults(self.nodes.__getitem__)
+        self.news = News()
         self._paused: set[str] = set()
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
@@ -99,6 +97,7 @@ class Host:
             control_ns=welcome.control_ns,
             abilities=RadioAbilities(welcome.max_power_dbm, welcome.rates_mbps, welcome.acknowledges),
             disk=partial(self._disks.of, welcome.node),
+            unit=welcome.unit,
         )
 
     # What nodes ask of their link.
@@ -109,9 +108,11 @@ class Host:
 
     def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
-        if self._active[node]:
-            self._outbox.frames.append(wire.Frame(node, payload, *options))
-            self._on_traffic()
+        self._enqueue(node, self._outbox.frames, wire.Frame(node, payload, *options))
+
+    def send_message(self, node: str, to: str | None, payload: bytes) -> None:
+        """Take a message for the backbone; a node that has ended is silent."""
+        self._enqueue(node, self._outbox.messages, SentMessage(node, to, payload))
 
     def busy_ratio(self, node: str) -> float | None:
         """Return the channel busy ratio that a node knows now."""
@@ -119,23 +120,22 @@ class Host:
 
     def send_report(self, report: Report) -> None:
         """Take a report."""
-        if self._active[report.node]:
-            self._outbox.reports.append(report)
-            self._on_traffic()
+        self._enqueue(report.node, self._outbox.reports, report)
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         """Take a line of a log or an event of a program; the line is written at once."""
         note = wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
         self._outbox.notes.append(note)
-        said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
-        line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip()
-        self._lines.add(node, level, line.replace("\n", "\n    "))
+        self._lines.add(node, kind, level, text, details)
         self._on_traffic()
 
     def send_action(self, action: Action) -> None:
         """Take what a program asks its vehicle to do."""
-        if self._active[action.node]:
-            self._outbox.actions.append(action)
+        self._enqueue(action.node, self._outbox.actions, action)
+
+    def _enqueue(self, node: str, queue: list[Any], item: object) -> None:
+        if self._active[node]:
+            queue.append(item)
             self._on_traffic()
 
     # What the transport asks of the host.
@@ -186,7 +186,7 @@ class Host:
         gone.disconnect()
         self._active[node] = False
         self._window.drop(node)
-        self.results.drop(node)
+        self.news.drop(node)
         if killed:
             self._unhandled.silence(gone)
             self._killed[gone] = self._tasks_of(gone)
@@ -256,7 +256,7 @@ class Host:
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
         self.busy.add(grant.busy)
-        self.results.add(grant.results)
+        self.news.add(grant.results, grant.messages)
         self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 
@@ -268,7 +268,7 @@ class Host:
         self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
-        next_ns = self.results.first_ns(self._paused, next_ns)
+        next_ns = self.news.first_ns(self._paused, next_ns)
         if window.has_packets:
             awaiting = {id for id, node in self.nodes.items() if self._active[id] and node.radio.inbox.waiting}
             next_ns = min(next_ns, window.first_packet_ns(awaiting - self._paused))
@@ -281,7 +281,8 @@ class Host:
         packets = self._window.take_packets(time_ns, self._paused)
         due = {node: some for node, some in packets.items() if self._active[node]}
         self.mail.deliver(Mail(due, fixes), time_ns)
-        self.results.settle(time_ns, self._paused)
+        arrived = self.news.take(time_ns, self._paused)
+        self.mail.deliver_news([each for each in arrived if self._active[each.node]], time_ns)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""

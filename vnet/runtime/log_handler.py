@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from vnet.node import Node
 from vnet.runtime.current_node import current_node
 from vnet.units import NS_PER_S
 
+LONGEST_NOTE = 4000
+"""Characters of a line that are told to the emulator."""
 MOST_LINES = 100_000
 """Lines of a node's log that are written by one process, so that a flood fills no disk."""
 
@@ -51,11 +53,13 @@ class NodeLines:
         self._clock = clock
         self._count: Counter[str] = Counter()
 
-    def add(self, node: str, level: str, text: str) -> None:
-        """Write a line to a node's log, unless there were too many."""
+    def add(self, node: str, kind: str, level: str, text: str, details: Mapping[str, object]) -> None:
+        """Write a line of a program, or an event with its details, to a node's log, unless there were too many."""
+        said = ", ".join(f"{key}={value}" for key, value in details.items()).replace("\n", "\\n")
+        line = f"{'' if kind == 'log' else 'event '}{text} {said}".rstrip().replace("\n", "\n    ")
         self._count[node] += 1
         if self._count[node] <= MOST_LINES:
-            self._write(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {text}")
+            self._write(node, f"{self._clock() / NS_PER_S:.6f} {node} {level}: {line}")
         elif self._count[node] == MOST_LINES + 1:
             self._write(node, f"(further lines of {node} are left out after {MOST_LINES:,})")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,8 +12,10 @@ from vnet.mailbox import Mailbox
 from vnet.node import Node
 from vnet.radio import Packet
 from vnet.runtime.mail import Mail
+from vnet.runtime.news import NewsItem
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.ready_queue import OrderedQueue
+from vnet.transport.backbone import WireMessage
 
 
 class MailDelivery:
@@ -36,6 +38,32 @@ class MailDelivery:
             self._nodes[node].radio.inbox.deliver(self._shown(node, packets))
         for node, fix in mail.fixes:
             self._nodes[node].gnss.inbox.deliver((fix,))
+
+    def deliver_news(self, arrivals: Iterable[NewsItem], time_ns: int | None = None) -> None:
+        """Deliver results of frames to single nodes, and messages of the backbone."""
+        for arrival in arrivals:
+            node = self._nodes[arrival.node]
+            if isinstance(arrival, WireMessage):
+                self._deliver_message(node, arrival, time_ns)
+                continue
+            show = partial(node.radio.settle, arrival.number, arrival.result())
+            if self.ordered is None or time_ns is None or arrival.time_ns < time_ns:
+                show()
+            else:
+                self.ordered.add_event(node, f"result of send {arrival.number}", "send", show, lambda: True)
+
+    def _deliver_message(self, node: Node, arrival: WireMessage, time_ns: int | None) -> None:
+        if node.backbone is None:
+            return
+        message, inbox = arrival.message(), node.backbone.inbox
+        if self._clocks.has_been_wrong(node.id):
+            message = message._replace(received_ns=self._clocks.shown_ns(node.id, message.received_ns))
+        show = partial(inbox.deliver, (message,))
+        if self.ordered is None or time_ns is None or arrival.time_ns < time_ns:
+            show()
+        else:
+            label = f"message from {message.sender}"
+            self.ordered.add_event(node, label, "backbone", show, partial(_is_awaited, inbox))
 
     def _shown(self, node: str, packets: Sequence[Packet]) -> Sequence[Packet]:
         """Return the packets of a node with the times of their arrivals as its clock showed them."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from vnet.driving import Action
 from vnet.reports import Report
 from vnet.transport import wire
+from vnet.transport.backbone import SentMessage
 from vnet.transport.orders import Deviation
 
 
@@ -21,16 +22,17 @@ class Outbox:
     notes: list[wire.Note] = field(default_factory=list)
     deviations: list[Deviation] = field(default_factory=list)
     actions: list[Action] = field(default_factory=list)
+    messages: list[SentMessage] = field(default_factory=list)
 
     @property
     def has_any(self) -> bool:
         """True if there is anything that the emulator must be told at this instant."""
-        return bool(self.frames or self.reports or self.endings or self.notes or self.actions)
+        return bool(self.frames or self.reports or self.endings or self.notes or self.actions or self.messages)
 
     def take(self, unhandled: Sequence[wire.Unhandled]) -> wire.Traffic:
         """Remove and return all of it, with exceptions that nobody handled."""
         frames, reports, endings, notes = self.frames, self.reports, self.endings, self.notes
-        deviations, actions = self.deviations, self.actions
+        deviations, actions, messages = self.deviations, self.actions, self.messages
         self.frames, self.reports, self.endings, self.notes = [], [], [], []
-        self.deviations, self.actions = [], []
-        return wire.Traffic(frames, reports, endings, unhandled, notes, deviations, actions)
+        self.deviations, self.actions, self.messages = [], [], []
+        return wire.Traffic(frames, reports, endings, unhandled, notes, deviations, actions, messages)

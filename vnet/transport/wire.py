@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,11 +14,14 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
+from vnet.backbone import UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Fix
 from vnet.radio import Packet
 from vnet.reports import Report
+from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport.lateness import LATENESS_BINS
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
 from vnet.transport.send_results import WireSendResult
 
@@ -27,10 +29,6 @@ VERSION = 2
 """Version of the messages. 2: a grant is for a window, and a yield has steps."""
 HEAD_START_NS = 200_000_000
 """Real time: time from the announcement of time 0 to time 0, so that all processes receive it before."""
-LATENESS_LIMIT_NS = 20_000_000
-"""Deliveries later than this count against a real-time run."""
-LATENESS_BINS = 80
-"""Bins of delays: four for each factor of two, from 10 µs to 10 s."""
 LARGEST_MESSAGE_BYTES = 64 * 2**20
 """Largest message of an agent: it holds a frame of the largest payload from each of a thousand nodes."""
 
@@ -144,11 +142,12 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
     notes: Sequence[Note] = ()
     deviations: Sequence[Deviation] = ()
     actions: Sequence[Action] = ()
+    messages: Sequence[SentMessage] = ()
 
     def __bool__(self) -> bool:
         """Return true if there is anything in it."""
         told = self.frames or self.reports or self.endings or self.unhandled or self.notes
-        return bool(told or self.deviations or self.actions)
+        return bool(told or self.deviations or self.actions or self.messages)
 
 
 class Step(msgspec.Struct, frozen=True, array_like=True):
@@ -253,6 +252,7 @@ class Welcome(Message, frozen=True):
     max_power_dbm: float | None = None
     rates_mbps: Sequence[float] = ()
     acknowledges: bool = False
+    unit: UnitAbilities | None = None
 
 
 class ClockError(msgspec.Struct, frozen=True, array_like=True):
@@ -290,7 +290,7 @@ class Grant(Message, frozen=True):
     `time_ns` is the first instant at which the process has something to do. `packets` are those that arrive before
     the end, each at its `received_ns`; `fixes` are due at the first instant. `clocks` are the clock errors that
     have changed, `busy` the channel busy ratios of the window if vehicles share a medium,
-    `results` those of frames to single nodes, each at its `time_ns`.
+    `results` those of frames to single nodes and `messages` those of the backbone, each at its `time_ns`.
 
     Instants before `quiet_ns` may be passed beyond the window as long as they are quiet; `next_fixes`, at
     `next_fixes_ns`, belong to such an instant. They are given only to processes that have said `ahead`.
@@ -307,6 +307,7 @@ class Grant(Message, frozen=True):
     next_fixes_ns: TimeNs | None = None
     busy: Sequence[BusyRatios] = ()
     results: Sequence[WireSendResult] = ()
+    messages: Sequence[WireMessage] = ()
 
 
 class Batch(Message, frozen=True):
@@ -326,6 +327,7 @@ class Batch(Message, frozen=True):
     clocks: Sequence[ClockError] = ()
     busy: Sequence[BusyRatios] = ()
     results: Sequence[WireSendResult] = ()
+    messages: Sequence[WireMessage] = ()
 
 
 class StackRequest(Message, frozen=True):
@@ -423,23 +425,6 @@ def _check_size(data: bytes) -> None:
     # allocate.
     if len(data) > LARGEST_MESSAGE_BYTES:
         raise WireError(f"message of {len(data)} bytes: at most {LARGEST_MESSAGE_BYTES} allowed")
-
-
-_LATENESS_LIMIT_BIN = 44
-"""Bin whose lower edge is `LATENESS_LIMIT_NS`."""
-
-
-def lateness_bin(late_ns: int) -> int:
-    """Return the bin of a delay: four bins for each factor of two; bin 44 begins at the bound of 20 ms."""
-    if late_ns <= 0:
-        return 0
-    position = _LATENESS_LIMIT_BIN + math.floor(4 * math.log2(late_ns / LATENESS_LIMIT_NS))
-    return min(max(position, 0), LATENESS_BINS - 1)
-
-
-def lateness_edge_ms(index: int) -> float:
-    """Return the upper edge of a lateness bin in milliseconds."""
-    return LATENESS_LIMIT_NS / 1e6 * float(2 ** ((index + 1 - _LATENESS_LIMIT_BIN) / 4))
 
 
 def boot_id() -> str:

@@ -27,6 +27,7 @@ class DrivenWorld(World):
     def __init__(self, scenario: Scenario) -> None:
         node_ids = _node_ids(scenario.network.vehicles)
         self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz))
+        self._units_m = [unit.position_m for unit in scenario.roadside]
         self._duration_ns = scenario.duration_ns
         top_m = scenario.driven.max_speed_mps * scenario.run.duration_s
         self._furthest_m = float(self.vehicles.along_m.max()) + top_m
@@ -37,7 +38,8 @@ class DrivenWorld(World):
         motion = Motion(node_ids, np.tile(position_m, (periods, 1, 1)), np.tile(heading_rad, (periods, 1)))
         super().__init__(scenario, motion, _lane_map(scenario, self.vehicles), np.zeros(0, dtype=np.intp))
         self._sensors = MotionSensors(scenario, periods, len(node_ids))
-        self._ranging, self._gap_m, self._gap_rate_mps = scenario.world.ranging, *_nothing(periods, len(node_ids))
+        self._ranging = scenario.world.ranging
+        self._gap_m, self._gap_rate_mps = _nothing(periods, len(self.node_ids))
         seed = scenario.run.seed
         if self._ranging is not None:
             draws = [stream(seed, "ranging", n).standard_normal((periods, 2)) for n in range(len(node_ids))]
@@ -62,7 +64,8 @@ class DrivenWorld(World):
     @property
     def area_m(self) -> Array:
         """Corners (2, 2) of the box in which vehicles can be during the run."""
-        return self.vehicles.road.area_m(self._furthest_m)
+        corners_m = np.array([*self.vehicles.road.area_m(self._furthest_m), *self._units_m])
+        return np.array([corners_m.min(axis=0), corners_m.max(axis=0)])
 
     def present(self, period: int) -> Mask:
         """Return the mask (N,) of the vehicles that are present in `period`."""
@@ -91,6 +94,11 @@ class DrivenWorld(World):
         times_ns = (period * self.period_ns for period in self._left)
         return next((time_ns for time_ns in times_ns if time_ns > after_ns), None)
 
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Ids of the vehicles that programs drive: all nodes but roadside units."""
+        return self.node_ids[: len(self.node_ids) - len(self._units_m)]
+
     def next_control_ns(self) -> int | None:
         """Return the next control instant within the run, or None."""
         next_ns = self.vehicles.now_ns + self.vehicles.step_ns
@@ -110,16 +118,17 @@ class DrivenWorld(World):
         """Take the truth at the start of a period, and what receivers and sensors make of it."""
         position_m, heading_rad = self.vehicles.place()
         rows, speed = slice(period, period + 1), self.vehicles.speed[None]
-        self.course_m[period], self._heading_rad[period] = position_m, heading_rad
-        self._fix_m[period] = position_m + self._common_m[period] + self._noise_m[period]
-        self._fix_heading_rad[rows] = self._sensors.heading_rad(heading_rad[None], speed, rows)
-        self._fix_speed_mps[rows] = self._sensors.speed_mps(speed, rows)
-        self._true_speed_mps[rows] = speed
+        driven = slice(len(position_m))  # behind them there are roadside units
+        self.course_m[period, driven], self._heading_rad[period, driven] = position_m, heading_rad
+        self._fix_m[period, driven] = position_m + self._common_m[period] + self._noise_m[period, driven]
+        self._fix_heading_rad[rows, driven] = self._sensors.heading_rad(heading_rad[None], speed, rows)
+        self._fix_speed_mps[rows, driven] = self._sensors.speed_mps(speed, rows)
+        self._true_speed_mps[rows, driven] = speed
         if self._ranging is not None:
             gap_m, rate_mps = self.vehicles.gaps(self._ranging.range_m)
             noise = self._ranging_normal[period]
-            self._gap_m[period] = gap_m + self._ranging.sigma_m * noise[:, 0]
-            self._gap_rate_mps[period] = rate_mps + self._ranging.rate_sigma_mps * noise[:, 1]
+            self._gap_m[period, driven] = gap_m + self._ranging.sigma_m * noise[:, 0]
+            self._gap_rate_mps[period, driven] = rate_mps + self._ranging.rate_sigma_mps * noise[:, 1]
         self._known = period + 1
 
     def fix(self, period: int, node: int) -> Fix:

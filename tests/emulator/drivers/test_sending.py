@@ -18,6 +18,7 @@ RADIO: dict[str, Any] = {
 }
 SENDS = "tests.emulator.drivers.test_sending:sends"
 FORGETS = "tests.emulator.drivers.test_sending:forgets"
+ASKS = "tests.emulator.drivers.test_sending:asks"
 ASKS_NOBODY = "tests.emulator.drivers.test_sending:asks_nobody"
 
 
@@ -52,6 +53,15 @@ async def asks_nobody(node: Node) -> None:
     """Send to a name that no vehicle has."""
     result = await node.radio.send("v99", b"x")
     node.event("result", delivered=result.delivered, attempts=result.attempts)
+
+
+async def asks(node: Node) -> None:
+    """v01 sends one frame, and is still there after 0.3 s."""
+    if node.id == "v01":
+        await node.radio.send("v02", b"x")
+        node.event("result")
+        await asyncio.sleep(0.3 - node.now_ns / 1e9)
+        node.event("later")
 
 
 def scenario(entry: str = SENDS, faults: list[Any] | None = None, **radio: Any) -> Any:
@@ -102,3 +112,16 @@ def test_a_name_that_no_vehicle_has_is_not_acknowledged() -> None:
     said = [event.details["details"] for event in emulation.folder.events if event.kind == "event"]
     assert said == [{"delivered": False, "attempts": 0}] * 5
     assert not len(emulation.engine.trace)
+
+
+def test_a_result_for_a_paused_vehicle_waits_and_the_run_goes_on() -> None:
+    """With one sender only: when its result comes, nobody else has anything to do."""
+    fault = {"kind": "pause", "nodes": {"ids": ["v01"]}, "at_s": 0.01, "duration_s": 0.1}
+    plan = scenario(ASKS, [fault], latency_ms=50.0)
+    for run in (run_together, run_apart):
+        emulation = run(plan)
+        first, last = (event for event in emulation.folder.events if event.kind == "event")
+        assert [(each.details["name"], each.time_ns) for each in (first, last)] == [
+            ("result", 110_000_000),
+            ("later", 300_000_000),
+        ]

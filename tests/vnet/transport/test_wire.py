@@ -9,7 +9,8 @@ from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.node import Fix
 from vnet.reports import Report
-from vnet.transport import wire
+from vnet.transport import lateness, wire
+from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.transport.orders import Deviation
 from vnet.transport.send_results import WireSendResult
 
@@ -52,6 +53,8 @@ notes = st.builds(
     names,
     st.dictionaries(names, st.booleans() | times | reals | names, max_size=2),
 )
+sent_messages = st.builds(SentMessage, names, st.none() | names, st.binary(max_size=16))
+messages = st.lists(st.builds(WireMessage, names, names, times, times, st.binary(max_size=16)), max_size=2)
 deviations = st.builds(Deviation, names, times, times, times, names, names)
 traffic = st.builds(
     wire.Traffic,
@@ -62,9 +65,10 @@ traffic = st.builds(
     st.lists(notes, max_size=2),
     st.lists(deviations, max_size=2),
     st.lists(actions, max_size=2),
+    st.lists(sent_messages, max_size=2),
 )
 steps = st.builds(wire.Step, times, traffic)
-histograms = st.lists(times, min_size=wire.LATENESS_BINS, max_size=wire.LATENESS_BINS)
+histograms = st.lists(times, min_size=lateness.LATENESS_BINS, max_size=lateness.LATENESS_BINS)
 agent_messages = st.one_of(
     st.builds(
         wire.Hello, names, names, st.binary(max_size=16), times, names, st.booleans(), st.none() | names, times
@@ -99,6 +103,7 @@ emulator_messages = st.one_of(
         st.none() | times,
         busy,
         results,
+        messages,
     ),
     st.builds(
         wire.Batch,
@@ -111,6 +116,7 @@ emulator_messages = st.one_of(
         clocks,
         busy,
         results,
+        messages,
     ),
     st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.StackRequest()),
@@ -160,7 +166,7 @@ def test_times_are_integers_within_bounds(time_ns: object) -> None:
         wire.decode_rx(grant)
 
 
-@pytest.mark.parametrize("bins", [0, wire.LATENESS_BINS - 1, wire.LATENESS_BINS + 1])
+@pytest.mark.parametrize("bins", [0, lateness.LATENESS_BINS - 1, lateness.LATENESS_BINS + 1])
 def test_a_histogram_of_another_length_is_refused(bins: int) -> None:
     """The emulator adds up the histograms of all processes."""
     frames = wire.Frames(b"n", 0, 0, [], wire.Traffic(), wire.Lateness([0] * bins))
@@ -193,11 +199,11 @@ def test_a_fix_survives_the_wire_bit_by_bit() -> None:
 
 
 def test_lateness_bins_have_an_edge_at_the_limit() -> None:
-    at_limit = wire.lateness_bin(wire.LATENESS_LIMIT_NS)
-    assert wire.lateness_bin(wire.LATENESS_LIMIT_NS - 1) == at_limit - 1
-    assert wire.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
-    assert wire.lateness_bin(-5) == 0
-    assert wire.lateness_bin(2**62) == wire.LATENESS_BINS - 1
+    at_limit = lateness.lateness_bin(lateness.LATENESS_LIMIT_NS)
+    assert lateness.lateness_bin(lateness.LATENESS_LIMIT_NS - 1) == at_limit - 1
+    assert lateness.lateness_edge_ms(at_limit - 1) == pytest.approx(20.0)
+    assert lateness.lateness_bin(-5) == 0
+    assert lateness.lateness_bin(2**62) == lateness.LATENESS_BINS - 1
 
 
 @settings(max_examples=100, deadline=None)

@@ -1,0 +1,121 @@
+"""The backbone of a run: messages of roadside units to each other, over a wire.
+
+It is no radio: a message reaches its receivers after `backbone.latency_ms`, wherever they stand, and messages
+between two units keep their order. Draws are keyed by seed, sender and number of the message, so they depend on
+nothing else that happens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from heapq import heappop, heappush
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from emulator.radio.trace import payload_digest
+from emulator.records.backbone_table import BackboneRow, backbone_table
+from emulator.scenario.random_streams import Draws
+from emulator.scenario.roadside import Backbone
+from emulator.scenario.scenario import Scenario
+from vnet.backbone import UnitAbilities
+from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.units import NS_PER_MS
+
+
+class _Sent(NamedTuple):
+    """A message on its way to one unit, in the order of arrivals."""
+
+    arrival_ns: int
+    sender: int
+    number: int
+    receiver: int
+    sent_ns: int
+    payload: bytes
+
+
+class BackboneNetwork:
+    """The messages of a run. `up` says which nodes are up."""
+
+    def __init__(self, scenario: Scenario, up: Mapping[str, bool]) -> None:
+        self._units = scenario.roadside
+        self._names = [unit.name for unit in self._units]
+        self._section = scenario.backbone or Backbone()
+        self._up = up
+        self._draws = Draws(scenario.run.seed, "backbone")
+        self._next = [0] * len(self._units)
+        self._last_ns: dict[tuple[int, int], int] = {}
+        """The latest arrival so far, by sender and receiver."""
+        self._unseen: list[_Sent] = []
+        """Heap of the messages that no process has been shown."""
+        self._undecided: list[_Sent] = []
+        """Heap of the messages of which it is open whether their receivers are up when they arrive."""
+        self._rows: list[BackboneRow] = []
+
+    def abilities(self, node: str) -> UnitAbilities | None:
+        """Return what a unit knows of itself; None for a vehicle."""
+        if node not in self._names:
+            return None
+        unit = self._units[self._names.index(node)]
+        peers = [name for name in self._names if name != node]
+        return UnitAbilities(unit.position_m, peers, self._section.max_message_bytes)
+
+    def send(self, time_ns: int, messages: Sequence[SentMessage]) -> None:
+        """Take what units send at `time_ns`. Vehicles have no backbone: what claims to be theirs is dropped."""
+        for message in messages:
+            if message.node in self._names and len(message.payload) <= self._section.max_message_bytes:
+                self._send(time_ns, self._names.index(message.node), message)
+
+    def _send(self, time_ns: int, sender: int, message: SentMessage) -> None:
+        number, self._next[sender] = self._next[sender], self._next[sender] + 1
+        drawn = self._draws.uniform(sender, number, 2 * len(self._units)).tolist()
+        for receiver, name in enumerate(self._names):
+            if receiver == sender or message.to not in (None, name):
+                continue
+            wait_ms = self._section.latency_ms + self._section.jitter_ms * drawn[2 * receiver]
+            arrival_ns = time_ns + max(round(wait_ms * NS_PER_MS), 1)
+            arrival_ns = max(arrival_ns, self._last_ns.get((sender, receiver), 0))
+            sent = _Sent(arrival_ns, sender, number, receiver, time_ns, message.payload)
+            if drawn[2 * receiver + 1] < self._section.loss:
+                self._record(sent, "loss")
+                continue
+            self._last_ns[sender, receiver] = arrival_ns
+            heappush(self._unseen, sent)
+            heappush(self._undecided, sent)
+
+    def next_ns(self) -> int | None:
+        """Return the next arrival that no process has been shown, or None."""
+        return self._unseen[0].arrival_ns if self._unseen else None
+
+    def take(self, time_ns: int) -> list[WireMessage]:
+        """Return the arrivals up to `time_ns` that no process has been shown, in order."""
+        taken = []
+        while self._unseen and self._unseen[0].arrival_ns <= time_ns:
+            sent = heappop(self._unseen)
+            receiver, sender = self._names[sent.receiver], self._names[sent.sender]
+            taken.append(WireMessage(receiver, sender, sent.sent_ns, sent.arrival_ns, sent.payload))
+        return taken
+
+    def decide(self, time_ns: int) -> None:
+        """Record the arrivals up to `time_ns`: who is up now was so when they came."""
+        while self._undecided and self._undecided[0].arrival_ns <= time_ns:
+            sent = heappop(self._undecided)
+            self._record(sent, "delivered" if self._up[self._names[sent.receiver]] else "receiver_down")
+
+    def _record(self, sent: _Sent, outcome: str) -> None:
+        sender, receiver = self._names[sent.sender], self._names[sent.receiver]
+        digest = payload_digest(sent.payload)
+        arrival_ns = None if outcome == "loss" else sent.arrival_ns
+        self._rows.append(
+            BackboneRow(sent.sent_ns, sender, sent.number, receiver, len(sent.payload), digest, arrival_ns, outcome)
+        )
+
+    def table(self) -> pa.Table | None:
+        """Return a row for each message and receiver, in the order of sending; None without roadside units."""
+        if not self._units:
+            return None
+        rows = [*self._rows]
+        for sent in self._undecided:  # still under way when the run ends
+            self._record(sent, "in_flight")
+        rows, self._rows = self._rows, rows
+        return backbone_table(rows)
