@@ -135,7 +135,8 @@ BUSY = {
 DRIVEN = {
     "time_ns": "the control instant",
     "node": "id of the vehicle",
-    "along_m": "truth: position of its centre along the road; on a ring it goes on counting. NaN once it has left",
+    "along_m": "truth: position of its centre along the road, or on a map its route; on a ring it goes on "
+    "counting. NaN once it has left",
     "left_m": "truth: its distance to the left of the rightmost lane's centre",
     "speed_m_s": "truth: its speed",
     "acceleration_m_s2": "truth: its acceleration",
@@ -215,6 +216,7 @@ EVENTS = {
         "`node.drive` asked for what the vehicle cannot do; of an acceleration the first time in a row",
     ),
     "collision": ("vehicle", "`with`, `closing_m_s`", "a driven vehicle has run into another, which was ahead"),
+    "lane_ended": ("vehicle", "`lane`", "on a map: a driven vehicle's lane has ended, and it is in this one now"),
     "rule_failed": (
         "",
         "`fault`, `rule`, `sender`, `error`, `where`",

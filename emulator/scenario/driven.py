@@ -18,20 +18,26 @@ Place = Annotated[float, Field(ge=0, le=100_000)]
 class Driven(Section):
     """`[network.driven]`: the road, where vehicles are at the start, and how they move (`kind = "driven"`)."""
 
-    road: Literal["straight", "ring"] = "straight"
-    """Shape of the road. Vehicles that come to the end of a `straight` one leave the network; a `ring` has none."""
+    road: Literal["straight", "ring", "map"] = "straight"
+    """Shape of the road. Vehicles that come to the end of a `straight` one leave the network; a `ring` has none.
+    With `map` they drive on the roads of `[map]`, or without it in a generated city (`network.size_m`, `seed`)."""
+    routes: tuple[Annotated[tuple[str, ...], Field(min_length=1)], ...] | None = Field(None, min_length=1)
+    """`map`: roads that vehicles follow, by their names in the map's file, such as `["way 12", "-way 7"]`; `-` for
+    one against its direction. Vehicles have the routes in turn. If left out, each vehicle starts anywhere, and
+    takes any exit of each junction; `network.seed` draws them."""
     length_m: float = Field(5000.0, ge=100, le=100_000)
     """Length of the road: of a ring the circumference of its rightmost lane."""
     lanes: int = Field(1, ge=1, le=12)
-    """Number of lanes, all in one direction; lane 0 is the rightmost."""
+    """Number of lanes, all in one direction; lane 0 is the rightmost. A map has lanes of its own."""
     lane_width_m: float = Field(3.5, ge=2, le=10)
-    """Width of a lane."""
+    """Width of a lane. A map has widths of its own."""
     gap_m: float = Field(30.0, gt=0, le=10_000)
-    """Clear distance at the start between a vehicle and the next in its lane. The first vehicle is the foremost."""
+    """Clear distance at the start between a vehicle and the next in its lane, the first one being the foremost.
+    Where routes are drawn it is the least distance between two in a street."""
     speed_mps: Speed | tuple[Speed, ...] = 20.0
     """Speed at the start, of all vehicles or of each."""
     start_m: tuple[Place, ...] | None = None
-    """Position of each vehicle's centre along the road at the start, in place of `gap_m`."""
+    """Position of each vehicle's centre along the road, or its route, at the start, in place of `gap_m`."""
     start_lanes: tuple[Annotated[int, Field(ge=0, le=11)], ...] | None = None
     """Lane of each vehicle at the start; if left out vehicles are put into the lanes in turn."""
     lag_s: float = Field(0.3, ge=0, le=10)
@@ -53,6 +59,10 @@ class Driven(Section):
     def _fits_the_road(self) -> Driven:
         if any(speed > self.max_speed_mps for speed in self.speeds_mps(1)):
             raise ValueError(f"speed_mps: at most max_speed_mps = {self.max_speed_mps:g}")
+        if self.road == "map":
+            return self._fits_a_map()
+        if self.routes is not None:
+            raise ValueError(f'routes goes with road = "map", not with "{self.road}"')
         if any(lane >= self.lanes for lane in self.start_lanes or ()):
             raise ValueError(f"start_lanes: the lanes are 0 to {self.lanes - 1}")
         if any(place > self.length_m for place in self.start_m or ()):
@@ -61,6 +71,17 @@ class Driven(Section):
             raise ValueError(f"vehicle_width_m: at most lane_width_m = {self.lane_width_m:g}")
         if self.road == "ring" and self.length_m / (2 * math.pi) <= self.lanes * self.lane_width_m:
             raise ValueError(f"length_m = {self.length_m:g}: too short for a ring of {self.lanes} lanes")
+        return self
+
+    def _fits_a_map(self) -> Driven:
+        fields = type(self).model_fields
+        for name in ("length_m", "lanes", "lane_width_m"):
+            if getattr(self, name) != fields[name].default:
+                raise ValueError(
+                    f'{name} goes with road = "straight" or "ring": a map has roads and lanes of its own'
+                )
+        if self.routes is None and (self.start_m is not None or self.start_lanes is not None):
+            raise ValueError('start_m and start_lanes need routes where road = "map"')
         return self
 
     def speeds_mps(self, vehicles: int) -> tuple[float, ...]:

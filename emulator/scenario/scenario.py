@@ -213,8 +213,10 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _roads_are_for_those_who_drive(self) -> Scenario:
         kind = self.network.kind
-        if self.map is not None and (not self.network.moves or kind == "driven"):
+        if self.map is not None and not self.network.moves:
             raise ValueError(f'map goes with vehicles that drive on it, not with network.kind = "{kind}"')
+        if self.map is not None and kind == "driven" and self.driven.road != "map":
+            raise ValueError(f'map goes with network.driven.road = "map", not with "{self.driven.road}"')
         if kind == "driven":
             check_driving(self.driven, self.run.control_hz, self.period_ns, self.world)
         elif self.world.ranging is not None:

@@ -89,7 +89,7 @@ def event_kinds() -> set[str]:
 def test_every_event_is_there() -> None:
     named_by_variables = {"finished", "crashed", "spun", "died", "entered", "restarted"}
     named_by_variables |= {"emulator_restarted", "router_restarted"}
-    named_by_variables |= {"drive_limited", "collision"}
+    named_by_variables |= {"drive_limited", "collision", "lane_ended"}
     assert event_kinds() | named_by_variables == set(files.EVENTS)
 
 

@@ -52,7 +52,7 @@ def scenario_of(faults: Sequence[dict[str, Any]], program: str, vehicles: int = 
         "fault": list(faults),
     }
     for name, section in sections.items():
-        data[name] = {**data[name], **section}
+        data[name] = {**data.get(name, {}), **section}
     return Scenario.model_validate(data)
 
 

@@ -45,14 +45,14 @@ class Grid:
         empty = (first > final).any(axis=1)
         first[empty], final[empty] = 0.0, -1.0
         first, final = first.astype(np.intp), final.astype(np.intp)
-        box, row = _ranges(np.arange(len(first)), first[:, 1], final[:, 1] + 1)
+        box, row = ranges(np.arange(len(first)), first[:, 1], final[:, 1] + 1)
         # The squares of a row, one beside the other, are one range of points.
         start = np.searchsorted(self._number, row * self._columns + first[:, 0][box], side="left")
         end = np.searchsorted(self._number, row * self._columns + final[:, 0][box], side="right")
-        return _ranges(box, start, end)
+        return ranges(box, start, end)
 
 
-def _ranges(label: Ints, start: Ints, end: Ints) -> tuple[Ints, Ints]:
+def ranges(label: Ints, start: Ints, end: Ints) -> tuple[Ints, Ints]:
     """Return all integers from `start` (n,) to `end` (n,), each after the `label` (n,) of its range."""
     count = np.maximum(end - start, 0)
     until = np.cumsum(count)

@@ -1,21 +1,70 @@
-"""Geometry of the road of driven vehicles: a straight one or a ring, with parallel lanes in one direction."""
+"""Geometry of the road of driven vehicles, and the interface that it shares with the roads of a map.
+
+A single road is straight or a ring, with parallel lanes in one direction. `map_roads.py` has the roads of a map.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vnet.types import Array
 
+Ints = NDArray[np.intp]
+
+
+class Road(Protocol):
+    """Interface of the roads to the vehicles that are driven on them; arrays have an entry (N,) a vehicle.
+
+    Positions are `along_m`, along the vehicle's way, NaN for an absent vehicle, and `left_m`, to the left of the
+    rightmost lane's centre.
+    """
+
+    @property
+    def end_m(self) -> Array:
+        """Position at which the way of each vehicle (N,), or of all (), ends; infinite if it does not."""
+
+    @property
+    def has_crossings(self) -> bool:
+        """True if vehicles of different ways may meet."""
+
+    def place(self, along_m: Array, left_m: Array) -> tuple[Array, Array]:
+        """Return positions (N, 2) in m and headings (N,) in [0, 2π)."""
+
+    def ahead(self, along_m: Array, left_m: Array, width_m: float, range_m: float) -> tuple[Ints, Array]:
+        """Return the number (N,) of the vehicle ahead of each, the next that it would run into, and the way to it.
+
+        The number is -1, and the way (N,) in m NaN, if none is within `range_m`, from centre to centre. Vehicles
+        are in each other's way if they overlap across the road, at `width_m` each.
+        """
+
+    def distance_m(self, along_m: Array, rear: int, front: int) -> float:
+        """Return the way from one vehicle to another that is ahead of it and near."""
+
+    def crossing_pairs(self, along_m: Array, position_m: Array, reach_m: float) -> tuple[Ints, Ints]:
+        """Return the pairs (n,), (n,) of vehicles within `reach_m` of which neither is behind the other."""
+
+    def lane_count(self, along_m: Array) -> Ints:
+        """Return the number (N,) of lanes at these positions, in the direction of travel."""
+
+    def left_m(self, along_m: Array, nominal_m: Array) -> Array:
+        """Return `left_m` (N,) of vehicles at `nominal_m`, which is what it is if all lanes have the same width."""
+
+    def rank(self, along_m: Array) -> Array:
+        """Return numbers (N,) that order vehicles on the same road, the foremost last."""
+
+    def area_m(self, furthest_m: Array) -> Array:
+        """Return the corners (2, 2) of a box around the roads, as far as vehicles can come."""
+
 
 @dataclass(frozen=True)
-class Road:
+class SingleRoad:
     """A road from the origin to the east, or a ring around the origin, counter-clockwise.
 
-    Positions on it are `along_m`, in m from its start, and `left_m`, to the left of the rightmost lane's centre.
     On a ring `along_m` counts along the rightmost lane, so vehicles further left cover as much of it a second.
     """
 
@@ -29,6 +78,16 @@ class Road:
         """Radius of a ring's rightmost lane."""
         return self.length_m / (2 * math.pi)
 
+    @property
+    def end_m(self) -> Array:
+        """End of the road (); infinite on a ring."""
+        return np.array(math.inf if self.is_ring else self.length_m)
+
+    @property
+    def has_crossings(self) -> bool:
+        """False: all vehicles have the same way."""
+        return False
+
     def place(self, along_m: Array, left_m: Array) -> tuple[Array, Array]:
         """Return positions (N, 2) in m and headings (N,) in [0, 2π) at these positions (N,) on the road."""
         if not self.is_ring:
@@ -38,18 +97,15 @@ class Road:
         position_m = np.column_stack([radius_m * np.cos(angle), radius_m * np.sin(angle)])
         return position_m, np.mod(angle + math.pi / 2, 2 * math.pi)
 
-    def area_m(self, furthest_m: float) -> Array:
+    def area_m(self, furthest_m: Array) -> Array:
         """Return the corners (2, 2) of a box around the road, of a straight one as far as `furthest_m`."""
         if self.is_ring:
             return np.array([[-self.radius_m] * 2, [self.radius_m] * 2])
-        return np.array([[0.0, 0.0], [min(furthest_m, self.length_m), (self.lanes - 1) * self.lane_width_m]])
+        end_m = min(float(furthest_m.max()), self.length_m)
+        return np.array([[0.0, 0.0], [end_m, (self.lanes - 1) * self.lane_width_m]])
 
-    def ahead(self, along_m: Array, left_m: Array, width_m: float, range_m: float) -> NDArray[np.intp]:
-        """Return the number (N,) of the vehicle ahead of each, the next that it would run into; -1 if none is.
-
-        Positions on the road are (N,), NaN for an absent vehicle. Vehicles are in each other's way if they overlap
-        across the road, at `width_m` each. Centres further away than `range_m` do not count.
-        """
+    def ahead(self, along_m: Array, left_m: Array, width_m: float, range_m: float) -> tuple[Ints, Array]:
+        """Return the number (N,) of the vehicle ahead of each and the way to it, as `Road.ahead` does."""
         found = np.full(len(along_m), -1, dtype=np.intp)
         there = np.flatnonzero(np.isfinite(along_m))
         at_m = np.mod(along_m[there], self.length_m) if self.is_ring else along_m[there]
@@ -67,8 +123,27 @@ class Road:
             meets = np.abs(across_m[seeking + step] - across_m[seeking]) < width_m
             found[number[seeking[meets]]] = number[seeking[meets] + step]
             seeking = seeking[~meets]
-        return found
+        way_m = along_m[found] - along_m
+        way_m = np.mod(way_m, self.length_m) if self.is_ring else way_m
+        return found, np.where(found >= 0, way_m, np.nan)
 
-    def distance_m(self, along_m: Array, ahead_m: Array) -> Array:
-        """Return the way (N,) along the road from positions to others ahead."""
-        return np.mod(ahead_m - along_m, self.length_m) if self.is_ring else np.asarray(ahead_m - along_m)
+    def distance_m(self, along_m: Array, rear: int, front: int) -> float:
+        """Return the way along the road from one vehicle to another."""
+        way_m = float(along_m[front] - along_m[rear])
+        return way_m % self.length_m if self.is_ring else way_m
+
+    def crossing_pairs(self, along_m: Array, position_m: Array, reach_m: float) -> tuple[Ints, Ints]:
+        """Return no pair: on one road each vehicle is behind another."""
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+
+    def lane_count(self, along_m: Array) -> Ints:
+        """Return the number (N,) of lanes, the same everywhere."""
+        return np.full(len(along_m), self.lanes, dtype=np.intp)
+
+    def left_m(self, along_m: Array, nominal_m: Array) -> Array:
+        """Return `nominal_m` (N,): all lanes have the same width."""
+        return nominal_m
+
+    def rank(self, along_m: Array) -> Array:
+        """Return the positions (N,): the foremost is the furthest."""
+        return along_m

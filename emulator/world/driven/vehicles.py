@@ -11,13 +11,15 @@ import numpy as np
 
 from emulator.scenario.driven import Driven
 from emulator.world.driven.dynamics import Limits, Longitudinal
-from emulator.world.driven.road import Road
+from emulator.world.driven.rectangles import rectangles_overlap
+from emulator.world.driven.start import Start, one_each, start_on_single_road
 from vnet.driving import Action
 from vnet.errors import ScenarioError
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
 COLLISION = "collision"
+LANE_ENDED = "lane_ended"
 LIMITED = "drive_limited"
 """Events of driven vehicles."""
 
@@ -44,25 +46,28 @@ class DrivenVehicles:
     """The true state of driven vehicles. `now_ns` is the last control instant that they have come to.
 
     A command holds from the first control instant at or after it until the next one. Vehicles are on `road`, their
-    centres at `along_m` and `left_m` (N,), with `speed` and `acceleration` (N,), all NaN once they have left.
+    centres at `along_m` and `left_m` (N,), with `speed` and `acceleration` (N,), all NaN once they have left. They
+    are at `start`, or if it is left out where `driven` has them on a single road.
     """
 
-    def __init__(self, driven: Driven, node_ids: Sequence[str], step_ns: int) -> None:
+    def __init__(self, driven: Driven, node_ids: Sequence[str], step_ns: int, start: Start | None = None) -> None:
         count = len(node_ids)
+        start = start_on_single_road(driven, count) if start is None else start
         self._driven, self._node_ids, self.step_ns = driven, node_ids, step_ns
         self.now_ns = 0
-        self.road = Road(driven.length_m, driven.lanes, driven.lane_width_m, driven.road == "ring")
+        self.road = start.road
         self._limits = Limits(
             driven.lag_s, driven.max_acceleration_mps2, driven.max_braking_mps2, driven.max_speed_mps
         )
         self._motion = Longitudinal(self._limits, step_ns / NS_PER_S)
-        self.lane = start_lanes(driven, count)
-        along_m = start_positions_m(driven, self.lane)
-        speed = np.array(_one_each("speed_mps", driven.speeds_mps(count), count))
-        self._state = np.array([along_m, speed, np.zeros(count)])
-        self.left_m: Array = self.lane * np.float64(driven.lane_width_m)
-        self._from_left_m = self.left_m.copy()
-        self._before_m = along_m
+        self.lane = start.lane.copy()
+        speed = np.array(one_each("speed_mps", driven.speeds_mps(count), count))
+        self._state = np.array([start.along_m, speed, np.zeros(count)])
+        self._nominal_m: Array = self.lane * np.float64(driven.lane_width_m)
+        """Distances (N,) from the rightmost lane, if all lanes had the width of the scenario."""
+        self._from_nominal_m = self._nominal_m.copy()
+        self.left_m = self.road.left_m(self.along_m, self._nominal_m)
+        self._before_m = self.along_m
         """Positions (N,) at the last control instant: a collision puts nobody further back."""
         self._change_steps = max(1, round(driven.lane_change_s * NS_PER_S / step_ns))
         self._changing = np.full(count, self._change_steps)
@@ -72,14 +77,13 @@ class DrivenVehicles:
         self._pending: deque[tuple[int, int, Action]] = deque()
         self._collided: set[tuple[int, int]] = set()
         self.log = Log()
-        if crashed := self._overlapping():
-            raise ScenarioError(
-                f"network.driven: {node_ids[crashed[0][0]]} and {node_ids[crashed[0][1]]} overlap at the start"
-            )
+        if crashed := self._overlapping() + self._crossing():
+            one, other = crashed[0]
+            raise ScenarioError(f"network.driven: {node_ids[one]} and {node_ids[other]} overlap at the start")
 
     @property
     def along_m(self) -> Array:
-        """Positions (N,) of the centres along the road, in m; on a ring they go on counting."""
+        """Positions (N,) of the centres along their ways, in m; on a ring they go on counting."""
         return np.asarray(self._state[0])
 
     @property
@@ -104,10 +108,8 @@ class DrivenVehicles:
         """Return the gaps (N,) to the vehicles ahead, in m, and their rates in m/s; NaN where none is in range."""
         length_m = self._driven.vehicle_length_m
         reach_m = range_m + length_m
-        ahead = self.road.ahead(self.along_m, self.left_m, self._driven.vehicle_width_m, reach_m)
-        way_m = self.road.distance_m(self.along_m, self.along_m[ahead])
-        gap_m = np.where(ahead >= 0, way_m - length_m, np.nan)
-        return gap_m, np.where(ahead >= 0, self.speed[ahead] - self.speed, np.nan)
+        ahead, way_m = self.road.ahead(self.along_m, self.left_m, self._driven.vehicle_width_m, reach_m)
+        return way_m - length_m, np.where(ahead >= 0, self.speed[ahead] - self.speed, np.nan)
 
     def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
         """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
@@ -130,8 +132,12 @@ class DrivenVehicles:
         self._state = self._motion.advance(self._state, command)
         self.now_ns += self.step_ns
         self._move_sideways()
+        happened += self._end_lanes()
+        self.left_m = self.road.left_m(self.along_m, self._nominal_m)
         for rear, front in self._overlapping():
             happened += self._collide(rear, front)
+        for one, other in self._crossing():
+            happened += self._collide_crossing(one, other)
         return happened
 
     def finished_log(self) -> Log:
@@ -141,10 +147,8 @@ class DrivenVehicles:
         return self.log
 
     def remove_arrived(self) -> bool:
-        """Take those off a straight road that have passed its end; returns whether there are any."""
-        if self.road.is_ring:
-            return False
-        arrived = self._state[0] > self.road.length_m
+        """Take those off the road that have passed the end of their way; returns whether there are any."""
+        arrived = self._state[0] > self.road.end_m
         self._state[:, arrived] = np.nan
         return bool(arrived.any())
 
@@ -165,10 +169,11 @@ class DrivenVehicles:
         if not action.lane or self.is_wreck[number]:
             return []
         lane = int(self.lane[number]) + action.lane
-        if self._changing[number] < self._change_steps or not 0 <= lane < self.road.lanes:
+        lanes = int(self.road.lane_count(self.along_m)[number])
+        if self._changing[number] < self._change_steps or not 0 <= lane < lanes:
             reason = "there is no lane" if self._changing[number] >= self._change_steps else "changing already"
             return [Happening(self.now_ns, LIMITED, number, {"lane": action.lane, "reason": reason})]
-        self._from_left_m[number] = self.left_m[number]
+        self._from_nominal_m[number] = self._nominal_m[number]
         self.lane[number], self._changing[number] = lane, 0
         return []
 
@@ -178,26 +183,55 @@ class DrivenVehicles:
             self._changing += ~self.is_wreck & (self._changing < self._change_steps)
             done = self._changing / self._change_steps
             share = done**3 * (10 - 15 * done + 6 * done**2)
-            target_m = self.lane * self.road.lane_width_m
-            moved_m = self._from_left_m + share * (target_m - self._from_left_m)
-            self.left_m = np.asarray(np.where(self.is_wreck, self.left_m, moved_m), dtype=np.float64)
+            target_m = self.lane * self._driven.lane_width_m
+            moved_m = self._from_nominal_m + share * (target_m - self._from_nominal_m)
+            self._nominal_m = np.asarray(np.where(self.is_wreck, self._nominal_m, moved_m), dtype=np.float64)
+
+    def _end_lanes(self) -> list[Happening]:
+        """Have those in a lane that has ended, or on the way to one, be in the leftmost lane that there is."""
+        last = self.road.lane_count(self.along_m) - 1
+        ended = np.flatnonzero(self.present & (self.lane > last))
+        if not len(ended):
+            return []
+        self.lane[ended] = last[ended]
+        last_m = last[ended] * self._driven.lane_width_m
+        self._nominal_m[ended] = np.minimum(self._nominal_m[ended], last_m)
+        self._from_nominal_m[ended] = np.minimum(self._from_nominal_m[ended], last_m)
+        return [
+            Happening(self.now_ns, LANE_ENDED, number, {"lane": int(last[number])}) for number in ended.tolist()
+        ]
 
     def _sideways_mps(self) -> Array:
         """Return the speeds (N,) to the left."""
         done = self._changing / self._change_steps
-        way_m = self.lane * self.road.lane_width_m - self._from_left_m
+        way_m = self.lane * self._driven.lane_width_m - self._from_nominal_m
         lasts_s = self._change_steps * self.step_ns / NS_PER_S
         return np.where(self.is_wreck, 0.0, way_m * 30 * done**2 * (1 - done) ** 2 / lasts_s)
 
     def _overlapping(self) -> list[tuple[int, int]]:
-        """Return the pairs, rear and front, that overlap, the foremost first."""
+        """Return the pairs, rear and front, that overlap in a lane, the foremost first."""
         length_m, width_m = self._driven.vehicle_length_m, self._driven.vehicle_width_m
-        ahead = self.road.ahead(self.along_m, self.left_m, width_m, length_m)
-        close = np.flatnonzero(ahead >= 0)
-        way_m = self.road.distance_m(self.along_m[close], self.along_m[ahead[close]])
-        rear = close[way_m < length_m]
-        rear = rear[np.argsort(-self.along_m[rear], kind="stable")]
+        ahead, way_m = self.road.ahead(self.along_m, self.left_m, width_m, length_m)
+        rear = np.flatnonzero((ahead >= 0) & (way_m < length_m))
+        rear = rear[np.argsort(-self.road.rank(self.along_m)[rear], kind="stable")]
         return list(zip(rear.tolist(), ahead[rear].tolist(), strict=True))
+
+    def _crossing(self) -> list[tuple[int, int]]:
+        """Return the pairs that overlap in the plane, as where roads cross; the first has the other ahead of it."""
+        if not self.road.has_crossings:
+            return []
+        length_m, width_m = self._driven.vehicle_length_m, self._driven.vehicle_width_m
+        position_m, heading_rad = self.place()
+        one, other = self.road.crossing_pairs(self.along_m, position_m, float(np.hypot(length_m, width_m)))
+        offset_m = position_m[other] - position_m[one]
+        hit = rectangles_overlap(offset_m, heading_rad[one], heading_rad[other], length_m, width_m)
+        return [self._striker_first(*pair) for pair in zip(one[hit].tolist(), other[hit].tolist(), strict=True)]
+
+    def _striker_first(self, one: int, other: int) -> tuple[int, int]:
+        position_m, heading_rad = self.place()
+        offset_m = position_m[other] - position_m[one]
+        ahead_m = [sign * float(offset_m @ _unit(heading_rad[n])) for sign, n in ((1, one), (-1, other))]
+        return (one, other) if ahead_m[0] >= ahead_m[1] else (other, one)
 
     def _collide(self, rear: int, front: int) -> list[Happening]:
         """Let two that overlap go on at their mean speed, as equal masses do, from where they touched.
@@ -206,18 +240,32 @@ class DrivenVehicles:
         """
         closing = float(self.speed[rear] - self.speed[front])
         if closing > 0:
-            way_m = float(self.road.distance_m(self.along_m[[rear]], self.along_m[[front]])[0])
-            overlap_m = self._driven.vehicle_length_m - way_m
+            overlap_m = self._driven.vehicle_length_m - self.road.distance_m(self.along_m, rear, front)
             self._state[0, rear] = max(self._state[0, rear] - overlap_m, self._before_m[rear])
             self._state[1, [rear, front]] = (self.speed[rear] + self.speed[front]) / 2
             self._state[2, [rear, front]] = 0.0
-        pair = (min(rear, front), max(rear, front))
+        return self._wreck(rear, front, closing)
+
+    def _collide_crossing(self, one: int, other: int) -> list[Happening]:
+        """Let two that meet at an angle go on in their lanes with the shares of their mean velocity along these."""
+        if (min(one, other), max(one, other)) in self._collided:
+            return []
+        _, heading_rad = self.place()
+        pair = np.array([one, other])
+        ahead = np.stack([_unit(heading_rad[number]) for number in pair])
+        velocity = self.speed[pair, None] * ahead
+        self._state[1, pair] = np.maximum(ahead @ velocity.mean(axis=0), 0.0)
+        self._state[2, pair] = 0.0
+        return self._wreck(one, other, float(np.hypot(*(velocity[0] - velocity[1]))))
+
+    def _wreck(self, one: int, other: int, closing: float) -> list[Happening]:
+        """Have two that collide brake from now on; returns what happens, the first time of each pair."""
+        pair = (min(one, other), max(one, other))
         if pair in self._collided:
             return []
         self._collided.add(pair)
         self.is_wreck = self.is_wreck | np.isin(np.arange(len(self.is_wreck)), pair)
-        details = {"with": self._node_ids[front], "closing_m_s": closing}
-        return [Happening(self.now_ns, COLLISION, rear, details)]
+        return [Happening(self.now_ns, COLLISION, one, {"with": self._node_ids[other], "closing_m_s": closing})]
 
     def _record(self, command: Array) -> None:
         there = self.present
@@ -226,30 +274,5 @@ class DrivenVehicles:
         self.log.rows.append(np.array([self._state[0], left_m, self._state[1], self._state[2], command]))
 
 
-def start_lanes(driven: Driven, count: int) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Return the lane (N,) of each vehicle at the start. Raise ScenarioError unless each has one."""
-    if driven.start_lanes is None:
-        return np.arange(count) % driven.lanes
-    return np.array(_one_each("start_lanes", driven.start_lanes, count), dtype=np.int64)
-
-
-def start_positions_m(driven: Driven, lane: np.ndarray[Any, np.dtype[np.int64]]) -> Array:
-    """Return the positions (N,) along the road at the start, in m. Raise ScenarioError if there is no room."""
-    if driven.start_m is not None:
-        return np.array(_one_each("start_m", driven.start_m, len(lane)))
-    row = np.zeros(len(lane), dtype=np.int64)
-    for each in range(driven.lanes):
-        row[lane == each] = np.arange(int((lane == each).sum()))
-    rows, step_m = int(row.max()) + 1, driven.gap_m + driven.vehicle_length_m
-    if rows * step_m > driven.length_m:
-        raise ScenarioError(
-            f"network.driven: {rows} vehicles a lane with gap_m = {driven.gap_m:g} take {rows * step_m:g} m: the "
-            f"road has length_m = {driven.length_m:g}"
-        )
-    return np.asarray((rows - 1 - row) * step_m + driven.vehicle_length_m / 2)
-
-
-def _one_each(name: str, values: Sequence[Any], count: int) -> Sequence[Any]:
-    if len(values) != count:
-        raise ScenarioError(f"network.driven.{name}: {len(values)} values for {count} vehicles: give one each")
-    return values
+def _unit(heading_rad: float) -> Array:
+    return np.array([np.cos(heading_rad), np.sin(heading_rad)])

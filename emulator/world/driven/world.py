@@ -10,13 +10,16 @@ import numpy as np
 from emulator.scenario.driven import control_step_ns
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
+from emulator.world.driven.start import Start, start_on_single_road
 from emulator.world.driven.vehicles import DrivenVehicles, Happening
+from emulator.world.projection import Frame
 from emulator.world.receivers import MotionSensors
 from emulator.world.trips.motion import Motion
 from emulator.world.truth import World, periods_of
 from vnet.errors import ScenarioError
 from vnet.node import Fix
 from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
 from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
@@ -26,17 +29,19 @@ class DrivenWorld(World):
 
     def __init__(self, scenario: Scenario) -> None:
         node_ids = _node_ids(scenario.network.vehicles)
-        self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz))
+        start, lanes, frame, notes = _start(scenario, len(node_ids))
+        self.vehicles = DrivenVehicles(scenario.driven, node_ids, control_step_ns(scenario.run.control_hz), start)
         self._units_m = [unit.position_m for unit in scenario.roadside]
         self._duration_ns = scenario.duration_ns
-        top_m = scenario.driven.max_speed_mps * scenario.run.duration_s
-        self._furthest_m = float(self.vehicles.along_m.max()) + top_m
+        self._furthest_m = start.along_m + scenario.driven.max_speed_mps * scenario.run.duration_s
         self._known = 1  # periods whose truth is known
         self._left: list[int] = []  # periods with which vehicles leave
         position_m, heading_rad = self.vehicles.place()
         periods = periods_of(scenario)
-        motion = Motion(node_ids, np.tile(position_m, (periods, 1, 1)), np.tile(heading_rad, (periods, 1)))
-        super().__init__(scenario, motion, _lane_map(scenario, self.vehicles), np.zeros(0, dtype=np.intp))
+        motion = Motion(
+            node_ids, np.tile(position_m, (periods, 1, 1)), np.tile(heading_rad, (periods, 1)), notes=notes
+        )
+        super().__init__(scenario, motion, lanes, np.zeros(0, dtype=np.intp), frame)
         self._sensors = MotionSensors(scenario, periods, len(node_ids))
         self._ranging = scenario.world.ranging
         self._gap_m, self._gap_rate_mps = _nothing(periods, len(self.node_ids))
@@ -47,14 +52,14 @@ class DrivenWorld(World):
         if scenario.run.nodes_per_process > 1 and self.may_leave:
             raise ScenarioError(
                 f"run.nodes_per_process = {scenario.run.nodes_per_process}: must be 1 where vehicles may leave: "
-                f"they may come to the end of the road, network.driven.length_m = {scenario.driven.length_m:g}"
+                f"they may come to the end of the road, after {self.vehicles.road.end_m.min():g} m"
             )
         self._fill(0)
 
     @property
     def may_leave(self) -> bool:
         """True if a vehicle may come to the end of the road."""
-        return not self.vehicles.road.is_ring and self._furthest_m > self.vehicles.road.length_m
+        return bool((self._furthest_m > self.vehicles.road.end_m).any())
 
     @property
     def has_traffic(self) -> bool:
@@ -149,10 +154,21 @@ def _node_ids(vehicles: int) -> tuple[str, ...]:
     return tuple(f"v{number:0{width}d}" for number in range(1, vehicles + 1))
 
 
-def _lane_map(scenario: Scenario, vehicles: DrivenVehicles) -> LaneMap:
+def _start(scenario: Scenario, count: int) -> tuple[Start, LaneMap | RoadMap, Frame | None, tuple[str, ...]]:
+    """Return where vehicles are at the start, the lanes that programs know, their frame, and notes for the user."""
+    if scenario.driven.road == "map":
+        from emulator.world.driven.map_start import start_on_map  # maps need much of scipy and are slow to import
+
+        found = start_on_map(scenario)
+        return found.start, found.lanes, found.frame, found.notes
+    start = start_on_single_road(scenario.driven, count)
+    return start, _lane_map(scenario), None, ()
+
+
+def _lane_map(scenario: Scenario) -> LaneMap:
     """Return the lanes that programs know: those of a straight road; of a ring none, as it is not straight."""
-    road, half_width_m = vehicles.road, scenario.world.lateral.half_width_m
-    if road.is_ring:
+    driven, half_width_m = scenario.driven, scenario.world.lateral.half_width_m
+    if driven.road == "ring":
         return LaneMap(np.zeros((0, 2)), np.zeros(0), half_width_m)
-    point_m = np.column_stack([np.zeros(road.lanes), np.arange(road.lanes) * road.lane_width_m])
-    return LaneMap(point_m, np.zeros(road.lanes), half_width_m)
+    point_m = np.column_stack([np.zeros(driven.lanes), np.arange(driven.lanes) * driven.lane_width_m])
+    return LaneMap(point_m, np.zeros(driven.lanes), half_width_m)

@@ -26,16 +26,7 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
     Raise ScenarioError if most positions are off the map.
     """
     position_m = course_m[np.isfinite(course_m[..., 0])]
-    low_m, high_m = position_m.min(axis=0) - section.margin_m, position_m.max(axis=0) + section.margin_m
-    part = roads.within(low_m, high_m)
-    lanes = part.lane_map(section.drive_on, section.sigma_m) if len(part) else None
-    if lanes is not None:
-        point_m = lanes.point_m
-        if section.aside_m:
-            point_m = point_m + section.aside_m * lanes.normal
-        if any(section.datum_m):
-            point_m = point_m + np.array(section.datum_m)
-        lanes = replace(lanes, point_m=point_m, datum_sigma_m=section.datum_sigma_m)
+    lanes = lanes_in_box(roads, section, position_m.min(axis=0), position_m.max(axis=0))
     if lanes is None or _far_share(lanes, position_m) > 0.5:
         (x, y), (left, low), (right, high) = np.median(position_m, axis=0), *_extent(roads)
         raise ScenarioError(
@@ -44,6 +35,20 @@ def lanes_around(roads: Roads, section: Map, course_m: Array) -> RoadMap:
             "check origin_deg and the projection"
         )
     return lanes
+
+
+def lanes_in_box(roads: Roads, section: Map, low_m: Array, high_m: Array) -> RoadMap | None:
+    """Return the lanes of `[map]` within its margin of the box from `low_m` to `high_m` (2,); None without any."""
+    part = roads.within(low_m - section.margin_m, high_m + section.margin_m)
+    if not len(part):
+        return None
+    lanes = part.lane_map(section.drive_on, section.sigma_m)
+    point_m = lanes.point_m
+    if section.aside_m:
+        point_m = point_m + section.aside_m * lanes.normal
+    if any(section.datum_m):
+        point_m = point_m + np.array(section.datum_m)
+    return replace(lanes, point_m=point_m, datum_sigma_m=section.datum_sigma_m)
 
 
 def notes_of(path: Path, roads: Roads) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.vehicles import COLLISION
+from tests.support.map_files import write_map
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
 from vnet import Node
 from vnet.errors import ScenarioError
@@ -57,10 +58,15 @@ def test_windows_and_processes_do_not_change_how_vehicles_drive(control_hz: floa
         assert mine == [event for event in reference[4] if event[1] != "started"]
 
 
-def test_vehicles_that_leave_do_so_alike_in_processes_of_their_own() -> None:
-    short = {"road": "straight", "length_m": 120.0, "lanes": 1}
+@pytest.mark.parametrize("is_map", [False, True])
+def test_vehicles_that_leave_do_so_alike_in_processes_of_their_own(tmp_path: Path, is_map: bool) -> None:
+    sections: dict[str, Any] = {"road": {"road": "straight", "length_m": 120.0, "lanes": 1}}
+    if is_map:
+        path = write_map(tmp_path, ([(0.0, 0.0), (70.0, 0.0), (70.0, 52.0)], (1, 0)))
+        road = {"road": "map", "routes": [["edge 0"]], "length_m": 5000.0, "lanes": 1}
+        sections = {"road": road, "map": {"path": str(path)}}
     together, apart = (
-        run(driven(PLATOON, road=short, run={"duration_s": 6.0})) for run in (run_together, run_apart)
+        run(driven(PLATOON, run={"duration_s": 6.0}, **sections)) for run in (run_together, run_apart)
     )
     left = [event.node for event in together.folder.events if event.kind == "left"]
     assert left == ["v01", "v02", "v03"]
@@ -179,7 +185,7 @@ def test_faults_cannot_select_by_a_position_that_is_not_known_yet(tmp_path: Path
         ({"network": {"kind": "generated"}}, 'driven goes with kind = "driven", not with "generated"'),
         ({"network": {"driven": {"max_speed_mps": 95.0}}}, "vehicles could pass through one another"),
         ({"world": {"common_error": {"gradient_m_per_km": 1.0}}}, "gradient_m_per_km goes not with"),
-        ({"map": {"path": "roads.osm"}}, "map goes with vehicles that drive on it"),
+        ({"map": {"path": "roads.osm"}}, 'map goes with network.driven.road = "map", not with "straight"'),
         ({"run": {"nodes_per_process": 4}}, "must be 1 where vehicles may leave"),
     ],
 )
