@@ -217,21 +217,21 @@ class DrivenVehicles:
         return list(zip(rear.tolist(), ahead[rear].tolist(), strict=True))
 
     def _crossing(self) -> list[tuple[int, int]]:
-        """Return the pairs that overlap in the plane, as where roads cross; the first has the other ahead of it."""
+        """Return the new pairs that overlap in the plane, as at crossings; the first has the other ahead of it."""
         if not self.road.has_crossings:
             return []
         length_m, width_m = self._driven.vehicle_length_m, self._driven.vehicle_width_m
         position_m, heading_rad = self.place()
         one, other = self.road.crossing_pairs(self.along_m, position_m, float(np.hypot(length_m, width_m)))
         offset_m = position_m[other] - position_m[one]
-        hit = rectangles_overlap(offset_m, heading_rad[one], heading_rad[other], length_m, width_m)
-        return [self._striker_first(*pair) for pair in zip(one[hit].tolist(), other[hit].tolist(), strict=True)]
-
-    def _striker_first(self, one: int, other: int) -> tuple[int, int]:
-        position_m, heading_rad = self.place()
-        offset_m = position_m[other] - position_m[one]
-        ahead_m = [sign * float(offset_m @ _unit(heading_rad[n])) for sign, n in ((1, one), (-1, other))]
-        return (one, other) if ahead_m[0] >= ahead_m[1] else (other, one)
+        hit = np.flatnonzero(rectangles_overlap(offset_m, heading_rad[one], heading_rad[other], length_m, width_m))
+        pairs = []
+        for each in hit.tolist():
+            pair = int(one[each]), int(other[each])
+            if pair not in self._collided:
+                ahead_m = [float(offset_m[each] @ _unit(heading_rad[number])) for number in pair]
+                pairs.append(pair if ahead_m[0] >= -ahead_m[1] else pair[::-1])
+        return pairs
 
     def _collide(self, rear: int, front: int) -> list[Happening]:
         """Let two that overlap go on at their mean speed, as equal masses do, from where they touched.
@@ -248,8 +248,6 @@ class DrivenVehicles:
 
     def _collide_crossing(self, one: int, other: int) -> list[Happening]:
         """Let two that meet at an angle go on in their lanes with the shares of their mean velocity along these."""
-        if (min(one, other), max(one, other)) in self._collided:
-            return []
         _, heading_rad = self.place()
         pair = np.array([one, other])
         ahead = np.stack([_unit(heading_rad[number]) for number in pair])
