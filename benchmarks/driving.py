@@ -1,8 +1,9 @@
-"""A hundred vehicles that programs drive, simulated: how much faster than time."""
+"""A hundred vehicles that programs drive on a ring and through a city, simulated: how much faster than time."""
 
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
@@ -10,7 +11,7 @@ from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 
-SCENARIO = {
+SCENARIO: dict[str, Any] = {
     "run": {"name": "driving", "duration_s": 20.0},
     "network": {
         "kind": "driven",
@@ -21,11 +22,25 @@ SCENARIO = {
     "radio": {"range_m": 150.0, "loss": 0.1},
     "program": {"entry": "docs.examples.platoon.platoon:main"},
 }
+CITY: dict[str, Any] = {
+    "network": {
+        "kind": "driven",
+        "vehicles": 100,
+        "size_m": 1500.0,
+        "driven": {"road": "map", "speed_mps": 10.0, "gap_m": 10.0},
+    },
+    "radio": {"range_m": 450.0, "loss": 0.1},
+}
 
 
 def measure() -> dict[str, float]:
+    """Return the figures of a ring, and those of a city."""
+    city = measured(Scenario.model_validate(SCENARIO | CITY))
+    return measured(Scenario.model_validate(SCENARIO)) | {f"city_{name}": value for name, value in city.items()}
+
+
+def measured(scenario: Scenario) -> dict[str, float]:
     """Return emulated by processor time, and the share of the vehicles' motion in it."""
-    scenario = Scenario.model_validate(SCENARIO)
     with tempfile.TemporaryDirectory(prefix="vnet-bench-") as folder:
         emulation = Emulation(scenario, build_world(scenario), RunFolder.create(Path(folder) / "run", scenario))
         advance, moving_s = emulation.driving.advance_to, [0.0]

@@ -24,7 +24,7 @@ class Driven(Section):
     routes: tuple[Annotated[tuple[str, ...], Field(min_length=1)], ...] | None = Field(None, min_length=1)
     """`map`: roads that vehicles follow, by their names in the map's file, such as `["way 12", "-way 7"]`; `-` for
     one against its direction. Vehicles have the routes in turn. If left out, each vehicle starts anywhere, and
-    takes any exit of each junction; `network.seed` draws them."""
+    takes any exit of each junction, but dead ends; `network.seed` draws them."""
     length_m: float = Field(5000.0, ge=100, le=100_000)
     """Length of the road: of a ring the circumference of its rightmost lane."""
     lanes: int = Field(1, ge=1, le=12)

@@ -86,12 +86,24 @@ class Links:
         found = self.starting(int(self.end[link]))
         return np.sort(found[self.is_open[found] & (found != link ^ 1)])
 
+    @cached_property
+    def is_endless(self) -> Mask:
+        """Mask (L,) of the links from which a vehicle can go on for ever without a U-turn."""
+        alive, before = self.is_open, -1
+        while alive.sum() != before:
+            before = alive.sum()
+            starting = np.bincount(self.start[alive], minlength=len(self._first_of))
+            back = alive.reshape(-1, 2)[:, ::-1].ravel()
+            alive = alive & (starting[self.end] > back)
+        return alive
+
     def drivable_exits(self, link: int) -> list[int]:
-        """Return the exits of a link without hairpins, unless there are no others."""
+        """Return the exits of a link that lead to no dead end and are no hairpins, as far as there are any."""
         if link not in self._drivable:
-            exits = self.exits(link).tolist()
-            wide = [each for each in exits if abs(self.turn_rad(link, each)) <= HAIRPIN_RAD]
-            self._drivable[link] = wide or exits
+            found = self.exits(link).tolist()
+            found = [each for each in found if self.is_endless[each]] or found
+            wide = [each for each in found if abs(self.turn_rad(link, each)) <= HAIRPIN_RAD]
+            self._drivable[link] = wide or found
         return self._drivable[link]
 
     def turn_rad(self, link: int, other: int) -> float:

@@ -35,7 +35,7 @@ def elements_of(paths: Paths, links: Iterator[int], least_m: float) -> tuple[int
 def drawn_links(links: Links, rng: np.random.Generator, first: int) -> Iterator[int]:
     """Yield the links of a route that begins with `first`, and takes any exit of each junction but a U-turn.
 
-    It ends where there is none. Hairpins are taken only where there is no other exit.
+    Dead ends and hairpins are taken only where there is no other exit. A route ends where there is none at all.
     """
     link = first
     while True:

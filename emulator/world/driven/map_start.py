@@ -146,7 +146,7 @@ class _Ways:
         """Return `count` vehicles anywhere on the map, each drawn from a stream of its own."""
         links, length_m = self._links, self._driven.vehicle_length_m
         fits = links.is_open & ~links.is_crossing & (links.length_m > 2 * length_m)
-        candidates = np.flatnonzero(fits)
+        candidates = np.flatnonzero(fits & links.is_endless if (fits & links.is_endless).any() else fits)
         if not len(candidates):
             raise ScenarioError(f"{self._source}: no road is as long and wide as a vehicle needs it to start there")
         share = np.cumsum(links.length_m[candidates])
