@@ -136,9 +136,10 @@ class Links:
 def _is_stop(roads: Roads) -> Mask:
     """Return the mask of the points at which roads end or meet."""
     entry = roads.segment
-    steps = np.sort(np.column_stack([roads.node[entry], roads.node[entry + 1]]), axis=1)
-    neighbours = np.bincount(np.unique(steps, axis=0).ravel(), minlength=len(roads.node_m))
-    is_stop = neighbours != 2
+    count = len(roads.node_m)
+    one, other = roads.node[entry], roads.node[entry + 1]
+    steps = np.divmod(np.unique(np.minimum(one, other) * count + np.maximum(one, other)), count)
+    is_stop = np.bincount(np.concatenate(steps), minlength=count) != 2
     is_stop[roads.node[roads.first[:-1]]] = True
     is_stop[roads.node[roads.first[1:] - 1]] = True
     return np.asarray(is_stop)
