@@ -14,10 +14,8 @@ SHARE = 0.45
 """Greatest share of a link, or of a straight part of it, that a turn at one of its ends takes."""
 TURN_POINTS = 13
 """Points of the path of a turn."""
-ARC_STEP_RAD = 0.1
-"""Turn from one point of an arc to the next."""
-MOST_ARC_POINTS = 12
-"""Most points of an arc."""
+ARC_POINTS = 7
+"""Points of the arc that rounds a corner: of a right angle one every 15°."""
 _SAME_M = 1e-6
 """Points closer than this are the same."""
 _MIN_ONE_PLUS_COSINE = 0.5
@@ -113,6 +111,8 @@ def offset_line(line_m: Array, right_m: float) -> Array:
     inner = right[1:] + right[:-1]
     scale = np.maximum(1 + np.einsum("ij,ij->i", right[1:], right[:-1]), _MIN_ONE_PLUS_COSINE)
     moved_m = line_m + right_m * np.concatenate([right[:1], inner / scale[:, None], right[-1:]])
+    if (np.einsum("ij,ij->i", np.diff(moved_m, axis=0), step) > 0).all():
+        return np.asarray(moved_m)
     kept = [0]
     for k in range(1, len(line_m)):
         if float((moved_m[k] - moved_m[kept[-1]]) @ step[k - 1]) > 0:
@@ -128,15 +128,17 @@ def rounded(line_m: Array) -> tuple[Array, Array]:
     length_m = np.hypot(*step.T)
     heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
     ahead = step / length_m[:, None]
-    points, headings = [line_m[:1]], [heading[:1]]
-    for k in np.flatnonzero(np.abs(np.diff(heading)) > _SAME_M).tolist():
-        cut_m, turn = min(CORNER_M, SHARE * length_m[k], SHARE * length_m[k + 1]), heading[k + 1] - heading[k]
-        t = np.linspace(0, 1, min(3 + int(abs(turn) / ARC_STEP_RAD), MOST_ARC_POINTS))[:, None]
-        # A quadratic Bézier curve with the corner as its control point.
-        points.append(line_m[k + 1] + cut_m * (t**2 * ahead[k + 1] - (1 - t) ** 2 * ahead[k]))
-        tangent = (1 - t) * ahead[k] + t * ahead[k + 1]
-        headings.append(heading[k] + _wrapped(np.arctan2(tangent[:, 1], tangent[:, 0]) - heading[k]))
-    return np.concatenate([*points, line_m[-1:]]), np.concatenate([*headings, heading[-1:]])
+    corner = np.flatnonzero(np.abs(np.diff(heading)) > _SAME_M)
+    before, after, point_m = ahead[corner, None], ahead[corner + 1, None], line_m[corner + 1, None]
+    cut_m = np.minimum(CORNER_M, SHARE * np.minimum(length_m[corner], length_m[corner + 1]))[:, None, None]
+    # Quadratic Bézier curves with the corners as their control points.
+    t = np.linspace(0, 1, ARC_POINTS)[:, None]
+    arc_m = point_m + cut_m * (t**2 * after - (1 - t) ** 2 * before)
+    tangent = (1 - t) * before + t * after
+    start_rad = heading[corner, None]
+    arc_rad = start_rad + _wrapped(np.arctan2(tangent[..., 1], tangent[..., 0]) - start_rad)
+    points_m = np.concatenate([line_m[:1], arc_m.reshape(-1, 2), line_m[-1:]])
+    return points_m, np.concatenate([heading[:1], arc_rad.ravel(), heading[-1:]])
 
 
 def _turn(one: Path, then: Path) -> Path:
@@ -154,13 +156,19 @@ def _turn(one: Path, then: Path) -> Path:
             end_m,
         ]
     )
-    t = np.linspace(0, 1, TURN_POINTS)[:, None]
-    weight = np.concatenate([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3], axis=1)
-    slope = np.concatenate([(1 - t) ** 2, 2 * t * (1 - t), t**2], axis=1)
-    tangent = slope @ np.diff(control_m, axis=0)
+    tangent = (_SLOPE[..., None] * np.diff(control_m, axis=0)).sum(axis=1)
     heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
     lanes, width_m = (one.lanes[1], then.lanes[0]), (one.width_m[1], then.width_m[0])
-    return Path(weight @ control_m, heading, lanes, width_m)
+    return Path((_WEIGHT[..., None] * control_m).sum(axis=1), heading, lanes, width_m)
+
+
+def _cubic(t: Array) -> tuple[Array, Array]:
+    """Return the weights of the four control points of a cubic Bézier curve, and of their steps in its slope."""
+    weight = np.column_stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
+    return weight, np.column_stack([(1 - t) ** 2, 2 * t * (1 - t), t**2])
+
+
+_WEIGHT, _SLOPE = _cubic(np.linspace(0, 1, TURN_POINTS))
 
 
 def _wrapped(angle: Array) -> Array:

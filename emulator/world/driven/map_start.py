@@ -76,7 +76,11 @@ def start_on_map(scenario: Scenario) -> MapStart:
     if section is None:
         return MapStart(start, roads.lane_map(), roads.frame, ())
     lanes = lanes_in_box(roads, section, *start.road.area_m(start.along_m))
-    assert lanes is not None, "vehicles are on some"
+    if lanes is None:
+        raise ScenarioError(
+            f"map.aside_m = {section.aside_m:g}: vehicles would be further than margin_m = {section.margin_m:g} m "
+            f"from all roads of {source}"
+        )
     return MapStart(start, lanes, roads.frame, notes_of(section.path, roads))
 
 
@@ -152,19 +156,22 @@ class _Ways:
         share = np.cumsum(links.length_m[candidates])
         places: list[_Place] = []
         routes: list[Route] = []
+        place_m, link_of = np.zeros((count, 2)), np.zeros(count, dtype=np.intp)
         for number in range(count):
             rng = stream(seed, STREAM, number)
             drawn = (
                 self._draw(rng, int(candidates[np.searchsorted(share, rng.random() * share[-1], side="right")]))
                 for _ in range(TRIES)
             )
-            place = next((each for each in drawn if self._is_free(each, places)), None)
+            others = link_of[:number], place_m[:number]
+            place = next((each for each in drawn if self._is_free(each, *others)), None)
             if place is None:
                 raise ScenarioError(
                     f"network.driven: no room for vehicle {number + 1} with gap_m = {self._driven.gap_m:g} on the "
                     f"roads of {self._source}: set fewer vehicles, or a smaller gap_m"
                 )
             places.append(place)
+            link_of[number], place_m[number] = place.link, place.position_m
             least_m = place.along_m + self._reach_m
             routes.append(elements_of(self._paths, drawn_links(links, rng, place.link), least_m))
         along_m, lane = np.array([place.along_m for place in places]), np.array([place.lane for place in places])
@@ -176,11 +183,11 @@ class _Ways:
         lane = int(rng.integers(path.lanes[0]))
         return _Place(link, along_m, lane, path.at(along_m, lane * path.width_m[0]))
 
-    def _is_free(self, place: _Place, others: list[_Place]) -> bool:
-        """Return whether a vehicle has its gap to those in its road, and is clear of those of other roads."""
+    def _is_free(self, place: _Place, link_of: Ints, place_m: Array) -> bool:
+        """Return whether a vehicle has its gap to those in its street, and is clear of those in other streets.
+
+        The others are in the streets `link_of` (n,) at `place_m` (n, 2).
+        """
         length_m = self._driven.vehicle_length_m
-        for other in others:
-            clear_m = length_m + (self._driven.gap_m if other.link == place.link else length_m)
-            if np.hypot(*(place.position_m - other.position_m)) < clear_m:
-                return False
-        return True
+        clear_m = length_m + np.where(link_of == place.link, self._driven.gap_m, length_m)
+        return bool((np.hypot(*(place_m - place.position_m).T) >= clear_m).all())
