@@ -215,7 +215,11 @@ EVENTS = {
         "`acceleration_m_s2`, `limit_m_s2` or `lane`, `reason`",
         "`node.drive` asked for what the vehicle cannot do; of an acceleration the first time in a row",
     ),
-    "collision": ("vehicle", "`with`, `closing_m_s`", "a driven vehicle has run into another, which was ahead"),
+    "collision": (
+        "vehicle",
+        "`with`, `closing_m_s`",
+        "a driven vehicle has run into another, which was ahead, or crossed its way",
+    ),
     "lane_ended": ("vehicle", "`lane`", "on a map: a driven vehicle's lane has ended, and it is in this one now"),
     "rule_failed": (
         "",
