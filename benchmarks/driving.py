@@ -29,7 +29,7 @@ CITY: dict[str, Any] = {
         "size_m": 1500.0,
         "driven": {"road": "map", "speed_mps": 10.0, "gap_m": 10.0},
     },
-    "radio": {"range_m": 450.0, "loss": 0.1},
+    "radio": {"range_m": 380.0, "loss": 0.1},
 }
 
 
