@@ -9,7 +9,7 @@ import numpy as np
 
 from emulator.world.driven.map_links import Links
 from emulator.world.driven.map_paths import Paths
-from vnet.errors import ScenarioError, did_you_mean
+from vnet.errors import ScenarioError, did_you_mean, first_names
 
 AGAINST = "-"
 """Sign before the name of a road on which a route goes against the road's direction."""
@@ -86,6 +86,7 @@ class NamedRoutes:
     def _open_links(self, name: str) -> set[int]:
         if name not in self._of_name:
             meant = did_you_mean(name, list(self._of_name))
+            meant = meant or f"; it has {first_names(list(dict.fromkeys(self._links.roads.name)))}"
             raise ScenarioError(f"{KEY}: {name!r}: no such road in {self._source}{meant}")
         found = {link for link in self._of_name[name] if self._links.is_open[link]}
         if not found:

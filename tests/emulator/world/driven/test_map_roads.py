@@ -296,7 +296,12 @@ def brute_force_way_m(road: MapRoads, along_m: Any, left_m: Any, number: int, ra
 @pytest.mark.parametrize(
     ("count", "keys", "message"),
     [
-        (1, {"routes": [["edge 9"]]}, r"network.driven.routes: 'edge 9': no such road in .*roads.npz.*"),
+        (
+            1,
+            {"routes": [["edge 9"]]},
+            r"network.driven.routes: 'edge 9': no such road in .*npz \(did you mean edge",
+        ),
+        (1, {"routes": [["Main"]]}, "'Main': no such road in .*npz; it has edge 0, edge 1, edge 2, edge 3"),
         (1, {"routes": [["-edge 0"]]}, "routes: '-edge 0': no lane in this direction is as wide as a vehicle"),
         (1, {"routes": [["edge 0", "edge 2"]]}, "'edge 2' does not begin or go on where 'edge 0' leads to"),
         (9, {"routes": [EAST], "gap_m": 50.0}, "9 vehicles a lane with gap_m = 50 take 490.5 m: route"),
