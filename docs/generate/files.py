@@ -266,6 +266,7 @@ VERDICT = {
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
     "figures": "means of some metrics, after the first fifth of the run",
+    "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",
     "driving": "where programs drive: `collisions`, `limited_actions`, `hardest_braking_m_s2`; else empty",
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "

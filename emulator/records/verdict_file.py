@@ -42,6 +42,7 @@ class Record:
     reported: dict[str, ReportedFigure] = field(default_factory=dict)
     driving: dict[str, float | None] = field(default_factory=dict)
     backbone: dict[str, int] = field(default_factory=dict)
+    roadside_units: int = 0
     cost: RunCost | None = None
     versions: dict[str, str] = field(default_factory=dict)
 

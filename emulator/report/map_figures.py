@@ -13,7 +13,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
-from emulator.pages.canvas import BLUE, GREY, INK, SKY, Canvas, canvas, legend
+from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
 from emulator.records.reported import figure_text, is_text
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
@@ -39,6 +39,8 @@ POINTS_A_TRAJECTORY = 80
 MOST_CLASSES = 5
 OPACITY = (0.06, 0.25, 0.45, 0.7, 1.0)
 """Opacity of a vehicle's point, by the class of its value."""
+UNIT: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 8, "color": ORANGE, "zorder": 4}
+"""Marker of a roadside unit."""
 LONG_LABEL = 14
 """Letters of a class from which on the legend has two columns instead of three."""
 MOST_COLOURED = 6
@@ -67,6 +69,9 @@ def _network(source: Source) -> Drawing:
         shown = _draw_links(made, source, scale)
         text = f"{_ground(source)} Lines: {shown}; points: vehicles."
     _draw_vehicles(made, position_m * scale)
+    if units := source.scenario.roadside:
+        made.axes.plot(*(position_m[-len(units) :] * scale).T, **UNIT)
+        text += " Squares: roadside units."
     if len(position_m) <= MOST_NAMED:
         for node, (x, y) in zip(source.recorded.node_ids, position_m * scale, strict=True):
             if np.isfinite(x):

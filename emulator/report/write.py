@@ -25,6 +25,7 @@ from emulator.report.index import write_index
 from emulator.report.radio import radio_section
 from emulator.report.source import Source, maybe, why_not
 from emulator.report.timeline import timeline
+from vnet.counted import counted
 from vnet.errors import VnetError, first_names
 
 MOST_EVENTS = 200
@@ -91,7 +92,9 @@ def report_page(source: Source) -> str:
 
 def _facts(source: Source, record: Record | None) -> Iterator[str]:
     if record is not None:
-        yield f"{record.vehicles} vehicle{'s' if record.vehicles != 1 else ''}"
+        yield counted(record.vehicles, "vehicle")
+        if record.roadside_units:
+            yield counted(record.roadside_units, "roadside unit")
     if scenario := maybe(lambda: source.scenario):
         emulated = f"{record.emulated_s:g} of " if record and record.emulated_s != scenario.run.duration_s else ""
         yield f"{emulated}{scenario.run.duration_s:g} s emulated"

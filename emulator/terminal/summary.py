@@ -194,6 +194,8 @@ def _figures(verdict: dict[str, Any]) -> Table:
     table.add_column()
     table.add_column(justify="right")
     table.add_row("vehicles", str(verdict["vehicles"]))
+    if verdict.get("roadside_units"):
+        table.add_row("roadside units", str(verdict["roadside_units"]))
     table.add_row("emulated time", f"{verdict['emulated_s']:.1f} s")
     if verdict["start_up_s"]:
         table.add_row("start of the processes", f"{verdict['start_up_s']:.1f} s")

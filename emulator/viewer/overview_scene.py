@@ -22,6 +22,7 @@ from emulator.viewer.drawing import (
     DARK,
     GREEN,
     GREY,
+    ORANGE,
     OUTCOME_COLOURS,
     POSITION_RINGS_M,
     PURPLE,
@@ -93,6 +94,10 @@ class OverviewScene:
             canvas.strip_style("map/buildings", (*GREY, 200), 1.0, -29.0)
             canvas.strips("map/buildings", edges, static=True)
         self._set_styles()
+        if units := tomllib.loads(scene["scenario"]).get("roadside", []):
+            names = [unit["id"] for unit in units]
+            canvas.point_style("map/roadside", ORANGE, 7.0, names, show_labels=True, order=29.0)
+            canvas.points("map/roadside", [unit["position_m"] for unit in units], static=True)
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas, scene)
         canvas.rings("common", COMMON_RINGS_M)
@@ -242,6 +247,8 @@ def draw_scale(canvas: Canvas, point_m: Floats) -> None:
 def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
     """Legend of the map's colours, in a view of its own: two rows of points with their names."""
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
+    if "roadside" in tomllib.loads(scene["scenario"]):
+        vehicles.append(("roadside unit", ORANGE))
     never = impossible(scene)
     links = [(one.title, colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):

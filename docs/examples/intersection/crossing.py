@@ -1,7 +1,8 @@
-"""An intersection that a unit beside the road grants to vehicles: docs/how-to/intersection.md.
+"""An intersection that a roadside unit grants to vehicles: docs/how-to/intersection.md.
 
-The first vehicle stands at the crossing and is the unit. It grants the crossing to vehicles of one road at a time.
-A grant ends when the unit has heard that the vehicle is past, so no packet loss puts two roads onto the crossing.
+The unit grants the crossing to vehicles of one road at a time. A grant ends when the unit has heard that the
+vehicle is past, so no packet loss puts two roads onto the crossing. The unit also knows where it stands, and so
+tells vehicles the error that its receiver has in common with theirs.
 """
 
 from __future__ import annotations
@@ -10,34 +11,34 @@ import math
 from dataclasses import dataclass
 
 import msgspec
+import numpy as np
 
 from vnet import Node
 
-CROSSING_M = 1500.0
-"""Position of the crossing along either road."""
-LINE_M = 1488.0
-"""Line at which a vehicle without a grant waits: its own length before the crossing, and room for noise."""
-PAST_M = 1510.0
+LINE_M = -12.0
+"""Line before the crossing at which a vehicle without a grant waits: its own length, and room for noise."""
+PAST_M = 10.0
 """From here on a vehicle is past the crossing."""
 ASKS_M = 120.0
 """Distance to the line from which on a vehicle asks."""
 VEHICLE_M = 5.0
 """Least distance between two positions of vehicles in a lane."""
-TELLS_M = 100.0
-"""Distance behind the crossing up to which a vehicle says that it is past."""
+CORRECTION_S = 2.0
+"""Time over which the unit averages the noise of its receiver."""
 
 
 class Request(msgspec.Struct, tag="request", frozen=True):
-    """Request of a vehicle of road 0 or 1 for the crossing, and where it is; behind it, word that it is past."""
+    """Request of a vehicle of road 0 or 1, `at_m` behind the crossing; far enough behind, word that it is past."""
 
     road: int
     at_m: float
 
 
 class Grants(msgspec.Struct, tag="grants", frozen=True):
-    """The vehicles that may cross."""
+    """The vehicles that may cross, and the common error of all receivers in m, as far as the unit knows it."""
 
     vehicles: list[str]
+    error_m: tuple[float, float]
 
 
 MESSAGES = msgspec.msgpack.Decoder(Request | Grants)
@@ -45,10 +46,9 @@ MESSAGES = msgspec.msgpack.Decoder(Request | Grants)
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the program: whether vehicles wait for a grant, the unit's patience, and the drivers' model."""
+    """Options of vehicles: whether they wait for a grant, and the drivers' model."""
 
     waits: bool = True
-    patience_s: float = 8.0
     cruise_m_s: float = 14.0
     headway_s: float = 1.2
     standstill_m: float = 2.0
@@ -103,36 +103,38 @@ class Book:
                 del self._waiting[vehicle]
 
 
-async def unit(node: Node, options: Options) -> None:
+async def unit(node: Node) -> None:
     """Grant the crossing to one road at a time, and say ten times a second who has a grant."""
-    book = Book(options.patience_s)
+    assert node.surveyed_position_m is not None
+    book, error_m = Book(float(node.options["patience_s"])), np.zeros(2)
     async for fix in node.gnss:
+        keeps = math.exp(-node.period_ns / 1e9 / CORRECTION_S) if fix.time_ns else 0.0
+        error_m = keeps * error_m + (1 - keeps) * (fix.position_m - node.surveyed_position_m)
         for packet in node.radio.drain():
             message = MESSAGES.decode(packet.payload)
             if isinstance(message, Request):
                 book.note(packet.sender, message, fix.time_ns / 1e9)
         book.decide(fix.time_ns / 1e9)
-        await node.radio.broadcast(msgspec.msgpack.encode(Grants(sorted(book.granted))))
-
-
-async def vehicle(node: Node, options: Options) -> None:
-    """Ask for the crossing, stop at the line without a grant, and say so when past."""
-    road = int(node.id[1:]) % 2
-    may_cross = not options.waits
-    async for fix in node.gnss:
-        for packet in node.radio.drain():
-            message = MESSAGES.decode(packet.payload)
-            may_cross |= isinstance(message, Grants) and node.id in message.vehicles
-        at_m, speed_m_s = float(fix.position_m[0]), fix.speed_m_s or 0.0
-        asked = wished(options, speed_m_s, fix.gap_m, fix.gap_rate_m_s or 0.0)
-        if not may_cross and at_m < CROSSING_M:
-            asked = min(asked, wished(options, speed_m_s, LINE_M - at_m, -speed_m_s))
-        node.drive(asked)
-        if LINE_M - ASKS_M < at_m < CROSSING_M + TELLS_M:
-            await node.radio.broadcast(msgspec.msgpack.encode(Request(road, at_m)))
+        grants = Grants(sorted(book.granted), (float(error_m[0]), float(error_m[1])))
+        await node.radio.broadcast(msgspec.msgpack.encode(grants))
 
 
 async def main(node: Node) -> None:
-    """Be the unit at the crossing, or a vehicle."""
+    """Ask for the crossing, stop at the line without a grant, and tell the unit that the vehicle is past."""
     options = Options(**node.options)
-    await (unit if int(node.id[1:]) == 1 else vehicle)(node, options)
+    may_cross, is_over, at_m, error_m = not options.waits, False, -math.inf, np.zeros(2)
+    async for fix in node.gnss:
+        road = int(abs(math.sin(fix.heading_rad or 0.0)) > 0.5)  # 0 goes to the east, 1 to the north
+        for packet in node.radio.drain():
+            message = MESSAGES.decode(packet.payload)
+            if isinstance(message, Grants):
+                may_cross |= node.id in message.vehicles
+                error_m = np.array(message.error_m)
+                is_over |= at_m > PAST_M and node.id not in message.vehicles
+        at_m, speed_m_s = float((fix.position_m - error_m)[road]), fix.speed_m_s or 0.0
+        asked = wished(options, speed_m_s, fix.gap_m, fix.gap_rate_m_s or 0.0)
+        if not may_cross and at_m < 0:
+            asked = min(asked, wished(options, speed_m_s, LINE_M - at_m, -speed_m_s))
+        node.drive(asked)
+        if at_m > LINE_M - ASKS_M and not is_over:
+            await node.radio.broadcast(msgspec.msgpack.encode(Request(road, at_m)))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Mapping
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,49 +19,45 @@ import emulator
 from vnet.types import Array
 
 SCENARIO = Path(__file__).parent / "crossing.toml"
-CROSSING_M, BEHIND_M, CRUISE_M_S = 1500.0, 50.0, 14.0
-HALF_BOX_M = (4.5 + 1.8) / 2
-"""Two vehicles of crossing roads overlap while both are nearer to the crossing: half a length and half a width."""
+BEHIND_M, CRUISE_M_S = 50.0, 14.0
 
 
 class Crossing(NamedTuple):
-    """Result of a run: mean delay in s, pairs of vehicles that overlapped on the crossing, vehicles not past."""
+    """Result of a run: mean delay in s, collisions, vehicles not past."""
 
     delay_s: float
-    overlaps: int
+    collisions: int
     not_past: int
 
 
 def starts(seed: int, vehicles: int) -> list[float]:
-    """Return positions at the start in m: the unit's, then each vehicle's, 65 m apart in the mean."""
+    """Return positions along their roads at the start in m, of the two roads in turn, 65 m apart in the mean."""
     gaps_m = 15 + np.random.default_rng(seed).exponential(50, (vehicles // 2, 2))
-    return [CROSSING_M, *np.round(1400 - np.cumsum(gaps_m, axis=0), 1).ravel().tolist()]
+    return np.round(1400 - np.cumsum(gaps_m, axis=0), 1).ravel().tolist()
 
 
 def cross(changes: Mapping[str, object], seed: int, places: list[float]) -> Crossing:
-    """Return the result of a run in which the unit and the vehicles start at `places` in m."""
+    """Return the result of a run in which vehicles start at `places` in m along their roads."""
     changes = {**changes, "network.driven.start_m": places}
     with tempfile.TemporaryDirectory() as folder:
         run = emulator.simulate(SCENARIO, seed=seed, set=changes, out=Path(folder) / "run")
-        table = run.driven
+        time_ns, position = run.states["time_ns"].to_numpy(), run.states["position_m"].combine_chunks()
         crashed = [event.node for event in run.events if event.kind == "crashed"]
-    if table is None or crashed:  # a crashed program's vehicle goes on, and would count as any other
+        collisions = len([event for event in run.events if event.kind == "collision"])
+    if crashed:  # a crashed program's vehicle goes on, and would count as any other
         raise RuntimeError(f"seed {seed}: programs of {crashed} crashed")
-    count = len(places)
-    time_s = table["time_ns"].to_numpy()[::count] / 1e9
-    along_m = table["along_m"].to_numpy().reshape(-1, count)[:, 1:]
-    return measured(time_s, along_m, np.array(places[1:]))
+    count = len(places) + 1  # the unit is the last node
+    position_m = position.flatten().to_numpy().reshape(-1, count, 2)[:, :-1]
+    at_m = position_m[:, np.arange(len(places)), np.arange(len(places)) % 2]
+    return measured(time_ns[::count] / 1e9, at_m, collisions)
 
 
-def measured(time_s: Array, along_m: Array, start_m: Array) -> Crossing:
-    """Return delays and overlaps of vehicles (N,), of the two roads in turn, from their positions (K, N)."""
-    is_past = along_m >= CROSSING_M + BEHIND_M
+def measured(time_s: Array, at_m: Array, collisions: int) -> Crossing:
+    """Return the delays of vehicles (N,) from their positions behind the crossing (K, N) in m."""
+    is_past = at_m >= BEHIND_M
     past_s = np.where(is_past.any(axis=0), time_s[is_past.argmax(axis=0)], time_s[-1])
-    free_s = (CROSSING_M + BEHIND_M - start_m) / CRUISE_M_S
-    on = np.abs(along_m - CROSSING_M) < HALF_BOX_M
-    pairs = combinations(range(along_m.shape[1]), 2)
-    overlaps = sum(bool((on[:, a] & on[:, b]).any()) for a, b in pairs if (a + b) % 2)
-    return Crossing(float((past_s - free_s).mean()), overlaps, int((~is_past.any(axis=0)).sum()))
+    free_s = (BEHIND_M - at_m[0]) / CRUISE_M_S
+    return Crossing(float((past_s - free_s).mean()), collisions, int((~is_past.any(axis=0)).sum()))
 
 
 def main() -> None:
@@ -92,7 +87,7 @@ def main() -> None:
                 for value, wide in zip(row, spread, strict=True)
             ]
             label = f"loss {changes['radio.loss']:4.0%}" if waits else name
-            print(f"{label}: delay {shown[0]} s, overlaps {shown[1]}, not past {shown[2]}")
+            print(f"{label}: delay {shown[0]} s, collisions {shown[1]}, not past {shown[2]}")
         for column, axes in enumerate(both):
             middle, wide = mean[:, column], width[:, column]
             if waits:
@@ -100,7 +95,7 @@ def main() -> None:
             else:  # nobody asks, so that losses do not matter
                 axes.axhline(middle[0], color=colour, label=name)
                 axes.axhspan(middle[0] - wide[0], middle[0] + wide[0], color=colour, alpha=0.2, linewidth=0)
-    for axes, label in zip(both, ("mean delay (s)", "pairs that overlap on the crossing"), strict=True):
+    for axes, label in zip(both, ("mean delay (s)", "collisions"), strict=True):
         axes.set_xlabel("packet loss (%)")
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
