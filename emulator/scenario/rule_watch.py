@@ -5,7 +5,8 @@ call has had its time. So a slow machine, or one that is stopped, interrupts not
 
 A call that waits (sleeps, reads from a socket, acquires a lock) sees no such exception. In the main thread, to
 which Python gives signals, it is interrupted by a signal whose handler raises; the handler is set for the call
-alone. On any other thread, and in a single long call into a library, nothing is interrupted before it returns.
+alone. From any other thread the function is called on a thread of its own, which is left behind if it waits for too
+long. In a single long call into a library nothing is interrupted before it returns.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextvars import copy_context
 from dataclasses import dataclass, field
-from types import FrameType
-from typing import Any, TypeVar
+from functools import partial
+from queue import SimpleQueue
+from types import FrameType, TracebackType
+from typing import Any, NoReturn, TypeVar
 
 from emulator.scenario.own_functions import NonsenseError, in_words, line_of, outside
 
@@ -56,7 +60,10 @@ class _Call:
 
     `looked_ns` is that time when the watch last looked, and `waited_s` how long it has seen the call wait.
     `takes_signals` says that the handler of `WAKE_UP` is that of this call, in place of `handler_before`.
+    `leave`, if given, is called in place of a signal once the call has waited for too long.
     """
+
+    leave: Callable[[_Call], None] | None = None
 
     thread: int = field(default_factory=threading.get_ident)
     clock: int | None = field(default_factory=lambda: _own_clock())
@@ -110,7 +117,10 @@ class _Call:
         if cpu_ns - self.start_ns > LIMIT_S * 1e9:
             self.is_interrupted, self.start_ns = True, cpu_ns
             self.interrupt()
-        if self.takes_signals and self.waited_s > WAIT_LIMIT_S:
+        if self.leave is not None and self.waited_s > WAIT_LIMIT_S:
+            leave, self.leave = self.leave, None
+            leave(self)
+        elif self.takes_signals and self.waited_s > WAIT_LIMIT_S:
             self.waited_s, self.is_awaited, self.is_signalled = 0.0, True, True
             signal.pthread_kill(self.thread, WAKE_UP)
 
@@ -155,7 +165,8 @@ class _Watch:
         self._last_s = 0.0
 
     def begin(self, call: _Call) -> None:
-        call.take_signals()
+        if call.leave is None:
+            call.take_signals()
         with self._lock:
             self._calls.add(call)
             self._last_s = time.monotonic()
@@ -188,9 +199,47 @@ _WATCH = _Watch()
 def call_bounded(function: Callable[..., T], *arguments: object) -> T:
     """Return what a function returns. Raises what it raises, or NoAnswerError after its time.
 
-    It may compute for `LIMIT_S`, and on the main thread wait for `WAIT_LIMIT_S`.
+    It may compute for `LIMIT_S`, and wait for `WAIT_LIMIT_S`.
     """
-    call = _Call()
+    if threading.current_thread() is threading.main_thread():
+        return _call_here(_Call(), function, *arguments)
+    return _call_aside(function, *arguments)
+
+
+def _call_aside(function: Callable[..., T], *arguments: object) -> T:
+    """Call on a thread of its own, which goes on by itself if it waits for too long: nobody takes its answer."""
+    answers: SimpleQueue[Callable[[], T]] = SimpleQueue()
+
+    def leave(call: _Call) -> None:
+        waits = WaitedError().with_traceback(_stack(sys._current_frames().get(call.thread)))
+        answers.put(partial(_raise, waits))
+
+    def run() -> None:
+        try:
+            answer = _call_here(_Call(leave), function, *arguments)
+        except BaseException as error:
+            answers.put(partial(_raise, error))
+        else:
+            answers.put(lambda: answer)
+
+    threading.Thread(target=copy_context().run, args=(run,), name="rule", daemon=True).start()
+    return answers.get()()
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
+
+
+def _stack(frame: FrameType | None) -> TracebackType | None:
+    """Return the traceback from this file to where a thread stands, as if it had raised there."""
+    traced: TracebackType | None = None
+    while frame is not None and frame.f_code.co_filename != __file__:
+        traced = TracebackType(traced, frame, frame.f_lasti, frame.f_lineno)
+        frame = frame.f_back
+    return traced
+
+
+def _call_here(call: _Call, function: Callable[..., T], *arguments: object) -> T:
     try:
         try:
             _WATCH.begin(call)

@@ -309,6 +309,15 @@ def test_other_signals_of_the_kind_reach_the_handler_of_before(
     assert handled == [rule_watch.WAKE_UP] * 10
 
 
+@pytest.mark.parametrize("name", ["sleeps", "locks_up"])
+def test_a_rule_that_waits_on_another_thread_is_left_behind(name: str, handled: list[int]) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        air = pool.submit(chatted, rule(name), periods=3).result()
+    (failure,) = air.failures
+    assert failure.error.startswith("does not answer within 0 s of waiting (rules.py:")
+    assert air.rows() == chatted(periods=3).rows()
+
+
 def test_on_another_thread_no_handler_is_set(handled: list[int]) -> None:
     with ThreadPoolExecutor(1) as pool:
         during = pool.submit(rule_watch.call_bounded, signal.getsignal, rule_watch.WAKE_UP).result()
