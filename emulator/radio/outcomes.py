@@ -167,6 +167,8 @@ class Outcome(IntEnum):
         Facts(
             meaning="it was received before: its sender has missed the acknowledgement, and sent it again",
             stage=Stage.RECEPTION,
+            colour="yellow",
+            sign="▩",
             is_possible=lambda scenario, vehicles: scenario.radio.mac is not None,
         ),
     )

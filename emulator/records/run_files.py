@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from emulator.radio.trace import Trace
+from emulator.radio.trace import ACKNOWLEDGED, Trace
 from emulator.records.backbone_table import BACKBONE
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
@@ -60,6 +60,8 @@ WITH_MAC = ("on_air_ns", "left_ns")
 """Columns that the trace has where there is a MAC."""
 WITH_POWER = ("rssi_dbm", "snr_db")
 """Columns that the trace has where there is a path loss, but for traces of vnet 0.2 and before."""
+WITH_UNICASTS = ACKNOWLEDGED
+"""Columns that the trace has where programs send to single vehicles; without them every row is a broadcast's."""
 TABLES: dict[str, pa.Schema] = {
     TRACE_FILE: Trace(["v01"], knows_air=True, knows_power=True).to_table().schema,
     STATES_FILE: STATES,
@@ -233,7 +235,7 @@ class RunFiles:
             check_is_run(self.folder)
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
-        names = None if wanted is None else [*wanted, *self._values_beside(path, wanted)]
+        names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         for column in wanted or schema.names:
             found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
@@ -241,8 +243,11 @@ class RunFiles:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
         return table.unify_dictionaries()
 
-    def _values_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
-        """The columns of reported values, for those who want `values` of the states."""
+    def _columns_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
+        """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
+        if path.name == TRACE_FILE:
+            there = self._read(path, lambda: pq.read_schema(path.absolute()).names)
+            return [name for name in WITH_UNICASTS if name in there]
         if path.name != STATES_FILE or "values" not in wanted:
             return []
         return self._read(path, lambda: value_columns(pq.read_schema(path.absolute())))

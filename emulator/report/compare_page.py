@@ -15,10 +15,10 @@ from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
 from emulator.report.program_figures import MOST_CHARTS, is_number, label_of, mean_over_time
-from emulator.report.radio_figures import bin_width_s, decided, latencies_ms
+from emulator.report.radio_figures import bin_width_ns, decided, latencies_ms
 from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
-from vnet.units import title_of
+from vnet.units import NS_PER_S, title_of
 
 LOOKS: tuple[tuple[str, str, Any], ...] = ((A, BLUE, DASHES[0]), (B, RED, DASHES[1]))
 REPORTED = "reported by the programs: means and 5 to 95 % of all reports of all vehicles"
@@ -141,11 +141,12 @@ def _metric(comparison: Comparison, name: str, y_label: str) -> Drawing:
 
 
 def _delivered(comparison: Comparison) -> Drawing:
-    width_s = max(bin_width_s(comparison.first), bin_width_s(comparison.second))
+    width_ns = max(bin_width_ns(comparison.first), bin_width_ns(comparison.second))
+    width_s = width_ns / NS_PER_S
 
     def ratio(source: Source) -> Any:
-        names, code, time_s = decided(source)
-        index = (time_s / width_s).astype(np.intp)
+        names, code, decided_ns = decided(source)
+        index = decided_ns // width_ns
         total = np.bincount(index)
         good = np.bincount(index, weights=np.array([name == "delivered" for name in names])[code])
         with np.errstate(invalid="ignore"):

@@ -36,17 +36,19 @@ _NAMED_VALUES = pa.struct([("key", pa.string()), ("value", pa.list_(pa.float64()
 
 
 def links(source: Source) -> Drawing:
-    """Draw the packet delivery ratio of the links against their length."""
+    """Draw the packet delivery ratio of the links against their length: that of broadcasts."""
     recorded = source.recorded
     count = len(recorded.node_ids)
-    if not len(recorded.trace):
-        raise NothingToShow("no frame was sent to anybody in range")
-    link = recorded.sender * count + recorded.receiver
+    cast = np.flatnonzero(recorded.attempt == 0)
+    if not len(cast):
+        raise NothingToShow("no broadcast was sent to anybody in range")
+    sender, receiver = recorded.sender[cast], recorded.receiver[cast]
+    link = sender * count + receiver
     rows = np.bincount(link, minlength=count * count)
     used = np.flatnonzero(rows)
-    delivered = np.bincount(link, weights=recorded.outcome_is("delivered"), minlength=count * count)
+    delivered = np.bincount(link, weights=recorded.outcome_is("delivered")[cast], minlength=count * count)
     share = 100 * delivered[used] / rows[used]
-    apart_m = recorded.places.pair_distances_m(recorded.sender, recorded.receiver, recorded.sent_ns)
+    apart_m = recorded.places.pair_distances_m(sender, receiver, recorded.sent_ns[cast])
     known = np.isfinite(apart_m)
     total_m = np.bincount(link[known], weights=apart_m[known], minlength=count * count)
     distance_km = total_m[used] / np.maximum(np.bincount(link[known], minlength=count * count), 1)[used] / 1000
@@ -59,6 +61,8 @@ def links(source: Source) -> Drawing:
     else:
         _draw_bins(made, distance_km, share)
     text = f"Packet delivery ratio of each of {len(used):,} links, from one vehicle to another."
+    if len(cast) < len(recorded.trace):
+        text += " Frames to one vehicle are not counted."
     lowest = float(share.min())
     if not physical:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
@@ -107,7 +111,8 @@ def _draw_frames(made: Canvas, bins: pa.Table) -> float:
 def _why_less(source: Source) -> str:
     """The outcomes besides `lost` that lower a link's delivery ratio."""
     others = (outcome.name for outcome in DRAWN if outcome not in (Outcome.delivered, Outcome.lost))
-    names = [name for name in others if source.recorded.outcome_is(name).any()]
+    cast = source.recorded.attempt == 0
+    names = [name for name in others if (source.recorded.outcome_is(name) & cast).any()]
     return f" Links below it had outcomes {', '.join(names)} as well." if names else ""
 
 

@@ -24,45 +24,54 @@ from emulator.pages.canvas import (
 )
 from emulator.pages.palette import PALETTE
 from emulator.radio.medium import WINDOW_NS
-from emulator.radio.outcomes import DRAWN
+from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.report.drawing import DASHES, TIME, WIDE_RANGE, Drawing, Line, faults_note, time_figure
 from emulator.report.source import Source
 from vnet.errors import VnetError, printable
-from vnet.types import Array
+from vnet.types import Array, IntArray
+from vnet.units import NS_PER_S
 
 OUTCOME_COLOURS = {outcome.name: PALETTE[outcome.facts.colour].light for outcome in DRAWN}
 MOST_BINS = 80
 MOST_BARS = 10
 
 
-def decided(source: Source) -> tuple[list[str], NDArray[np.intp], Array]:
-    """Return the names of outcomes, and each row's index among them and time of its decision in seconds.
+def in_range(source: Source) -> pa.Table:
+    """Return the rows of the trace but those of frames to a vehicle out of range. Raises VnetError without any."""
+    trace = source.recorded.trace
+    trace = trace.filter(pc.not_equal(trace["outcome"].cast(pa.string()), Outcome.out_of_range.name))
+    if not len(trace):
+        raise VnetError("no frame was sent to anybody in range")
+    return trace
+
+
+def decided(source: Source) -> tuple[list[str], NDArray[np.intp], IntArray]:
+    """Return the names of outcomes, and each row's index among them and time of its decision in ns.
 
     Raises VnetError without rows.
     """
-    trace = source.recorded.trace
-    if not len(trace):
-        raise VnetError("no frame was sent to anybody in range")
+    trace = in_range(source)
     column = trace["outcome"].combine_chunks()
     code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
     left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
     decided_ns = pc.coalesce(trace["arrival_ns"], trace[left]).to_numpy()
-    return column.dictionary.to_pylist(), code, decided_ns / 1e9
+    return column.dictionary.to_pylist(), code, np.asarray(decided_ns, dtype=np.int64)
 
 
-def bin_width_s(source: Source) -> float:
+def bin_width_ns(source: Source) -> int:
     """Return the width of the bins of figures against time: whole periods, so that each bin has frames."""
-    period_s = source.scenario.period_ns / 1e9
-    periods = max(1, int(np.ceil(source.end_s / period_s - 1e-9)))
-    return int(np.ceil(periods / MOST_BINS)) * period_s
+    period_ns = source.scenario.period_ns
+    periods = max(1, int(np.ceil(source.end_s * NS_PER_S / period_ns - 1e-9)))
+    return int(np.ceil(periods / MOST_BINS)) * period_ns
 
 
 def outcomes(source: Source) -> Drawing:
     """Draw the shares of the outcomes against time, stacked."""
-    names, code, decided_s = decided(source)
-    width_s = bin_width_s(source)
+    names, code, decided_ns = decided(source)
+    width_ns = bin_width_ns(source)
+    width_s = width_ns / NS_PER_S
     bins = max(1, int(np.ceil(source.end_s / width_s - 1e-9)))
-    index = np.minimum((decided_s / width_s).astype(np.intp), bins - 1)
+    index = np.minimum(decided_ns // width_ns, bins - 1)  # of whole numbers: times on an edge stay on their side
     counts = np.bincount(index * len(names) + code, minlength=bins * len(names)).reshape(bins, len(names))
     share = 100 * counts / np.maximum(1, counts.sum(axis=1, keepdims=True))
     shown = [number for number, name in enumerate(names) if counts[:, number].any() and name in OUTCOME_COLOURS]
@@ -100,9 +109,7 @@ def busy(source: Source) -> Drawing:
 
 def totals(source: Source) -> Drawing:
     """Draw the numbers and shares of the outcomes of the whole run."""
-    trace = source.recorded.trace
-    if not len(trace):
-        raise VnetError("no frame was sent to anybody in range")
+    trace = in_range(source)
     bars = _bars(trace)
     made = canvas("share of receptions (%)", "outcome", plot_px=31 * len(bars) + 6)
     axes = made.axes

@@ -20,8 +20,8 @@ MEMBER = """
         Facts(
             meaning="an interferer was on the air",
             stage=Stage.RECEPTION,
-            colour="yellow",
-            sign="▩",
+            colour="quiet",
+            sign="▣",
             is_possible=lambda scenario, vehicles: vehicles > 5,
         ),
     )

@@ -16,11 +16,10 @@ from tests.support.paths import ROOT
 def test_numbers_names_and_stages() -> None:
     assert [outcome.value for outcome in Outcome] == list(range(len(Outcome))), "they index tables"
     assert Outcome(7) is Outcome.fault and Outcome.fault.title == "fault" and Outcome.peer_cap.title == "peer cap"
-    hidden = {Outcome.pending, Outcome.out_of_range, Outcome.duplicate}  # of a duplicate the program has all
-    assert set(Outcome) - set(DRAWN) == hidden
+    assert set(Outcome) - set(DRAWN) == {Outcome.pending, Outcome.out_of_range}
     assert DRAWN[0] is Outcome.delivered
     staged = {outcome for outcome in Outcome if outcome.facts.stage is not None}
-    assert staged == {*DRAWN, Outcome.duplicate}
+    assert staged == {*DRAWN}
     assert decided_at(Stage.SENDER) == ("queue_full", "oversize", "held_back")
     assert decided_at(Stage.ARRIVAL) == ("delivered", "receiver_down", "transport")
 
@@ -43,5 +42,5 @@ def test_an_outcome_is_added_in_the_table_alone(tmp_path: Path) -> None:
     assert found["summary"] and f"{found['counted']:,}" in found["summary"][0]
     assert found["report"] >= 2, "outcomes over time and in total"
     assert found["legend"] == [True, False], "where it is possible"
-    assert found["colour"] == [list(PALETTE["yellow"].rgb)]
+    assert found["colour"] == [list(PALETTE["quiet"].rgb)]
     assert found["checks"] and found["dashboard"] and found["reference"]

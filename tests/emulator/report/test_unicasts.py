@@ -1,0 +1,88 @@
+"""Reports of runs that send frames to single vehicles: packet delivery ratios are those of broadcasts."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import emulator
+from emulator.radio.outcomes import Outcome
+from emulator.records.radio_metrics import radio_metrics
+from emulator.records.recorded_run import RecordedRun
+from emulator.records.unicast_figures import unicast_figures
+from emulator.report import radio_figures
+from emulator.report.network_figures import links
+from emulator.report.radio import radio_section
+from emulator.report.source import Source
+from emulator.report.write import report_page
+from vnet import Node
+
+
+async def send_and_broadcast(node: Node) -> None:
+    """Have `a` broadcast, then send to a vehicle out of range and to one in range."""
+    async for _ in node.gnss:
+        if node.id == "a":
+            await node.radio.broadcast(b"to all")
+            await node.radio.send("far", b"to nobody in range")
+            await node.radio.send("b", b"to b")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three vehicles, one of them out of range, and a link that loses every third frame."""
+    folder = tmp_path_factory.mktemp("unicasts")
+    (folder / "n.csv").write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,50,0,0\nfar,50000,0,0\n")
+    scenario: dict[str, Any] = {
+        "run": {"duration_s": 1.0, "settle_s": 0.0},
+        "network": {"kind": "file", "path": str(folder / "n.csv")},
+        "world": {"lateral": {"sigma_m": 0.0}},
+        "radio": {"path_loss": {"kind": "log_distance"}, "mac": {}, "loss": 0.35},
+    }
+    emulator.simulate(scenario, program=send_and_broadcast, out=folder / "run")
+    return folder / "run"
+
+
+def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> None:
+    whole = RecordedRun.open(run)
+    assert (whole.attempt > 1).any() and whole.outcome_is("duplicate").any() and whole.outcome_is("delivered").any()
+    source = Source(run)
+    assert source.recorded.attempt.tolist() == whole.attempt.tolist()
+    assert source.recorded.acked.tolist() == whole.acked.tolist()
+    ratio = radio_metrics(whole).totals["delivery_ratio"]
+    assert ratio is not None
+    section = radio_section(source)
+    assert not isinstance(section, str)
+    assert section.totals["packet delivery ratio"] == f"{100 * ratio:.1f} %"
+    assert section.totals["frames to one vehicle"] == str(unicast_figures(whole))
+    page = re.sub(r"<[^>]*>|\s+", " ", report_page(source))
+    assert f"{ratio:.2%}" in page, "key figures and the section agree"
+
+
+def test_figures_count_receptions_in_range_and_links_broadcasts(run: Path) -> None:
+    source = Source(run)
+    assert "each of 1 links" in links(source).caption
+    attempted = int((~source.recorded.outcome_is("out_of_range")).sum())
+    assert attempted < len(source.recorded.trace)
+    for drawing in (radio_figures.outcomes(source), radio_figures.totals(source)):
+        assert f"{attempted:,} attempted receptions" in drawing.caption
+
+
+def test_outcomes_over_time_stack_up_to_all_receptions(run: Path) -> None:
+    made = radio_figures.outcomes(Source(run)).canvas
+    layers = made.axes.collections
+    tops = [np.asarray(path.vertices)[:, 1].max() for layer in layers for path in layer.get_paths()]
+    assert max(tops) == pytest.approx(100)
+    assert Outcome.duplicate.name in {layer.get_label() for layer in layers}
+
+
+def test_times_on_the_edge_of_a_bin_are_on_their_side(tmp_path: Path) -> None:
+    async def beacon(node: Node) -> None:
+        async for _ in node.gnss:
+            await node.radio.broadcast(b"x")
+
+    run = {"duration_s": 2.0, "settle_s": 0.0}  # what is lost is decided as it is sent, at the start of a period
+    scenario = {"network": {"vehicles": 2}, "run": run, "radio": {"range_m": 9000.0, "loss": 1.0}}
+    emulator.simulate(scenario, program=beacon, out=tmp_path / "run")
+    assert "20 to 20 a second" in radio_figures.outcomes(Source(tmp_path / "run")).caption
