@@ -132,7 +132,8 @@ def _deviation(recorded: RecordedRun, common_m: Array) -> Array:
     everybody = np.ones(len(recorded.node_ids), dtype=bool)
     period_ns = recorded.scenario.period_ns
     # Where vehicles move, each period has its own components, among the vehicles in the network.
-    pieces = [slice(k, k + 1) for k in range(len(common_m))] if recorded.moves else [slice(None)]
+    changes = recorded.topology_changes
+    pieces = [slice(k, k + 1) for k in range(len(common_m))] if changes else [slice(None)]
     for piece in pieces:
         among = up[piece.start] if recorded.moves else everybody
         for part in _components(recorded, among, (piece.start or 0) * period_ns):

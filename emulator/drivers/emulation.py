@@ -108,7 +108,8 @@ class Emulation:
         if self.payloads is not None:
             self.engine.on_payload = self.payloads.add
         self._placed = 0  # the period in which vehicles are where the engine has them
-        self.faults = FaultPlan(scenario, self._nodes_at(0), self._nodes_at if world.moves else None)
+        nodes_at = self._nodes_at if self._topology_changes else None
+        self.faults = FaultPlan(scenario, self._nodes_at(0), nodes_at)
         self.gnss = FaultyGnss(world, self.faults.faults, scenario.run.seed)
         self.presence = Presence(world.node_ids, self._absent(0))
         self.up, self.incarnation = self.presence.up, self.presence.incarnation
@@ -135,13 +136,19 @@ class Emulation:
         """Nodes as the selectors of faults see them in a period."""
         world = self.world
         degree = self._links(period).in_degrees()
-        return Nodes(world.node_ids, world.position_m(period), np.where(world.present(period), degree, -1))
+        position_m = world.position_m(period if world.moves else 0)
+        return Nodes(world.node_ids, position_m, np.where(world.present(period), degree, -1))
 
     def _links(self, period: int) -> Links:
-        connectivity = self._connectivity
-        if period == self._placed and not len(connectivity.changes_ns):
+        if period == self._placed and not len(self._connectivity.changes_ns):
             return self.engine.links
-        return connectivity.at(period * self.world.period_ns).links(self.world.position_m(period))
+        self._connectivity = self._connectivity.at(period * self.world.period_ns)  # the next is often a later one
+        return self._connectivity.links(self.world.position_m(period))
+
+    @property
+    def _topology_changes(self) -> bool:
+        """True if vehicles move, or links are given over time."""
+        return self.world.moves or len(self._connectivity.changes_ns) > 0
 
     def _component(self, period: int) -> NDArray[np.intp]:
         """Connected component of each vehicle."""
@@ -420,7 +427,7 @@ class Emulation:
             self._arrived.append(self.engine.advance(end_ns - 1))
             instant = self.gnss.at(self._period)
             reports = sorted(self._reports, key=lambda r: (r.time_ns, self.number[r.node]))
-            component = self._component(self._period) if self.world.moves else None
+            component = self._component(self._period) if self._topology_changes else None
             self.metrics.record(instant, reports, component)
             self._period += 1
             self._reports = []

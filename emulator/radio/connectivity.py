@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.obstacles import Obstacles
 from emulator.radio.propagation import DIGITS, MeanPower
-from emulator.scenario.scenario import Radio
+from emulator.scenario.scenario import Radio, Scenario
 from emulator.world.link_table import LinkTable
 from emulator.world.neighbours import Links, links_within
 from emulator.world.radio_inputs import RadioInputs
@@ -54,6 +54,17 @@ def connectivity_of(radio: Radio, seed: int, inputs: RadioInputs | None = None) 
     if isinstance(inputs.links, LinkTable):
         return Measured(inputs.links)
     return Disc(radio.range_m) if inputs.links is None else Matrix(inputs.links)
+
+
+def component_links(scenario: Scenario, inputs: RadioInputs, position_m: Array) -> Links:
+    """Return the links at the start; where links are given over time and vehicles stand, all links of the run.
+
+    By them vehicles are put into components whose members may ever know of each other.
+    """
+    table = inputs.links
+    if isinstance(table, LinkTable) and not scenario.network.moves:
+        return Links.of_pairs(position_m, *table.linked_before(scenario.duration_ns))
+    return connectivity_of(scenario.radio, scenario.run.seed, inputs).links(position_m)
 
 
 def distances_m(position_m: Array) -> Array:

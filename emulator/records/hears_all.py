@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from emulator.radio.connectivity import connectivity_of
+from emulator.radio.connectivity import component_links
 from emulator.records.recorded_tables import RecordedTables
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import components
@@ -192,7 +192,7 @@ def bound_of(recorded: RecordedTables) -> BoundSeries:
         raise VnetError("no program reported a common error")
     position_m, start = recorded.vectors("position_m"), pc.equal(recorded.states["period"], 0)
     heading_rad = recorded.states.filter(start)["heading_rad"].to_numpy()
-    links = connectivity_of(scenario.radio, scenario.run.seed, world.radio_inputs).links(world.position_m)
+    links = component_links(scenario, world.radio_inputs, world.position_m)
     lane = lanes_of(position_m[0], heading_rad, world.lane_point_m, world.lane_heading_rad)
     filters = HearsAll(
         scenario,

@@ -54,7 +54,7 @@ class PeriodFigures:
     stacked_deviation_m: float | None
     """As `deviation_m`, right after fusion, before the map."""
     component_rmse_m: list[float | None]
-    """`common_error_rmse_m` of each connected component of the network: where vehicles move, of the period's."""
+    """`common_error_rmse_m` of each connected component of the network: of the period's, where links change."""
     component_deviation_m: list[float | None]
     """`deviation_m` of each connected component, from its own mean."""
     position_rmse_m: float | None

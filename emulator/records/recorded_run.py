@@ -166,7 +166,8 @@ class RecordedRun(RecordedTables):
         """The faults and whom they chose. Raises ScenarioError if they do not fit the run's nodes."""
         if not self.node_ids or not self.scenario.fault:
             return []
-        return FaultPlan(self.scenario, self._nodes_at(0), self._nodes_at if self.moves else None).faults
+        nodes_at = self._nodes_at if self.topology_changes else None
+        return FaultPlan(self.scenario, self._nodes_at(0), nodes_at).faults
 
     def _nodes_at(self, period: int) -> Nodes:
         position_m = self.places.position_m(period)
@@ -188,7 +189,7 @@ class RecordedRun(RecordedTables):
 
     def connectivity(self, planned: PlannedFault) -> Iterator[tuple[int, int, Mask]]:
         """The links (N, N), rows are senders, whose rows may name a fault, and from when until when."""
-        if not self.moves or not planned.fault.follows_vehicles:
+        if planned.moving is None and not (self.moves and planned.fault.follows_vehicles):
             yield from self._connectivity(planned)
             return
         period_ns = self.scenario.period_ns

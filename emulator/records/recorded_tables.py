@@ -80,6 +80,11 @@ class RecordedTables:
         return self.scenario.network.moves
 
     @cached_property
+    def topology_changes(self) -> bool:
+        """True if the vehicles in range of each other change during the run."""
+        return self.moves or isinstance(self.radio_inputs.links, LinkTable)
+
+    @cached_property
     def places(self) -> Places:
         """Positions of the vehicles. Raises ScenarioError if the scenario's links do not fit them."""
         connectivity = connectivity_of(self.scenario.radio, self.scenario.run.seed, self.radio_inputs)

@@ -13,6 +13,7 @@ from matplotlib.path import Path as Outline
 from matplotlib.ticker import MaxNLocator
 
 from emulator.pages.canvas import BLUE, INK, RED, Canvas, canvas, legend, whole_numbers
+from emulator.radio.connectivity import component_links
 from emulator.radio.outcomes import DRAWN, Outcome
 from emulator.records.beliefs import WEIGHT
 from emulator.records.distributions import binomial_interval
@@ -144,7 +145,11 @@ def degrees(source: Source) -> Drawing:
             made,
             f"Number of vehicles that each can hear, {how}; mean over its time in the network.",
         )
-    parts = int(components(recorded.places.position_m(0), radio.range_m, recorded.places.links(0)).max()) + 1
+    start_m = recorded.places.position_m(0)
+    links = component_links(source.scenario, recorded.radio_inputs, start_m)
+    parts = int(components(start_m, radio.range_m, links).max()) + 1
+    if recorded.topology_changes:
+        how += ", in the mean over the run"
     network = "one component" if parts == 1 else f"{parts} components out of range of each other"
     return Drawing(made, f"Number of vehicles that each can hear, {how}: {network}.")
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.radio.connectivity import connectivity_of
+from emulator.radio.connectivity import component_links
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import decided_ns
 from emulator.records.beliefs import WEIGHT, Beliefs, collect, is_cloud
@@ -58,12 +58,13 @@ def scene_message(world: RecordedWorld, scenario: Scenario, scenario_text: str) 
     `node_ids`; lanes (`lane_point_m`, `lane_heading_rad`, `lane_length_m`, which is infinite for a line in both
     directions from its point); `building_edge_m` (k × 2 × 2), the ends of the edges of buildings; `range_m` (None
     if links or path loss decide connectivity); `component` (int16, n), the connected component of each vehicle at
-    the start (-1: absent); `area_m` (float32, 2 × 2), the corners of the bounding box of all positions during the
-    run; `moves`, true if vehicles drive; `scenario_text`, the resolved scenario as TOML.
+    the start (-1: absent), or by all links of the run where they are given over time and vehicles stand; `area_m`
+    (float32, 2 × 2), the corners of the bounding box of all positions during the run; `moves`, true if vehicles
+    drive; `scenario_text`, the resolved scenario as TOML.
     """
     radio = scenario.radio
-    connectivity = connectivity_of(radio, scenario.run.seed, world.radio_inputs)
-    label = components(world.position_m, radio.range_m, connectivity.links(world.position_m))
+    links = component_links(scenario, world.radio_inputs, world.position_m)
+    label = components(world.position_m, radio.range_m, links)
     return {
         "name": scenario.run.name,
         "node_ids": list(world.node_ids),

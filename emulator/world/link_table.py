@@ -62,6 +62,12 @@ class LinkTable:
         index = np.minimum(np.searchsorted(known, asked), len(known) - 1)
         return np.where((known[index] == asked) & (receiver < self._size), values[index], np.nan)
 
+    def linked_before(self, end_ns: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return sender and receiver (n,) of the pairs that are in range at any time before `end_ns`, sorted."""
+        sender, receiver, pair = self.pairs
+        linked = np.unique(pair[np.isfinite(self.loss) & (self.time_ns < end_ns)])
+        return sender[linked], receiver[linked]
+
     def loss_at(self, time_ns: int, before: Array | None = None, before_ns: int = -1) -> Array:
         """Return the losses (P,) of the pairs at a time, NaN out of range.
 
