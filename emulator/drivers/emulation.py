@@ -364,7 +364,7 @@ class Emulation:
 
     def _sensor_failed(self, failure: SensorFailure) -> None:
         details = {"fault": f"world.sensor.{failure.sensor}", "rule": failure.model, "error": failure.error}
-        self.folder.event(failure.time_ns, "rule_failed", None, **details, where=failure.where)
+        self.folder.foresee(failure.time_ns, "rule_failed", None, **details, where=failure.where)
 
     def heal(self, label: str, now_ns: int) -> PlannedFault:
         """End a fault right after `now_ns`, and write that down. Raises ScenarioError if there is no such fault."""
@@ -415,6 +415,7 @@ class Emulation:
             self._finished = True
             self.drive_to(time_ns)
             self.close_periods(time_ns)
+            self.folder.reach(time_ns)
             self.engine.drain()
 
     def close_periods(self, time_ns: int) -> None:

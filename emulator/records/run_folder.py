@@ -68,6 +68,7 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.events: list[Event] = []
+        self._foreseen: list[Event] = []
         self.scenario_text = ""
         """`scenario.toml` as it is now."""
         self._digests: dict[str, dict[str, str]] = {}
@@ -162,8 +163,23 @@ class RunFolder:
         self.put(name, lambda path: pq.write_table(table, path, compression="zstd"))
 
     def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
-        """Write down what happened at an emulated instant."""
-        event = Event(time_ns, kind, node, details)
+        """Write down what happened at an emulated instant, after all that was foreseen for an earlier one."""
+        self.reach(time_ns - 1)
+        self._write(Event(time_ns, kind, node, details))
+
+    def foresee(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
+        """Write down what happens at an instant that others may not have come to, once they have."""
+        self._foreseen.append(Event(time_ns, kind, node, details))
+
+    def reach(self, time_ns: int) -> None:
+        """Write what has been foreseen until `time_ns`."""
+        due = sorted((e for e in self._foreseen if e.time_ns <= time_ns), key=lambda event: event.time_ns)
+        if due:
+            self._foreseen = [event for event in self._foreseen if event.time_ns > time_ns]
+        for event in due:
+            self._write(event)
+
+    def _write(self, event: Event) -> None:
         self.events.append(event)
         if self.is_open:
             with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:

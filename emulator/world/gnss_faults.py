@@ -68,7 +68,7 @@ class FaultyGnss:
         last = max(0, math.ceil(min(frozen) / self._world.period_ns) - 1)
         while not self._world.present(last)[number]:
             last += 1
-        return self._world.fix(last, number).position_m
+        return self._world.fix_m(last, number)
 
     def _moved(self, planned: PlannedFault, position_m: Array, time_ns: int, period: int, number: int) -> Array:
         fault = planned.fault

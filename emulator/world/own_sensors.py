@@ -7,12 +7,14 @@ processes. One that raises, answers nonsense or does not answer is told once, an
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Set
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.scenario import rule_watch
 from emulator.scenario.own_functions import NonsenseError, load_function
@@ -21,7 +23,7 @@ from emulator.scenario.random_streams import frame_stream
 from emulator.scenario.world import OwnSensor
 from vnet.errors import shown
 from vnet.runtime.program_path import search_programs_in
-from vnet.types import Array
+from vnet.types import Array, Mask
 from vnet.units import NS_PER_S
 
 MOST_NUMBERS = 64
@@ -64,6 +66,39 @@ class SensorFailure:
     where: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class _Kept:
+    """The k readings of a sensor in a period: as arrays, since runs keep those of all periods.
+
+    `vehicle` (k,): numbers, sorted. `end` (k,): end of each reading in `numbers`; it begins where the one before
+    ends. `is_single` (k,): a number by itself.
+    """
+
+    vehicle: NDArray[np.int32]
+    end: NDArray[np.int32]
+    is_single: Mask
+    numbers: Array
+
+    @classmethod
+    def of(cls, readings: Mapping[int, Reading]) -> _Kept:
+        """Keep readings by the vehicles' numbers."""
+        vehicle = sorted(readings)
+        single = [isinstance(readings[number], float) for number in vehicle]
+        several = [reading if isinstance(reading := readings[number], tuple) else (reading,) for number in vehicle]
+        end = np.cumsum([len(each) for each in several], dtype=np.int32)
+        numbers = np.array([number for each in several for number in each], dtype=float)
+        return cls(np.array(vehicle, dtype=np.int32), end, np.array(single, dtype=bool), numbers)
+
+    def of_vehicle(self, number: int) -> Reading | None:
+        """Return the reading of a vehicle; None if it has none."""
+        index = int(np.searchsorted(self.vehicle, number))
+        if index == len(self.vehicle) or self.vehicle[index] != number:
+            return None
+        start = self.end[index - 1] if index else 0
+        several = tuple(self.numbers[start : self.end[index]].tolist())
+        return several[0] if self.is_single[index] else several
+
+
 class OwnSensors:
     """The sensors of one run, their states and readings. `on_failure` is told of each that fails."""
 
@@ -80,7 +115,8 @@ class OwnSensors:
         }
         self._states: dict[str, dict[str, Any]] = {name: {} for name in sensors}
         self._failed: set[str] = set()
-        self._readings: list[dict[str, dict[str, Reading]]] = []
+        self._number: dict[str, int] = {}
+        self._readings: list[dict[str, _Kept]] = []
 
     def __bool__(self) -> bool:
         return bool(self._sensors)
@@ -89,15 +125,21 @@ class OwnSensors:
         """Return what a vehicle reads in a period, by sensor; `truth` has that of a period, without options."""
         while len(self._readings) <= period:
             self._readings.append(self._sense(truth(len(self._readings)), len(self._readings)))
-        return dict(self._readings[period].get(node, {}))
+        number = self._number.get(node, -1)
+        found = {name: kept.of_vehicle(number) for name, kept in self._readings[period].items()}
+        return {name: reading for name, reading in found.items() if reading is not None}
 
-    def _sense(self, truth: SensedTruth, period: int) -> dict[str, dict[str, Reading]]:
-        """Return the readings of a period, by vehicle and sensor."""
-        found: dict[str, dict[str, Reading]] = {}
-        for name in [name for name in self._sensors if name not in self._failed]:
-            for node, reading in self._ask(name, truth, period).items():
-                found.setdefault(node, {})[name] = reading
-        return found
+    def _sense(self, truth: SensedTruth, period: int) -> dict[str, _Kept]:
+        """Return the readings of a period, by sensor."""
+        for node in truth.node_ids:
+            self._number.setdefault(node, len(self._number))
+        names = [name for name in self._sensors if name not in self._failed]
+        asked = {name: self._ask(name, truth, period) for name in names}
+        return {
+            name: _Kept.of({self._number[node]: reading for node, reading in read.items()})
+            for name, read in asked.items()
+            if read
+        }
 
     def _ask(self, name: str, truth: SensedTruth, period: int) -> dict[str, Reading]:
         sensor = self._sensors[name]
@@ -111,14 +153,14 @@ class OwnSensors:
         )
         try:
             answer = rule_watch.call_bounded(self._functions[name], seen, self._states[name])
-            return _understood(answer, truth.node_ids)
+            return _understood(answer, frozenset(truth.node_ids))
         except (Exception, SystemExit, rule_watch.NoAnswerError) as error:
             self._failed.add(name)
             self.on_failure(SensorFailure(name, sensor.model, truth.time_ns, *rule_watch.told(error, __file__)))
             return {}
 
 
-def _understood(answer: Any, node_ids: Sequence[str]) -> dict[str, Reading]:
+def _understood(answer: Any, node_ids: Set[str]) -> dict[str, Reading]:
     """Return readings as plain numbers. Raises NonsenseError."""
     if not isinstance(answer, Mapping):
         raise NonsenseError(f"{shown(answer)}: a dict from vehicles to readings is needed")
@@ -129,10 +171,18 @@ def _understood(answer: Any, node_ids: Sequence[str]) -> dict[str, Reading]:
 
 def _reading(node: str, value: Any) -> Reading:
     try:
-        numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
+        numbers = np.asarray(value, dtype=float) if _are_numbers(value) else np.full(1, math.nan)
+    except (TypeError, ValueError, OverflowError):
         numbers = np.full(1, math.nan)
     if numbers.ndim > 1 or numbers.size > MOST_NUMBERS or not np.isfinite(numbers).all():
         needed = f"a finite number, or at most {MOST_NUMBERS} of them, is needed"
         raise NonsenseError(f"{shown(value)} for {node}: {needed}")
     return numbers.item() if numbers.ndim == 0 else tuple(numbers.tolist())
+
+
+def _are_numbers(value: Any) -> bool:
+    """Return whether a value is a number or several: no text that numpy could read, and no truth value."""
+    array = value if isinstance(value, np.ndarray) else np.asarray(value, dtype=object)
+    if array.dtype != object:
+        return array.dtype.kind in "iuf"
+    return all(isinstance(each, Real) and not isinstance(each, (bool, np.bool_)) for each in array.flat)

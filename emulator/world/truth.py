@@ -160,6 +160,10 @@ class World:
             sensors=self.sensed(period, node) if self.own_sensors else NOTHING_SENSED,
         )
 
+    def fix_m(self, period: int, node: int) -> Array:
+        """Return the position (2,) of a fix alone, for which no sensor is asked."""
+        return np.asarray(self._fix_m[period, node].copy())
+
     def sensed(self, period: int, node: int) -> dict[str, Reading]:
         """Return what the sensors of the user's own in vehicle number `node` read at the start of `period`."""
         return self.own_sensors.readings(period, self.node_ids[node], self._sensed_truth)

@@ -1,5 +1,7 @@
 """Sensors of the user's own: readings of the truth, the same in any division into processes."""
 
+import tracemalloc
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +10,16 @@ import pytest
 
 from emulator import SensedTruth
 from emulator.drivers.emulation import Emulation
+from emulator.scenario.program import Program
 from emulator.scenario.scenario import load_scenario
+from emulator.scenario.world import OwnSensor
+from emulator.world.own_sensors import OwnSensors
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
 from vnet.errors import ScenarioError
 from vnet.node import NOTHING_SENSED, Fix
 from vnet.transport import wire
 
+ODD: dict[str, Any] = {"digits": "1.5", "bytes": b"2", "truth value": True, "mixed": [1.0, True]}
 HERE = "tests.emulator.world.test_own_sensors"
 
 
@@ -41,18 +47,23 @@ def stumbles(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
     return dict.fromkeys(truth.node_ids, 1 / (0.5 - truth.time_s))
 
 
+def ones(truth: SensedTruth, state: dict[str, Any]) -> dict[str, Any]:
+    """Return a number for each vehicle, but two for the second, and none for the third."""
+    return dict.fromkeys(truth.node_ids, 1) | {truth.node_ids[1]: (1, 2), truth.node_ids[2]: None}
+
+
 def answers(truth: SensedTruth, state: dict[str, Any]) -> Any:
     """Return what the options say."""
     return {"nothing": None, "unknown": {"x99": 1.0}, "text": {"v01": "far"}, "many": {"v01": range(65)}}.get(
-        truth.options["kind"], {"v01": float("nan")}
+        truth.options["kind"], {"v01": ODD.get(str(truth.options["kind"]), float("nan"))}
     )
 
 
-def scenario(*functions: str, **sections: Any) -> Any:
+def scenario(*functions: str, faults: Sequence[dict[str, Any]] = (), **sections: Any) -> Any:
     sensor = {name: {"model": f"{HERE}:{name}"} for name in functions}
     run = {"duration_s": 1.0, "settle_s": 0.0, "seed": 3}
     return scenario_of(
-        [],
+        list(faults),
         "tests.support.sensor_programs:tells",
         3,
         **{"run": run, "world": {"gnss": {"rate_hz": 10}, "sensor": sensor}, **sections},
@@ -96,6 +107,10 @@ def test_a_function_cannot_change_the_truth() -> None:
         ("answers", {"kind": "unknown"}, "answers 'x99': no vehicle that is present"),
         ("answers", {"kind": "text"}, "answers 'far' for v01: a finite number, or at most 64 of them, is needed"),
         ("answers", {"kind": "many"}, "for v01: a finite number, or at most 64 of them, is needed"),
+        ("answers", {"kind": "digits"}, "answers '1.5' for v01: a finite number"),
+        ("answers", {"kind": "bytes"}, "answers b'2' for v01: a finite number"),
+        ("answers", {"kind": "truth value"}, "answers True for v01: a finite number"),
+        ("answers", {"kind": "mixed"}, "answers [1.0, True] for v01: a finite number"),
         ("answers", {"kind": "none"}, "answers nan for v01: a finite number"),
     ],
 )
@@ -107,6 +122,36 @@ def test_a_sensor_that_fails_is_named_once(function: str, options: dict[str, Any
     assert failed.details["fault"] == "world.sensor.radar"
     assert said in failed.details["error"]
     assert len([1 for _, _, name, _ in readings(emulation) if name == "other"]) == 30, "others go on"
+
+
+def test_the_failure_of_a_sensor_comes_in_the_order_of_time_wherever_programs_run() -> None:
+    pause = {"kind": "pause", "at_s": 0.2, "duration_s": 0.5, "nodes": ["v03"]}
+    plan = scenario("stumbles", "counts", faults=[pause])
+    together, apart = (
+        [(e.time_ns, e.kind, e.node) for e in run(plan).folder.events if e.kind != "started"]
+        for run in (run_together, run_apart)
+    )
+    times_ns = [time_ns for time_ns, *_ in apart]
+    assert together == apart and times_ns == sorted(times_ns)
+    assert (500_000_000, "rule_failed", None) in apart
+
+
+def test_readings_of_many_vehicles_and_periods_take_little_memory_and_time() -> None:
+    sensors = OwnSensors(1, {"radar": OwnSensor(model=f"{HERE}:ones")}, Program(entry="agents.beacon:main"))
+    ids = tuple(f"v{number:04d}" for number in range(1000))
+    zeros = np.zeros(len(ids))
+
+    def truth(period: int) -> SensedTruth:
+        return SensedTruth(period, ids, np.zeros((len(ids), 2)), zeros, zeros)
+
+    sensors.readings(0, ids[0], truth)
+    tracemalloc.start()
+    assert sensors.readings(10, ids[-1], truth) == {"radar": 1.0}
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert size / 10 / len(ids) < 40, "bytes of a vehicle and period"
+    assert sensors.readings(3, ids[1], truth) == {"radar": (1.0, 2.0)}
+    assert sensors.readings(3, ids[2], truth) == {}
 
 
 def test_what_is_no_function_is_said_before_a_run(tmp_path: Path) -> None:
