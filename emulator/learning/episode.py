@@ -48,7 +48,7 @@ class Moment:
     """The truth at the end of a step, from which rewards are made; programs never see it.
 
     time_s: emulated seconds since the start of the run.
-    position_m: (2,) in m east-north, by node; NaN for a vehicle that is not there.
+    position_m: (2,) in m east-north, by node, read-only; NaN for a vehicle that is not there.
     speed_m_s: speed by node, from the way since the step before (0 in the first); NaN as above.
     events: what has happened since the step before, such as `collision`.
     actions: what each agent did in this step.
@@ -198,9 +198,11 @@ class Scenes:
             passed_s = (period - self._period) * world.period_ns / NS_PER_S
             self._speed, self._period = np.hypot(way_m[:, 0], way_m[:, 1]) / passed_s, period
         new, self._events = events[self._events :], len(events)
+        position_m = world.position_m(period).copy()
+        position_m.flags.writeable = False  # one for the functions of all agents
         return Moment(
             period * world.period_ns / NS_PER_S,
-            dict(zip(world.node_ids, world.position_m(period), strict=True)),
+            dict(zip(world.node_ids, position_m, strict=True)),
             dict(zip(world.node_ids, self._speed.tolist(), strict=True)),
             new,
             actions,

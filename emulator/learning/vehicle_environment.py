@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from copy import deepcopy
+from operator import index
 from pathlib import Path
 from typing import Any, ClassVar
 
 from gymnasium.spaces import Space
 from pettingzoo import ParallelEnv
 
-from emulator.learning.episode import Behaviour, Episode, Scenes, Turn
+from emulator.learning.episode import Behaviour, Episode, Moment, Scenes, Turn
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.errors import VnetError
+from vnet.errors import VnetError, shown
 
 Spaces = Space[Any] | Callable[[str], Space[Any]]
+SEEDS = 2**63
+"""Number of seeds, from 0 on, that a scenario can have."""
 
 
 class VehicleEnvironment(ParallelEnv[str, Any, Any]):
@@ -64,7 +67,7 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         """
         self.close()
         if seed is not None:
-            self._seed = seed
+            self._seed = _whole_seed(seed)
         run = self._scenario.run.model_copy(update={"seed": self._seed})
         self._seed += 1
         self._episodes += 1
@@ -91,15 +94,24 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
             raise VnetError(f"step: {unknown[0]} is no living agent; there are: {', '.join(self.agents)}")
         self._episode.answer(actions)
         turn = self._next_turn(self._episode)
-        moment = self._scenes.moment(turn.time_ns, actions)
+        try:
+            return self._step(self._episode, turn, self._scenes.moment(turn.time_ns, actions))
+        except BaseException:
+            self._give_up()
+            raise
+
+    def _step(
+        self, episode: Episode, turn: Turn, moment: Moment
+    ) -> tuple[dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """Return what a step returns, that ends with this turn and this moment."""
         self._observed |= turn.observed
         entered = [agent for agent in turn.observed if agent not in self.agents and self._is_new(agent)]
         at_end = [*self.agents, *entered]
         rewards = {agent: float(self._behaviour.reward(agent, moment)) for agent in at_end}
         ended = {agent: self._is_gone(agent, turn) or self._behaviour.terminated(agent, moment) for agent in at_end}
         truncated = {agent: turn.over and not ended[agent] for agent in at_end}
-        self._episode.finished |= {agent for agent in at_end if ended[agent] or turn.over}
-        self.agents = [agent for agent in at_end if agent not in self._episode.finished]
+        episode.finished |= {agent for agent in at_end if ended[agent] or turn.over}
+        self.agents = [agent for agent in at_end if agent not in episode.finished]
         observations = {agent: self._observed[agent] for agent in at_end}
         if not self.agents:
             self.close()
@@ -109,9 +121,13 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
         try:
             return episode.next_turn()
         except BaseException:
-            self.agents = []
-            self.close()
+            self._give_up()
             raise
+
+    def _give_up(self) -> None:
+        """End the episode after an error."""
+        self.agents = []
+        self.close()
 
     def _is_new(self, agent: str) -> bool:
         return self._episode is not None and agent not in self._episode.finished
@@ -130,3 +146,11 @@ class VehicleEnvironment(ParallelEnv[str, Any, Any]):
     def __del__(self) -> None:
         with suppress(AttributeError):  # it was never made
             self.close()
+
+
+def _whole_seed(seed: Any) -> int:
+    """Return a seed as a plain number. Raises VnetError for one that no scenario can have."""
+    with suppress(TypeError):
+        if 0 <= index(seed) < SEEDS:
+            return index(seed)
+    raise VnetError(f"reset: seed = {shown(seed)}: a whole number from 0 to 2**63 - 1 is needed")

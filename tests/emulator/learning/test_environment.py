@@ -3,6 +3,7 @@
 import sys
 import threading
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -170,6 +171,46 @@ def test_an_error_of_the_user_s_function_is_raised_and_ends_the_episode() -> Non
     assert threads() == 0
     with pytest.raises(VnetError, match=r"step: the episode is over, or has not begun: reset\(\)"):
         env.step({})
+
+
+@pytest.mark.parametrize("step", [3, 5], ids=["on the way", "at the end"])
+@pytest.mark.parametrize("which", ["reward", "terminated"])
+def test_an_error_in_a_reward_ends_the_episode_too(which: str, step: int) -> None:
+    steps = count(1)
+
+    def stumble(agent: str, moment: Moment) -> float:
+        return 0.0 / (agent != "v01" or next(steps) != step)
+
+    functions: dict[str, Any] = {which: stumble}
+    env = make(duration_s=0.5, **functions)
+    env.reset(seed=1)
+    with pytest.raises(ZeroDivisionError):
+        while env.agents:
+            env.step({})
+    assert env.agents == [] and threads() == 0
+    with pytest.raises(VnetError, match=r"step: the episode is over, or has not begun: reset\(\)"):
+        env.step({})
+    assert sorted(env.reset()[0]) == ["v01", "v02", "v03", "v04"]
+    env.close()
+
+
+def test_a_reward_cannot_change_the_truth() -> None:
+    def spoil(agent: str, moment: Moment) -> float:
+        with pytest.raises(ValueError, match="read-only"):
+            moment.position_m[agent][:] = 0.0
+        return 0.0
+
+    play(make(duration_s=0.3, reward=spoil))
+
+
+@pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "1"])
+def test_a_seed_that_no_scenario_can_have_is_refused(seed: Any) -> None:
+    env = make()
+    with pytest.raises(VnetError, match=r"reset: seed = .*: a whole number from 0 to"):
+        env.reset(seed=seed)
+    assert threads() == 0
+    env.reset(seed=np.int64(7))
+    env.close()
 
 
 def test_what_is_wrong_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
