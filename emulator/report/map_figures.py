@@ -19,6 +19,7 @@ from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
 from emulator.report.source import NothingToShow, Source
 from emulator.world.buildings import Buildings
+from vnet.counted import counted
 from vnet.errors import printable
 from vnet.types import Array, Mask
 from vnet.units import title_of
@@ -214,7 +215,7 @@ def _draw_links(made: Canvas, source: Source, scale: float) -> str:
     ends = np.stack([position_m[shown // count], position_m[shown % count]], axis=1)
     _draw_lines(made, ends * scale, SKY, float(np.clip(30 / max(len(shown), 1), 0.12, 0.8)), 1.0)
     part = f"{len(shown):,} of the " if len(shown) < len(pair) else "the "
-    return f"{part}{len(pair):,} links that delivered frames"
+    return f"{part}{counted(len(pair), 'link')} that delivered frames"
 
 
 def _draw_trajectories(made: Canvas, source: Source, scale: float) -> str:

@@ -84,15 +84,18 @@ def _worded(problem: ErrorDetails) -> str:
 
 
 def _allowed_keys(of: type[BaseModel] | TypeAdapter[Any], path: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the section at `path`, where numbers are indices of lists and kinds stand for classes."""
+    """Return the keys of the section at `path`, where numbers are indices of lists and kinds stand for classes.
+
+    Names that are neither a key nor a kind are the user's own, of a table such as `world.sensor`.
+    """
     models = list(_sections_in(of))
     for name in path:
         if isinstance(name, int):
             continue
-        kinds = [m for m in models if "kind" in m.model_fields]
+        kinds = [m for m in models if "kind" in m.model_fields] if len(models) > 1 else []
         by_kind = [m for m in kinds if name in get_args(m.model_fields["kind"].annotation)]
         fields = [m.model_fields[name] for m in models if name in m.model_fields]
-        models = by_kind or [m for f in fields for m in _sections_in(f.annotation)]
+        models = by_kind or [m for f in fields for m in _sections_in(f.annotation)] or models
     return sorted({key for model in models for key in model.model_fields})
 
 

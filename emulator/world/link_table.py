@@ -129,7 +129,17 @@ def _read_row(
         raise ScenarioError(f"{path}: line {line}: {shown(ends[0])} to itself: two vehicles are needed")
     loss = np.nan
     if (row["loss"] or "").strip():
-        loss = number_within(path, line, row, "loss", 1.0)
-        if loss < 0:
-            raise ScenarioError(f"{path}: line {line}: loss = {loss:g}: 0 to 1, or nothing out of range, is needed")
+        loss = _probability(path, line, row["loss"] or "")
     return round(time_s * NS_PER_S), number[ends[0]], number[ends[1]], loss
+
+
+def _probability(path: Path, line: int, text: str) -> float:
+    """Return the loss in a row of a line. Raise ScenarioError unless it is from 0 to 1."""
+    try:
+        loss = float(text)
+    except ValueError:
+        loss = np.nan
+    if not 0 <= loss <= 1:
+        needed = "0 to 1, or nothing out of range, is needed"
+        raise ScenarioError(f"{path}: line {line}: loss = {shown(text)}: {needed}")
+    return loss

@@ -50,7 +50,8 @@ def load_links(radio: Radio, node_ids: Sequence[str]) -> NDArray[np.bool_] | Lin
 def _is_table(path: Path) -> bool:
     """Return whether a file begins with the names of columns."""
     with open_csv(path, _LONGEST_LINE) as lines:
-        return COLUMNS[0] in next(iter(lines), "")
+        first = next(iter(lines), "")
+        return any(name in first for name in COLUMNS)  # a misspelt one is named as it is read
 
 
 def _read(path: Path) -> NDArray[np.bool_]:

@@ -81,7 +81,7 @@ class World:
         buildings = load_buildings(scenario, frame, self.area_m)
         self.radio_inputs = RadioInputs(load_links(scenario.radio, self.node_ids), buildings, scenario.roadside)
         if buildings is not None and not len(buildings):
-            self.notes = (*self.notes, "radio.buildings: none is near a vehicle; check its origin_deg")
+            self.notes = (*self.notes, f"radio.buildings: none is near a vehicle; check {_place_of(scenario)}")
         present = np.isfinite(motion.position_m[: self.periods - 1, :, 0])
         self._changes = np.flatnonzero((present[1:] != present[:-1]).any(axis=1)) + 1  # periods
         _check_exceptions(scenario, motion.node_ids)
@@ -177,6 +177,15 @@ class World:
             heading_rad=self._heading_rad[period, there],
             speed_m_s=self._true_speed_mps[period, there],
         )
+
+
+def _place_of(scenario: Scenario) -> str:
+    """Return what says where the buildings of a scenario are: those in metres have no origin."""
+    section, roads = scenario.radio.buildings, scenario.map
+    path = (section.path if section else None) or (roads.path if roads else None)
+    assert path is not None
+    in_metres = path.name.lower().endswith((".csv", ".poly.xml"))
+    return "the coordinates of its corners" if in_metres else "its origin_deg"
 
 
 def _stated_variance_m2(gnss: Gnss) -> float:

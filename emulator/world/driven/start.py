@@ -10,6 +10,7 @@ import numpy as np
 
 from emulator.scenario.driven import Driven
 from emulator.world.driven.road import Ints, Road, SingleRoad
+from vnet.counted import counted
 from vnet.errors import ScenarioError
 from vnet.types import Array
 
@@ -68,5 +69,6 @@ def queue_m(driven: Driven, lane: Ints) -> Array:
 def one_each(name: str, values: Sequence[Any], count: int) -> Sequence[Any]:
     """Return `values`. Raise ScenarioError, naming the key, unless there are `count` of them."""
     if len(values) != count:
-        raise ScenarioError(f"network.driven.{name}: {len(values)} values for {count} vehicles: give one each")
+        numbers = f"{counted(len(values), 'value')} for {counted(count, 'vehicle')}"
+        raise ScenarioError(f"network.driven.{name}: {numbers}: give one each")
     return values

@@ -23,6 +23,7 @@ from emulator.world.maps.roads import MAX_POINTS
 from emulator.world.maps.sumo import read_sumo_polygons
 from emulator.world.networks import MAX_COORDINATE_M
 from emulator.world.projection import Frame
+from vnet.counted import counted
 from vnet.errors import ScenarioError, shown
 from vnet.types import Array
 
@@ -89,19 +90,16 @@ def _read_csv(path: Path) -> list[Rings]:
             )
             rows.append(((row["building"] or "").strip(), reader.line_num, (x_m, y_m)))
             _bounded(path, len(rows))
-    buildings: list[Rings] = []
-    seen: set[str] = set()
+    rings: dict[str, tuple[str, Array]] = {}
     for name, group in groupby(rows, key=lambda row: row[0]):
         ring = list(group)
         where = f"{path}: line {ring[0][1]}: building = {shown(name)}"
         if not name:
             raise ScenarioError(f"{where}: a name is needed")
-        if name in seen:
+        if name in rings:
             raise ScenarioError(f"{where}: its corners have to stand in rows one after the other")
-        seen.add(name)
-        corners = np.array([corner for _, _, corner in ring])
-        buildings.append([_open_ring(where, corners)])
-    return buildings
+        rings[name] = where, np.array([corner for _, _, corner in ring])
+    return [[_open_ring(where, corners)] for where, corners in rings.values()]
 
 
 def _open_ring(where: str, corners: Array) -> Array:
@@ -109,7 +107,7 @@ def _open_ring(where: str, corners: Array) -> Array:
     if len(corners) > 1 and (corners[0] == corners[-1]).all():
         corners = corners[:-1]
     if len(np.unique(corners, axis=0)) < LEAST_CORNERS:
-        raise ScenarioError(f"{where}: {len(corners)} corners; three different ones are needed")
+        raise ScenarioError(f"{where}: {counted(len(corners), 'corner')}; three different ones are needed")
     return corners
 
 
@@ -148,9 +146,10 @@ def _read_geojson(path: Path) -> list[Rings]:
             continue
         polygons = [geometry.coordinates] if geometry.type == "Polygon" else geometry.coordinates
         where = f"{path}: feature {number}"
-        buildings += [_rings(where, polygon) for polygon in polygons]
-        corners += sum(map(len, buildings[-1])) if buildings else 0
-        _bounded(path, corners)
+        for polygon in polygons:
+            buildings.append(_rings(where, polygon))
+            corners += sum(map(len, buildings[-1]))
+            _bounded(path, corners)
     return buildings
 
 
@@ -158,8 +157,8 @@ def _rings(where: str, polygon: Any) -> Rings:
     """Return the rings (n, 2) of a polygon in GeoJSON, longitude and latitude."""
     try:
         found = msgspec.convert(polygon, list[list[list[float]]])
-        rings = [np.array([point[:2] for point in ring], dtype=float).reshape(-1, 2) for ring in found]
-    except ValueError:
+        rings = [np.array([(x, y) for x, y, *_ in ring], dtype=float).reshape(-1, 2) for ring in found]
+    except ValueError:  # also a point of one number
         rings = []
     if not rings:
         raise ScenarioError(f"{where}: its coordinates are not rings of three or more points")

@@ -82,7 +82,7 @@ class _Reader:
             raise self.wrong(f"not XML: {printable(str(error))}") from None
 
     def _refuse_doctype(self, *_: object) -> None:
-        raise self.wrong("a document type declaration; networks of SUMO have none")
+        raise self.wrong("a document type declaration; files of SUMO have none")
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
         self._depth += 1

@@ -26,6 +26,11 @@ def write(folder: Path, text: str) -> Path:
     ("text", "parts"),
     [
         ("[radio]\nlos = 0.1", ["radio.los", "unknown key", "loss", "max_peers"]),
+        ("[network.driven]\nlenght_m = 9", ["network.driven.lenght_m", "did you mean length_m", "lanes, length_m"]),
+        (
+            '[world.sensor.radar]\nmodle = "x.py"',
+            ["world.sensor.radar.modle", "did you mean model", "model, options"],
+        ),
         ("[radoi]\nloss = 0.1", ["radoi", "unknown key", "radio"]),
         ("[world.gnss]\nrate = 1", ["world.gnss.rate", "unknown key", "rate_hz"]),
         ("[radio]\nloss = 2", ["radio.loss = 2", "less than or equal to 1"]),

@@ -150,7 +150,7 @@ def test_vehicles_leave_at_the_end_of_a_straight_road() -> None:
         (3, {"start_m": (10.0, 20.0)}, "start_m: 2 values for 3 vehicles"),
         (2, {"start_m": (10.0, 12.0)}, "v02 and v01 overlap|v01 and v02 overlap"),
         (9, {"road": "ring", "length_m": 200.0}, "take 310.5 m: the road has length_m = 200"),
-        (2, {"speed_mps": (1.0,)}, "speed_mps: 1 values for 2 vehicles"),
+        (2, {"speed_mps": (1.0,)}, "speed_mps: 1 value for 2 vehicles"),
     ],
 )
 def test_a_start_that_cannot_be_is_one_line(count: int, keys: dict[str, Any], message: str) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from emulator.scenario.scenario import Scenario
 from emulator.world.buildings import Buildings
+from emulator.world.maps import outlines
 from emulator.world.maps.outlines import read_buildings
 from emulator.world.world import build_world
 from tests.support.maps import FRAME, ORIGIN, WAYS, collection, osm_xml, sumo_net
@@ -128,6 +129,8 @@ def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
             CSV + "hut,0,0\nhut,1,0\nhut,0,1\nhouse,1,1\n",
             "line 9: building = 'house': its corners have",
         ),
+        ("b.csv", CSV + "hut,0,0\nhouse,1,1\n", "line 7: building = 'house': its corners have"),
+        ("b.csv", CSV + "hut,0,0\n", "line 6: building = 'hut': 1 corner; three"),
         ("b.csv", CSV + ",0,0\n", "line 6: building = '': a name is needed"),
         ("b.csv", CSV + "hut,0,nan\n", "line 6: y_m = 'nan': a finite number is needed"),
         ("b.csv", CSV + "hut,0\n", "line 6: y_m = None: a finite number is needed"),
@@ -164,6 +167,12 @@ def test_a_table_has_corners_in_metres(tmp_path: Path) -> None:
             '"geometry":{"type":"Polygon","coordinates":[[0,0],[0,1]]}}]}',
             "feature 0: its coordinates are not rings",
         ),
+        (
+            "b.geojson",
+            '{"type":"FeatureCollection","features":[{"properties":{"building":"yes"},'
+            '"geometry":{"type":"Polygon","coordinates":[[[1],[2],[1.5],[2.5],[3],[4]]]}}]}',
+            "feature 0: its coordinates are not rings",
+        ),
     ],
 )
 def test_a_wrong_file_is_one_line(tmp_path: Path, name: str, text: str, message: str) -> None:
@@ -171,6 +180,16 @@ def test_a_wrong_file_is_one_line(tmp_path: Path, name: str, text: str, message:
     with pytest.raises(ScenarioError, match=message) as caught:
         read_buildings(tmp_path / name, lambda: FRAME)
     assert str(caught.value).startswith(str(tmp_path / name)) and "\n" not in str(caught.value)
+
+
+def test_the_corners_of_all_parts_of_a_multipolygon_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outlines, "MAX_POINTS", 10)
+    house = degrees([*HOUSE, HOUSE[0]])
+    geometry = {"type": "MultiPolygon", "coordinates": [[house]] * 3}
+    path = tmp_path / "town.geojson"
+    path.write_text(collection({"type": "Feature", "properties": {"building": "yes"}, "geometry": geometry}))
+    with pytest.raises(ScenarioError, match="more than 10 corners"):
+        read_buildings(path, lambda: FRAME)
 
 
 # Where the metres of degrees begin.
