@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from emulator.radio.connectivity import Connectivity, distances_m
 from emulator.world.neighbours import Links
+from vnet.errors import VnetError
 from vnet.types import Array, IntArray, Mask
 
 MOST_KEPT = 1_000_000
@@ -52,7 +53,9 @@ class Places:
         return np.isfinite(self._position_m[..., 0])
 
     def position_m(self, index: int) -> Array:
-        """(N, 2) of one of the K; the last of them for all later ones."""
+        """(N, 2) of one of the K; the last of them for all later ones. Raises VnetError if K is 0."""
+        if not len(self._position_m):
+            raise VnetError("no period was completed, and no position is known")
         return np.asarray(self._position_m[min(index, len(self._position_m) - 1)])
 
     def distance_m(self, index: int) -> Array:

@@ -366,6 +366,14 @@ def test_a_report_of_an_unfinished_run_says_so(beacon: Path, tmp_path: Path) -> 
     )
 
 
+def test_a_run_that_ended_in_its_first_period_has_a_report(beacon: Path) -> None:
+    for name in ("states", "metrics", "trace"):
+        path = beacon / f"{name}.parquet"
+        pq.write_table(pq.read_table(path).slice(0, 0), path)
+    page = page_of(beacon)
+    assert "no period was completed, and no position is known" in page.text
+
+
 def test_compare_refuses_an_unfinished_run(beacon_run: Path, beacon: Path) -> None:
     (beacon / "states.parquet").unlink()
     with pytest.raises(VnetError, match=r"states\.parquet"):
