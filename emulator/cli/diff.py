@@ -26,7 +26,10 @@ def diff(
     run: RunArgument,
     other: Annotated[Path, typer.Argument(parser=path_of, metavar="OTHER", help="Another run's folder.")],
 ) -> None:
-    """Show where two runs part: decision, frame, reception, event or value, and what had happened before."""
+    """Show where two runs part: decision, frame, reception, event or value, and what had happened before.
+
+    Status 0 in any case.
+    """
     with one_line_errors():
         ours, theirs = RecordedRun.open(run), RecordedRun.open(other)
         found = partings(ours, theirs)

@@ -61,16 +61,19 @@ def links(source: Source) -> Drawing:
         made.axes.plot(distance_km, share, color=BLUE, alpha=0.55, label="a link", **dots)
     else:
         _draw_bins(made, distance_km, share)
-    text = f"Packet delivery ratio of each of {len(used):,} links, from one vehicle to another."
+    each = f"each of {len(used):,} links" if len(used) > 1 else "the one link"
+    text = f"Packet delivery ratio of {each}, from one vehicle to another."
     if len(cast) < len(recorded.trace):
         text += " Frames to one vehicle are not counted."
     lowest = float(share.min())
     if not physical:
         low, band = _draw_expected(made, source.scenario.radio.loss, int(np.median(rows[used])))
         lowest, text = min(lowest, low), text + band + _why_less(source)
+    farthest_km = float(distance_km.max())
     if binned:
-        lowest = min(lowest, _draw_frames(made, source.radio.distances))
-    made.axes.set_xlim(0, max(float(distance_km.max()) * 1.03, 1e-3))
+        least, last_km = _draw_frames(made, source.radio.distances)
+        lowest, farthest_km = min(lowest, least), max(farthest_km, last_km)
+    made.axes.set_xlim(0, max(farthest_km * 1.03, 1e-3))
     made.axes.set_ylim(max(0, np.floor((lowest - 3) / 10) * 10), 102)
     legend(made)
     return Drawing(made, text)
@@ -98,15 +101,19 @@ def _draw_bins(made: Canvas, distance_km: Array, share: Array) -> None:
     made.axes.plot(middle, median, color=BLUE, label="median")
 
 
-def _draw_frames(made: Canvas, bins: pa.Table) -> float:
-    """Draw the ratio of all frames by distance, in at most `DISTANCE_BINS` bins; returns the least in percent."""
+def _draw_frames(made: Canvas, bins: pa.Table) -> tuple[float, float]:
+    """Draw the ratio of all frames by distance, in at most `DISTANCE_BINS` bins.
+
+    Returns the least in percent, and the largest distance in km.
+    """
     from_m, pairs, delivered = (bins[name].to_numpy() for name in ("from_m", "pairs", "delivered"))
     width_m = BIN_M * int(np.ceil((from_m.max(initial=0) + BIN_M) / BIN_M / DISTANCE_BINS))
     index = (from_m // width_m).astype(np.intp)
     filled = np.unique(index)
     share = 100 * np.bincount(index, delivered)[filled] / np.bincount(index, pairs)[filled]
-    made.axes.plot((filled + 0.5) * width_m / 1000, share, color=INK, label=f"all frames, by {width_m:g} m")
-    return float(share.min(initial=100))
+    middle_km = (filled + 0.5) * width_m / 1000
+    made.axes.plot(middle_km, share, color=INK, label=f"all frames, by {width_m:g} m")
+    return float(share.min(initial=100)), float(middle_km.max(initial=0))
 
 
 def _why_less(source: Source) -> str:

@@ -60,14 +60,15 @@ def radio_section(source: Source) -> RadioSection | str:
         metrics = source.radio
     except VnetError as error:
         return str(error)
-    if not metrics.totals["pairs"]:
+    unicast = unicast_figures(source.recorded)
+    if not metrics.totals["pairs"] and unicast is None:
         return "No frame was sent to anybody in range."
     totals = {
         title: f"{100 * value if unit == '%' else value:.1f} {unit}"
         for title, (name, unit) in TOTALS.items()
         if (value := metrics.totals[name]) is not None
     }
-    if (unicast := unicast_figures(source.recorded)) is not None:
+    if unicast is not None:
         totals["frames to one vehicle"] = str(unicast)
     vehicles = metrics.vehicles.sort_by([("heard_delivery_ratio", "ascending"), ("node", "ascending")])
     tables = _listed("By vehicle, the lowest packet delivery ratio (PDR) first", vehicles, VEHICLES)

@@ -106,7 +106,7 @@ def _open_ring(where: str, corners: Array) -> Array:
     """Return a ring without the repetition of its first corner at its end. Raise ScenarioError if it is no area."""
     if len(corners) > 1 and (corners[0] == corners[-1]).all():
         corners = corners[:-1]
-    if len(np.unique(corners, axis=0)) < LEAST_CORNERS:
+    if len(set(map(tuple, corners.tolist()))) < LEAST_CORNERS:  # np.unique takes ten times as long
         raise ScenarioError(f"{where}: {counted(len(corners), 'corner')}; three different ones are needed")
     return corners
 

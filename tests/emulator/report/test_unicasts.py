@@ -60,9 +60,21 @@ def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> No
     assert f"{ratio:.2%}" in page, "key figures and the section agree"
 
 
+def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) -> None:
+    async def send(node: Node) -> None:
+        await node.radio.send("v02" if node.id == "v01" else "v01", b"hello")
+
+    scenario = {"network": {"vehicles": 2}, "run": {"duration_s": 0.2, "settle_s": 0.0}}
+    radio = {"range_m": 9000.0, "mac": {}, "loss": 0.0}
+    emulator.simulate({**scenario, "radio": radio}, program=send, out=tmp_path / "run")
+    section = radio_section(Source(tmp_path / "run"))
+    assert not isinstance(section, str), section
+    assert section.totals["frames to one vehicle"].startswith("2 sent, 2 acknowledged")
+
+
 def test_figures_count_receptions_in_range_and_links_broadcasts(run: Path) -> None:
     source = Source(run)
-    assert "each of 1 links" in links(source).caption
+    assert "of the one link" in links(source).caption
     attempted = int((~source.recorded.outcome_is("out_of_range")).sum())
     assert attempted < len(source.recorded.trace)
     for drawing in (radio_figures.outcomes(source), radio_figures.totals(source)):
@@ -86,3 +98,16 @@ def test_times_on_the_edge_of_a_bin_are_on_their_side(tmp_path: Path) -> None:
     scenario = {"network": {"vehicles": 2}, "run": run, "radio": {"range_m": 9000.0, "loss": 1.0}}
     emulator.simulate(scenario, program=beacon, out=tmp_path / "run")
     assert "20 to 20 a second" in radio_figures.outcomes(Source(tmp_path / "run")).caption
+
+
+def test_the_axis_of_distances_holds_all_frames_of_vehicles_that_drive(tmp_path: Path) -> None:
+    async def beacon(node: Node) -> None:
+        async for _ in node.gnss:
+            await node.radio.broadcast(b"x")
+
+    road = {"start_m": [200.0, 100.0], "speed_mps": [40.0, 10.0]}
+    scenario = {"network": {"kind": "driven", "vehicles": 2, "driven": road}, "run": {"duration_s": 5.0}}
+    emulator.simulate(scenario, program=beacon, out=tmp_path / "run")
+    axes = links(Source(tmp_path / "run")).canvas.axes
+    drawn_km = max(np.max(line.get_xdata()) for line in axes.get_lines() if "all frames" in str(line.get_label()))
+    assert drawn_km <= axes.get_xlim()[1]
