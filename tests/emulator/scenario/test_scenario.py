@@ -28,8 +28,8 @@ def write(folder: Path, text: str) -> Path:
         ("[radio]\nlos = 0.1", ["radio.los", "unknown key", "loss", "max_peers"]),
         ("[network.driven]\nlenght_m = 9", ["network.driven.lenght_m", "did you mean length_m", "lanes, length_m"]),
         (
-            '[world.sensor.radar]\nmodle = "x.py"',
-            ["world.sensor.radar.modle", "did you mean model", "model, options"],
+            '[world.sensor.radar]\nmodl = "x.py"',
+            ["world.sensor.radar.modl", "did you mean model", "model, options"],
         ),
         ("[radoi]\nloss = 0.1", ["radoi", "unknown key", "radio"]),
         ("[world.gnss]\nrate = 1", ["world.gnss.rate", "unknown key", "rate_hz"]),
