@@ -37,6 +37,7 @@ WIDTH_PX, PLOT_PX = 400, 190
 _LEFT_PX, _RIGHT_PX, _TOP_PX, _BOTTOM_PX = 54, 12, 8, 42
 _LEGEND_ROW_PX, _LANE_PX = 18, 15
 _MOST_LANES = 6
+LEGEND_COLUMNS = 3
 _LETTER_PX = 5.6
 """The width of a letter of a fault's label, on average."""
 MOST_POINTS = 2 * (WIDTH_PX - _LEFT_PX - _RIGHT_PX)
@@ -154,7 +155,7 @@ def _draw_lanes(strip: Axes, lanes: Sequence[Sequence[Span]], end_s: float) -> N
             strip.text(_reach(span, end_s)[0], row + 0.68, span.label, fontsize=10, color=QUIET, va="baseline")
 
 
-def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = 3) -> None:
+def legend(of: Canvas, handles: Sequence[Artist] | None = None, columns: int = LEGEND_COLUMNS) -> None:
     """Put a legend of these handles, or of all that have labels, above the figure."""
     of.figure.legend(
         handles=of.axes.get_legend_handles_labels()[0] if handles is None else list(handles),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,18 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from emulator.pages.canvas import Canvas, Span, canvas, from_zero, legend, logarithmic, styled, thin, to_svg
+from emulator.pages.canvas import (
+    LEGEND_COLUMNS,
+    Canvas,
+    Span,
+    canvas,
+    from_zero,
+    legend,
+    logarithmic,
+    styled,
+    thin,
+    to_svg,
+)
 from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
 from vnet.types import Array
@@ -53,7 +65,7 @@ def time_figure(
     lines: Sequence[Line], y_label: str, end_s: float, spans: Sequence[Span] = (), linear: bool = False
 ) -> Canvas:
     """Draw lines against time, spans of faults behind them; logarithmic if they spread far, unless `linear`."""
-    rows = 1 if len(lines) > 1 else 0
+    rows = math.ceil(len(lines) / LEGEND_COLUMNS) if len(lines) > 1 else 0
     made = canvas(TIME, y_label, rows, spans, end_s)
     for line in lines:
         marker = "o" if np.isfinite(line.value).sum() < 3 else None

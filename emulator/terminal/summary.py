@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -27,6 +29,8 @@ from emulator.viewer.sinks import is_closed, repair_command
 
 SLOWEST = 10
 """Vehicles in the table of what a run cost."""
+WIDEST = 10_000
+"""Columns of a terminal on which every table has room."""
 STYLE = {Verdict.VALID: "green", Verdict.INVALID: "bold red", Verdict.UNKNOWN: "yellow"}
 
 
@@ -111,7 +115,7 @@ def print_checks(judgement: Judgement, console: Console, reproduce: str, verbose
             _print_details(check, console)
         if rows := check.figures.get("rows"):
             console.print(Text(f"{check.name}: the first offending rows", style="bold red"))
-            console.print(offending(rows))
+            print_offending(rows, console)
     if judgement.verdict is Verdict.INVALID:
         console.print(f"to see this again: {as_typed(reproduce)}", highlight=False, soft_wrap=True)
 
@@ -139,6 +143,17 @@ def _listed(checks: Sequence[CheckResult]) -> Table:
     for check in checks:
         table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
     return table
+
+
+def print_offending(rows: Sequence[Mapping[str, Any]], console: Console) -> None:
+    """Print the rows that a failed check holds against the run; where a table is too wide, each by itself."""
+    table = offending(rows)
+    if Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum <= console.width:
+        console.print(table)
+        return
+    for row in rows:
+        told = [f"{key} {cell(value)}" for key, value in row.items() if value not in (None, "")]
+        console.print(Padding(Text(", ".join(told)), (0, 0, 0, 2)))
 
 
 def offending(rows: Sequence[Mapping[str, Any]]) -> Table:

@@ -15,7 +15,7 @@ from rich.console import Console
 from emulator.checks.judge import CheckResult, NotExercised, RecordedRun, Verdict, check_run, judge
 from emulator.checks.replay import compare
 from emulator.records.states import STATES
-from emulator.terminal.summary import print_checks
+from emulator.terminal.summary import print_checks, print_offending
 from tests.emulator.checks.test_faults import with_cells
 from tests.emulator.checks.test_judge import first, four, result, with_names
 from tests.support.paths import ROOT
@@ -88,6 +88,11 @@ def test_a_failed_check_prints_its_rows_and_the_command(recorded: RecordedRun) -
     lines = printed.getvalue().splitlines()
     start = lines.index(next(line for line in lines if line.startswith("conservation: the first offending rows")))
     assert lines[start + 1].split()[:4] == ["sent_ns", "sender", "seq", "receiver"]
+    narrow = StringIO()
+    row = {"sent_ns": 10**9, "payload_digest": 10**18, "cause": None, "sender": "v01"}
+    print_offending([row] * 2, Console(file=narrow, width=36))
+    told = ["sent_ns 1000000000, payload_digest", "1000000000000000000, sender v01"]
+    assert [line.strip() for line in narrow.getvalue().splitlines()] == told * 2
     assert lines[-1].startswith("to see this again: ")
     assert lines[-1].endswith("vnet simulate here/scenario.toml")
 
