@@ -306,7 +306,7 @@ def brute_force_way_m(road: MapRoads, along_m: Any, left_m: Any, number: int, ra
         (1, {"routes": [["edge 0", "edge 2"]]}, "'edge 2' does not begin or go on where 'edge 0' leads to"),
         (9, {"routes": [EAST], "gap_m": 50.0}, "9 vehicles a lane with gap_m = 50 take 490.5 m: route"),
         (1, {"routes": [EAST], "start_m": [500]}, r"start_m: 500: route \['edge 0', 'edge 1'\] has 400 m"),
-        (2, {"routes": [EAST], "start_m": [50]}, "start_m: 1 values for 2 vehicles"),
+        (2, {"routes": [EAST], "start_m": [50]}, "start_m: 1 value for 2 vehicles"),
         (
             1,
             {"routes": [EAST], "start_m": [50], "start_lanes": [1]},
