@@ -20,7 +20,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 
@@ -28,8 +28,7 @@ from vnet.errors import VnetError
 from vnet.types import Array
 
 
-@dataclass(frozen=True)
-class Share:
+class Share(NamedTuple):
     """A node's broadcast of one round: its epoch, the running sum (s_x, s_y, w) given to each of `out_neighbours`.
 
     `heard` are the peers that it has received lately. Averaging needs no epoch (it is 0) and has
@@ -75,6 +74,11 @@ USUAL_ROUNDS = 50
 """Rounds over which the usual weight is averaged."""
 DOUBTFUL_ROUNDS = 6
 """Silence of an out-neighbour for which the ratio is not the mean: at 10 % loss a chance of 10⁻⁶."""
+
+
+Triple = tuple[float, float, float]
+"""Mass (s_x, s_y, w)."""
+_NO_MASS = (0.0, 0.0, 0.0)
 
 
 class Consensus(Protocol):
@@ -133,11 +137,12 @@ class Peers:
         if min(self._received.values(), default=oldest) < oldest:
             for peer in [peer for peer, received in self._received.items() if received < oldest]:
                 self.drop(peer)
+        received, hears_us, node, now = self._received, self._hears_us, self._node, self._round
         for peer, share in shares.items():
-            self._received[peer] = self._round
-            hears = self._node in share.heard
-            if self._hears_us.get(peer) is not hears:
-                self._hears_us[peer] = hears
+            received[peer] = now
+            hears = node in share.heard
+            if hears_us.get(peer) is not hears:
+                hears_us[peer] = hears
                 self._heard = self._mutual = None
 
 
@@ -179,23 +184,32 @@ class RatioConsensus:
 
     def round(self, value: Array, shares: Mapping[str, Share]) -> Share:
         """One round with the input x (2,) and what peers said last, by peer; returns what to broadcast."""
-        shares = self._believed(value, shares)
+        x, y = value.tolist()
+        shares, added = self._believed(x, y, shares)
         self._peers.listen(shares)
         self._highest = max([self._highest, *[share.epoch for share in shares.values()]])
-        self._follow(value)
-        for peer in sorted(shares):
-            self._take(peer, shares[peer])
+        if self._follow(x, y):
+            each = ((peer, self._added(peer, share)) for peer, share in shares.items())
+            added = {peer: mass for peer, mass in each if mass is not None}
+        s_x, s_y, w = self._mass
+        for peer in sorted(added):
+            more_x, more_y, more_w = added[peer]
+            s_x, s_y, w = s_x + more_x, s_y + more_y, w + more_w
+            self._seen[peer] = shares[peer].running_sum
+        self._mass = s_x, s_y, w
         self._split()
         self._divide()
-        x, y = value.tolist()
         self._input = float(x), float(y)
         return Share(self.epoch, self._running_sum, self._out_neighbours, self._peers.heard)
 
-    def _believed(self, value: Array, shares: Mapping[str, Share]) -> dict[str, Share]:
+    def _believed(
+        self, x: float, y: float, shares: Mapping[str, Share]
+    ) -> tuple[dict[str, Share], dict[str, Triple]]:
         """Return the shares without those of banned peers and of implausible mass: as if these were not received.
 
         Mass that such a peer has been given is lost until a new epoch starts without it; the ratio of what is left
-        is the mean all the same.
+        is the mean all the same. Mass is plausible if it may be of common errors near the input (x, y). The second
+        value is what each has given this node since its last sum.
         """
         if self._penalties:
             leak = 1 / self._config.forgive_rounds
@@ -203,17 +217,23 @@ class RatioConsensus:
                 p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
             }
         self._penalize_new_epochs(shares)
-        x, y = value.tolist()
-        believed = {}
+        gate_m = self._config.gate_m
+        believed: dict[str, Share] = {}
+        added: dict[str, Triple] = {}
         for peer, share in shares.items():
             if self._penalties and self._penalty(peer) > self._config.ban_penalty:
                 self._rejected["banned"] += 1
-            elif not self._is_plausible(peer, share, x, y):
-                self._rejected["implausible_mass"] += 1
-                self._penalize(peer, self._config.ban_penalty, share.epoch)
-            else:
-                believed[peer] = share
-        return believed
+                continue
+            mass = self._added(peer, share)
+            if mass is not None:
+                s_x, s_y, w = mass
+                if w < 0 or not math.hypot(s_x - w * x, s_y - w * y) <= gate_m * (w + MIN_MASS):
+                    self._rejected["implausible_mass"] += 1
+                    self._penalize(peer, self._config.ban_penalty, share.epoch)
+                    continue
+                added[peer] = mass
+            believed[peer] = share
+        return believed, added
 
     def _penalize_new_epochs(self, shares: Mapping[str, Share]) -> None:
         """Penalize the peers that are the first with a new epoch.
@@ -237,34 +257,34 @@ class RatioConsensus:
         if penalty > self._config.ban_penalty:
             self._peers.drop(peer)
 
-    def _is_plausible(self, peer: str, share: Share, x: float, y: float) -> bool:
-        """Tell whether the mass that a peer has added since its last sum may be of common errors near (x, y)."""
+    def _added(self, peer: str, share: Share) -> Triple | None:
+        """Return the mass that a peer has given this node since its last sum, None if it gives it nothing."""
         if share.epoch != self.epoch or self._node not in share.out_neighbours:
-            return True
+            return None
         s_x, s_y, w = share.running_sum
-        if peer in self._seen:
-            seen_x, seen_y, seen_w = self._seen[peer]
-            s_x, s_y, w = s_x - seen_x, s_y - seen_y, w - seen_w
-        return w >= 0 and math.hypot(s_x - w * x, s_y - w * y) <= self._config.gate_m * (w + MIN_MASS)
+        seen_x, seen_y, seen_w = self._seen.get(peer, _NO_MASS)
+        return s_x - seen_x, s_y - seen_y, w - seen_w
 
-    def _follow(self, value: Array) -> None:
-        """Start a new epoch where one is due, otherwise add the change of the input."""
+    def _follow(self, x: float, y: float) -> bool:
+        """Start a new epoch where one is due, otherwise add the change of the input (x, y); tells which."""
         wanted = self._peers.mutual
         changed = wanted != self._out_neighbours or self.epoch == 0
         self._changed_rounds = self._changed_rounds + 1 if changed else 0
         if self._changed_rounds >= self._config.steady_rounds:
-            self._start(self._highest + 1, value, wanted)
-        elif self.epoch and self._highest > self.epoch:
-            self._start(self._highest, value, wanted)
-        elif self.epoch:
+            self._start(self._highest + 1, x, y, wanted)
+            return True
+        if self.epoch and self._highest > self.epoch:
+            self._start(self._highest, x, y, wanted)
+            return True
+        if self.epoch:
             assert self._input is not None
-            (x, y), (s_x, s_y, w) = value.tolist(), self._mass
+            s_x, s_y, w = self._mass
             self._mass = s_x + (x - self._input[0]), s_y + (y - self._input[1]), w
             self._age += 1
+        return False
 
-    def _start(self, epoch: int, value: Array, out_neighbours: frozenset[str]) -> None:
+    def _start(self, epoch: int, x: float, y: float, out_neighbours: frozenset[str]) -> None:
         self.epoch = self._highest = epoch
-        x, y = value.tolist()
         self._mass = float(x), float(y), 1.0
         self._usual_weight = 1.0
         self._running_sum = (0.0, 0.0, 0.0)
@@ -272,14 +292,6 @@ class RatioConsensus:
         self._changed_rounds = 0
         self._age = 0
         self._seen = {}
-
-    def _take(self, peer: str, share: Share) -> None:
-        if share.epoch != self.epoch or self._node not in share.out_neighbours:
-            return
-        (x, y, w), (s_x, s_y, s_w) = share.running_sum, self._mass
-        seen_x, seen_y, seen_w = self._seen.get(peer, (0.0, 0.0, 0.0))
-        self._mass = s_x + (x - seen_x), s_y + (y - seen_y), s_w + (w - seen_w)
-        self._seen[peer] = share.running_sum
 
     def _divide(self) -> None:
         """Take the ratio for the mean, if it can be trusted.
@@ -421,6 +433,7 @@ def tracked_mean(neighbours_mean_m: Array, mean_m: Array | None, limit_m: float 
     """
     if mean_m is None:
         return neighbours_mean_m
-    x, y = (mean_m - neighbours_mean_m).tolist()
-    share = CONSENSUS_SHARE * min(1.0, limit_m / max(math.hypot(x, y), 1e-300))
-    return np.asarray(neighbours_mean_m + share * np.array([x, y]))
+    off_m = mean_m - neighbours_mean_m
+    x, y = off_m.tolist()
+    off_m *= CONSENSUS_SHARE * min(1.0, limit_m / max(math.hypot(x, y), 1e-300))
+    return np.asarray(neighbours_mean_m + off_m)

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -274,7 +273,7 @@ def agreed_without_the_first(net: Net) -> None:
 def test_false_sums_are_not_taken_and_who_says_them_is_left_out() -> None:
     def lie(turn: int, share: Share) -> Share:
         s_x, s_y, w = share.running_sum
-        return replace(share, running_sum=(s_x + 50 * w, s_y, w))
+        return share._replace(running_sum=(s_x + 50 * w, s_y, w))
 
     net, rejected = deceived(8, lie)
     agreed_without_the_first(net)
@@ -285,7 +284,7 @@ def test_false_sums_are_not_taken_and_who_says_them_is_left_out() -> None:
 
 def test_a_peer_that_starts_epoch_after_epoch_is_left_out_and_not_those_who_took_them_over() -> None:
     def lie(turn: int, share: Share) -> Share:
-        return replace(share, epoch=share.epoch + 1) if turn > 50 else share
+        return share._replace(epoch=share.epoch + 1) if turn > 50 else share
 
     net, rejected = deceived(6, lie, lambda _, j, i: abs(i - j) <= 2)
     agreed_without_the_first(net)
