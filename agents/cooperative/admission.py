@@ -87,34 +87,34 @@ class Admission(Generic[F]):
             except FrameError as error:
                 self.rejected[str(error)] += 1
         admitted = []
-        period_ns = now_ns - now_ns % self._period_ns
+        period_ns, late_ns = now_ns - now_ns % self._period_ns, STALE_PERIODS * self._period_ns
+        largest_epoch = EPOCH_MARGIN + now_ns // self._period_ns
         for node, frame in frames:
-            sender = short_name(node)
-            reason = self._objection(sender, frame, now_ns)
-            if reason:
+            sender, time_ns = short_name(node), frame.fix_time_ns
+            if frame.name != sender or sender == self._name:
+                self.rejected["replayed"] += 1
+            elif not -late_ns <= now_ns - time_ns <= late_ns:
+                self.rejected["stale"] += 1
+            elif frame.epoch > largest_epoch:
+                self.rejected["absurd"] += 1
+            elif reason := self._objection(sender, frame, time_ns):
                 self.rejected[reason] += 1
-            elif frame.fix_time_ns > period_ns:
-                self._early[sender, frame.fix_time_ns] = node, frame
+            elif time_ns > period_ns:
+                self._early[sender, time_ns] = node, frame
             else:
                 self.ids[sender] = node
-                self._newest_ns[sender] = frame.fix_time_ns
+                self._newest_ns[sender] = time_ns
                 admitted.append((sender, frame))
         return admitted
 
-    def _objection(self, sender: str, frame: F, now_ns: int) -> str | None:
-        """Return the reason to reject the frame, if there is one."""
-        if frame.name != sender or sender == self._name:
-            return "replayed"
-        if abs(now_ns - frame.fix_time_ns) > STALE_PERIODS * self._period_ns:
-            return "stale"
-        if frame.epoch > EPOCH_MARGIN + now_ns // self._period_ns:
-            return "absurd"
-        if sender not in self._newest_ns and len(self._newest_ns) + len(self._early) >= MAX_SENDERS:
+    def _objection(self, sender: str, frame: F, time_ns: int) -> str | None:
+        """Return the reason to reject the frame for what was sent before, if there is one."""
+        if len(self._newest_ns) + len(self._early) >= MAX_SENDERS and sender not in self._newest_ns:
             return "too_many_senders"
-        known = self._newest_ns.get(sender, -1) >= frame.fix_time_ns
-        if (known or (self._early and (sender, frame.fix_time_ns) in self._early)) and not self._several:
+        known = self._newest_ns.get(sender, -1) >= time_ns or (self._early and (sender, time_ns) in self._early)
+        if known and not self._several:
             return "duplicate"
-        return None if self.claim(sender, frame.fix_time_ns, frame.fingerprint) else "replayed"
+        return None if self.claim(sender, time_ns, frame.fingerprint) else "replayed"
 
     def claim(self, sender: str, time_ns: int, fingerprint: bytes) -> bool:
         """Tell whether `sender` is the first with what comes from a fix: no two receivers' noise is the same."""
