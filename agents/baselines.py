@@ -24,7 +24,7 @@ from msgspec import Meta
 from agents import options as parsing
 from agents.cooperative.estimator import usable
 from vnet import Fix, Node
-from vnet.cmm.information import Information, inverse
+from vnet.cmm.information import Five, Information, inverse
 from vnet.cmm.map_matching import candidate_lanes
 from vnet.cmm.own_vehicle import OwnConfig, own_vehicle
 from vnet.cmm.rbpf import Observation, RbpfConfig
@@ -40,7 +40,6 @@ REACH_M = 15.0
 LEAST_INFORMATION = 1e-6
 """Information (1/m²) about the correction before anything is heard: a deviation of a kilometre."""
 
-Five = tuple[float, float, float, float, float]
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -72,15 +71,9 @@ class Frame(msgspec.Struct, array_like=True):
     increment: Five
 
 
-def _five(information: Information) -> Five:
-    (a, b), (_, d) = information.matrix.tolist()
-    x, y = information.vector.tolist()
-    return a, b, d, x, y
-
-
 def _information(five: Array) -> Information:
     a, b, d, x, y = five.tolist()
-    return Information(np.array([[a, b], [b, d]]), np.array([x, y]))
+    return Information((a, b, d, x, y))
 
 
 class Filtering:
@@ -98,7 +91,7 @@ class Filtering:
         observation = Observation(fix.position_m, fix.covariance_m2, fix.heading_rad) if usable(fix) else None
         increment = self._own.step((fix.time_ns - last_ns) / NS_PER_S, observation)
         self._last_ns = fix.time_ns
-        return Frame(fix.time_ns, _five(self._own.prior), _five(increment))
+        return Frame(fix.time_ns, self._own.prior.numbers, increment.numbers)
 
     def combine(self, own: Frame, heard: list[Frame]) -> None:
         """Combine what others say of the same instant."""
@@ -111,7 +104,7 @@ class Filtering:
         else:
             means = [_information(each).moments()[0] for each in prior]
             certain = _information(prior[0]).matrix
-            pooled = np.array(_five(Information(certain, certain @ np.mean(means, axis=0))))
+            pooled = np.array(Information.from_arrays(certain, certain @ np.mean(means, axis=0)).numbers)
         self._own.absorb(_information(pooled + increment))
 
     def estimate(self, fix: Fix) -> tuple[Array, Array, Array, Array]:
@@ -148,8 +141,8 @@ class Differential:
         normal = self._lanes.normal[lane]
         variance_m2 = float(normal @ fix.covariance_m2 @ normal) + (self._lanes.half_width_m / 2) ** 2
         innovation_m = float(normal @ fix.position_m - self._lanes.offset_m[lane])
-        seen = Information(np.outer(normal, normal) / variance_m2, innovation_m * normal / variance_m2)
-        return Frame(fix.time_ns, nothing, _five(seen))
+        seen = Information.from_arrays(np.outer(normal, normal) / variance_m2, innovation_m * normal / variance_m2)
+        return Frame(fix.time_ns, nothing, seen.numbers)
 
     def combine(self, own: Frame, heard: list[Frame]) -> None:
         """Average the innovations of all heard, and the vehicle's own, with those of the last moments."""

@@ -202,7 +202,9 @@ class Estimator:
     def _fusion_weights(self, frames: Mapping[str, CooperativeFrame]) -> Array:
         """Fusion weights (1 + n,) of this vehicle and its neighbours, by the rule of the options."""
         degrees = [len(frame.heard) for frame in frames.values()]
-        return self._rule.weights(*self._sent_estimates(frames), self.consensus.mean_m, degrees)
+        estimates_m, covariances_m2 = self._sent_estimates(frames)
+        variances_m2 = covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1]
+        return self._rule.weights(estimates_m, variances_m2, self.consensus.mean_m, degrees)
 
     def _sent_estimates(self, frames: Mapping[str, CooperativeFrame]) -> tuple[Array, Array]:
         """Estimates (1 + n, 2) and covariances (1 + n, 2, 2) as they were sent, the vehicle's own first."""

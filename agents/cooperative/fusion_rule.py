@@ -37,12 +37,12 @@ class FusionRule:
         self.largest_degree = max([self.largest_degree, own_degree, *largest_degrees])
 
     def weights(
-        self, estimates_m: Array, covariances_m2: Array, mean_m: Array | None, degrees: Sequence[int]
+        self, estimates_m: Array, variances_m2: Array, mean_m: Array | None, degrees: Sequence[int]
     ) -> Array:
         """Return weights (1 + n,) of the vehicle itself and n neighbours that hear `degrees` others.
 
-        Estimates (1 + n, 2) and covariances (1 + n, 2, 2) are the vehicle's own first; `mean_m` (2,) is the
-        network's mean as far as it is known.
+        Estimates (1 + n, 2) and the traces (1 + n,) of their covariances are the vehicle's own first; `mean_m` (2,)
+        is the network's mean as far as it is known.
         """
         count = len(estimates_m)
         match self._options.fusion:
@@ -58,4 +58,4 @@ class FusionRule:
                 return max_degree_weights(count, max(self.largest_degree, count - 1))
             case _:
                 mean_m = estimates_m.mean(axis=0) if mean_m is None else mean_m
-                return self._optimized.solve(estimates_m, covariances_m2, mean_m)
+                return self._optimized.solve_by_variance(estimates_m, variances_m2, mean_m)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_su
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.information_frame import InformationFrame, encode
 from vnet import Fix
+from vnet.cmm.information import Five
 from vnet.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, matrices
 from vnet.types import Array
 from vnet.units import NS_PER_S
@@ -53,11 +55,7 @@ class InformationAttacker(InformationEstimator):
                 return _moved(frame, *_undetected(frame, offset_m, self.period_s, self.limit_m))
             case "overconfident":
                 moved = _moved(frame, offset_m, offset_m)
-                prior, increment = (
-                    tuple(EXAGGERATION * value for value in information)
-                    for information in (moved.prior, moved.increment)
-                )
-                return replace(moved, prior=prior, increment=increment)
+                return replace(moved, prior=_louder(moved.prior), increment=_louder(moved.increment))
             case "sums":
                 return replace(frame, running_sum=shifted_sum(frame.running_sum, offset_m))
             case "relay":
@@ -75,7 +73,13 @@ class InformationAttacker(InformationEstimator):
                 return replace(frame, prior=(*frame.prior[:3], 1e30, -1e30))
 
 
-def _shifted(information: tuple[float, ...] | list[float], by_m: Array) -> tuple[float, ...]:
+def _louder(information: Five) -> Five:
+    """Return what claims `EXAGGERATION` times as much information with the same mean."""
+    a, b, d, x, y = information
+    return EXAGGERATION * a, EXAGGERATION * b, EXAGGERATION * d, EXAGGERATION * x, EXAGGERATION * y
+
+
+def _shifted(information: Sequence[float], by_m: Array) -> Five:
     """Return information (5,) whose mean is off by (2,)."""
     a, b, d, x, y = information
     east, north = by_m.tolist()

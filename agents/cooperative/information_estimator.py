@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.cooperative.admission import Admission
 from agents.cooperative.estimator import mean_consensus, usable
@@ -23,7 +22,6 @@ from agents.cooperative.fusion_rule import FusionRule
 from agents.cooperative.information_frame import (
     INCREMENT_LIMIT,
     MAX_HEARD,
-    PASSED,
     InformationFrame,
     decode,
     encode,
@@ -32,19 +30,18 @@ from agents.cooperative.information_frame import (
     room,
 )
 from agents.cooperative.options import Options
+from agents.cooperative.passing import Passing, codes_and_increments
 from vnet import Fix, Packet
 from vnet.cmm.consensus import Share, tracked_mean
-from vnet.cmm.information import Information
+from vnet.cmm.information import Five, Information, plain_moments
 from vnet.cmm.own_vehicle import own_vehicle
 from vnet.cmm.plausibility import (
     INCREMENT_FACTOR,
-    MAX_ORIGINS,
     PRIOR_FACTOR,
     SELF_SHARE,
     SPREAD_GATE,
     Origins,
     cut_to,
-    matrices,
     median_belief,
     priors_agree,
     scaled_down,
@@ -64,20 +61,31 @@ LOST_NEIGHBOURS = 3
 PASSED_SHARE = 0.8
 """Share of an increment that is passed on which is added: what priors hold by longer ways is not in their lists,
 and with the whole the vehicles are too sure (ANEES 1.25 on N1 in place of 1.16; the error grows by 1 %)."""
-MAX_FORGED_SHARE = 0.5
-"""Share of the increments that are known first-hand, beyond which a frame that passes on others is forged."""
 
 
 _SENT = struct.Struct("<5f")
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0)
-_ROW = 15
-"""Numbers of a vehicle: prior, increment, and the prior's mean and covariance."""
 
 
-def as_sent(information: Information) -> tuple[float, ...]:
+def as_sent(information: Information) -> Five:
     """Return the five numbers of `information` with the precision in which frames carry them."""
-    (a, b), (_, d) = information.matrix.tolist()
-    return _SENT.unpack(_SENT.pack(a, b, d, *information.vector.tolist()))
+    a, b, d, x, y = _SENT.unpack(_SENT.pack(*information.numbers))
+    return a, b, d, x, y
+
+
+def _trace(information: Five) -> float:
+    """Return the trace of the matrix."""
+    return information[0] + information[2]
+
+
+def _sum(rows: Array) -> Array:
+    """Return the sum (5,) of rows (n, 5): numpy's takes longer where they are few."""
+    return np.asarray(np.ones(len(rows)).dot(rows))
+
+
+def _joined(rows: list[bytes]) -> Array:
+    """Return rows of `packed_numbers` as an array (n, 15)."""
+    return np.frombuffer(b"".join(rows)).reshape(len(rows), -1)
 
 
 class InformationEstimator:
@@ -116,11 +124,10 @@ class InformationEstimator:
         self._now_ns = -period_ns
         self._contradicted = 0
         self._prior = as_sent(self.own.prior)
-        self._increment: tuple[float, ...] = _NOTHING
+        self._increment: Five = _NOTHING
         self._largest_increment = 0.0
         self._code = int(self.name, 16)
-        self._used = passed_record(self._code, self._increment)
-        self._passing = Passing()
+        self._passing = Passing(passed_record(self._code, self._increment))
         self._neighbours = frozenset(map(short_name, options.hears.get(node_id, []))) if options.hears else None
 
     @property
@@ -159,7 +166,8 @@ class InformationEstimator:
         increment = as_sent(self.own.step(dt_s, fix))
         largest = max(map(abs, increment))
         if largest > INCREMENT_LIMIT:
-            increment = tuple(value * (INCREMENT_LIMIT / largest) for value in increment)
+            a, b, d, x, y = (value * (INCREMENT_LIMIT / largest) for value in increment)
+            increment = a, b, d, x, y
         self._increment = increment
         self._prior = as_sent(self.own.prior)
 
@@ -174,32 +182,28 @@ class InformationEstimator:
         }
         self._frames = {}
         # What this vehicle says itself is the first row of all.
-        rows = [packed_numbers(self._prior, self._increment), *[frame.numbers for frame in frames.values()]]
-        table = np.frombuffer(b"".join(rows)).reshape(-1, _ROW)
-        codes = [frame.code for frame in frames.values()]
-        believed = self._believed(codes, table)
+        own = plain_moments(*self._prior)
+        table = _joined([packed_numbers(self._prior, self._increment, own), *[f.numbers for f in frames.values()]])
+        believed = self._believed(list(frames.values()), own, table)
         if believed is not None:
             frames = {name: frames[name] for name, good in zip(frames, believed, strict=True) if good}
-            codes = [frame.code for frame in frames.values()]
             table = table[[True, *believed]]
-        said, means_m = table[:, :10], table[:, 10:12]
-        priors, means_m, leaning = self._moderated(codes, said[:, :5], means_m, table[:, 12:])
+        heard = list(frames.values())
+        priors, means_m, leaning = self._moderated(heard, own, table[:, :5], table[:, 10:12])
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
             self.mean_m = tracked_mean(
                 np.add.reduce(means_m) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE
             )
-        priors, increments = self._limited(priors, said[:, 5:])
-        weights = self._weigh(frames, means_m, matrices(table[:, 12:]), leaning)
-        pooled = weights @ priors + np.add.reduce(increments)
-        passed = self._passed_on(frames, weights)
-        pooled += np.add.reduce(passed)
+        priors, increments = self._limited(heard, priors, table[:, 5:10])
+        weights = self._weigh(frames, means_m, table[:, 12] + table[:, 14], leaning)
+        passed = self._passed_on(heard, weights[1:])
+        pooled = np.array(weights).dot(priors) + _sum(increments) + _sum(passed)
         self.imported = len(frames) + len(passed)
-        own = passed_record(self._code, self._increment)
-        self._used = b"".join([own, *[frame.record for frame in frames.values()]])
+        self._passing.use([passed_record(self._code, self._increment), *[frame.record for frame in heard]])
         if self.imported:
-            self.own.absorb(Information(matrices(pooled[None])[0], pooled[3:]))
+            self.own.absorb(Information(tuple(pooled.tolist())))
         self.fused_m = self.own.estimate_m
 
     def _is_current(self, sender: str, frame: InformationFrame) -> bool:
@@ -211,34 +215,34 @@ class InformationEstimator:
         self.rejected["late"] += 1
         return False
 
-    def _believed(self, codes: list[int], table: Array) -> list[bool] | None:
-        """Tell which of the senders `codes` (n,) are plausible, None if all are.
+    def _believed(self, frames: Sequence[InformationFrame], own: Five, table: Array) -> list[bool] | None:
+        """Tell which of the frames (n,) are plausible, None if all are.
 
-        `table` (1 + n, 15) has what they say, and first what the vehicle says itself.
+        `own` is the mean and the covariance of the vehicle's own prior, and `table` (1 + n, 15) has what all say.
         """
-        if not self._options.defence or not codes:
+        if not self._options.defence or not frames:
             return None
-        own, others = table[0], table[1:]
-        own_m2 = matrices(own[None, 12:])[0]
-        near = priors_agree(others[:, 10:12], others[:, 12:], own[10:12], own[12:])
-        agrees = self._origins.agree(codes, others[:, 5:10], (own[10:12], own_m2), self._now_ns / NS_PER_S)
+        x, y, p, q, r = own
+        codes, now_s = [frame.code for frame in frames], self._now_ns / NS_PER_S
+        near = priors_agree([frame.moments for frame in frames], own)
+        agrees = self._origins.agree(codes, table[1:, 5:10], ((x, y), (p, q, r)), now_s)
         agrees = unless_most_disagree(agrees)
-        self._notice_being_lost(near, others[:, :5])
-        believed = near & agrees
-        if np.count_nonzero(believed) == len(codes):
+        self._notice_being_lost(near, table[1:, :5])
+        believed = [is_near and does for is_near, does in zip(near, agrees, strict=True)]
+        if False not in believed:
             return None
-        self._reject("prior", ~near)
-        self._reject("increment", near & ~agrees)
-        return [bool(good) for good in believed]
+        self._reject("prior", near.count(False))
+        self._reject("increment", near.count(True) - believed.count(True))
+        return believed
 
-    def _reject(self, reason: str, which: NDArray[np.bool_]) -> None:
+    def _reject(self, reason: str, count: int) -> None:
         """Count what is not used."""
-        if count := int(np.count_nonzero(which)):
+        if count:
             self.rejected[reason] += count
 
-    def _notice_being_lost(self, near: NDArray[np.bool_], priors: Array) -> None:
+    def _notice_being_lost(self, near: list[bool], priors: Array) -> None:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long."""
-        contradicted = len(near) >= LOST_NEIGHBOURS and 2 * np.count_nonzero(~near) > len(near)
+        contradicted = len(near) >= LOST_NEIGHBOURS and 2 * near.count(False) > len(near)
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted >= LOST_PERIODS:
             self._contradicted = 0
@@ -247,109 +251,94 @@ class InformationEstimator:
             self._prior, self._increment = as_sent(self.own.prior), _NOTHING
 
     def _moderated(
-        self, codes: list[int], priors: Array, means_m: Array, variances_m2: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the priors (1 + n, 5) of the vehicle and of `codes`, and their means, none far from their median.
+        self, frames: Sequence[InformationFrame], own: Five, priors: Array, means_m: Array
+    ) -> tuple[Array, Array, list[bool] | None]:
+        """Return the priors (1 + n, 5) of the vehicle and of `frames`, and their means, none far from their median.
 
-        `variances_m2` (1 + n, 3) are those of the means (1 + n, 2). No vehicle is dropped: where a few hear what
-        the others cannot know, they are always off, and right. The last value (1 + n,) tells which always are.
+        No vehicle is dropped: where a few hear what the others cannot know, they are always off, and right. The
+        last value (n,) tells which always are, None if nobody is.
         """
-        leaning = np.zeros(len(means_m), dtype=np.bool_)
-        if not self._options.defence or not codes:
+        if not self._options.defence or not frames:
             self.limit_m = np.inf
-            return priors, means_m, leaning
-        median_m, self.limit_m = spread_limit_m(means_m)
+            return priors, means_m, None
+        moments = [frame.moments for frame in frames]
+        middle_m, self.limit_m = spread_limit_m([own, *moments])
         if self.limit_m == np.inf:
-            median_m = means_m[0]
-        off_m = means_m[1:] - median_m
-        now_s = self._now_ns / NS_PER_S
-        less_m, leaning[1:] = self._origins.without_lean(codes, off_m, variances_m2[1:] + variances_m2[0], now_s)
-        less_m = cut_to(less_m, self.limit_m)
-        if less_m is off_m:
-            return priors, means_m, leaning
+            middle_m = own[:2]
+        codes = [frame.code for frame in frames]
+        off_m, leaning = self._origins.without_lean(codes, moments, own, middle_m, self._now_ns / NS_PER_S)
+        less_m = cut_to(off_m, self.limit_m)
+        if less_m is off_m and leaning is None:
+            return priors, means_m, None
         moved_m = np.zeros_like(means_m)
-        moved_m[1:] = less_m - off_m
+        moved_m[1:] = np.array(less_m) + middle_m - means_m[1:]
         priors = priors.copy()
         priors[:, 3] += priors[:, 0] * moved_m[:, 0] + priors[:, 1] * moved_m[:, 1]
         priors[:, 4] += priors[:, 1] * moved_m[:, 0] + priors[:, 2] * moved_m[:, 1]
         return priors, means_m + moved_m, leaning
 
-    def _limited(self, priors: Array, increments: Array) -> tuple[Array, Array]:
+    def _limited(self, frames: Sequence[InformationFrame], priors: Array, increments: Array) -> tuple[Array, Array]:
         """Return priors and increments (1 + n, 5) of all rows, none much more certain than one's own."""
         if not self._options.defence:
             return priors, increments
-        traces = (increments[:, 0] + increments[:, 2]).tolist()
-        usual = INCREMENT_FACTOR * max(traces[0], sorted(traces)[len(traces) // 2])
+        own, largest = _trace(self._increment), PRIOR_FACTOR * _trace(self._prior)
+        traces = sorted([own, *[frame.increment[0] + frame.increment[2] for frame in frames]])
+        usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
-        largest = PRIOR_FACTOR * (self._prior[0] + self._prior[2])
-        return scaled_down(priors, largest), scaled_down(increments, self._largest_increment)
+        if traces[-1] > self._largest_increment:
+            increments = scaled_down(increments, self._largest_increment)
+        if max([frame.prior[0] + frame.prior[2] for frame in frames], default=0.0) > largest:
+            priors = scaled_down(priors, largest)
+        return priors, increments
 
     def _weigh(
         self,
         frames: Mapping[str, InformationFrame],
         means_m: Array,
-        covariances_m2: Array,
-        leaning: NDArray[np.bool_],
-    ) -> Array:
-        """Return the weights (1 + n,) of the priors, with means (1 + n, 2) and covariances (1 + n, 2, 2).
+        variances_m2: Array,
+        leaning: list[bool] | None,
+    ) -> list[float]:
+        """Return the weights (1 + n,) of the priors.
 
-        The weight of who is always to one side, `leaning` (1 + n,), goes to the vehicle itself.
+        They have means (1 + n, 2) and covariances with traces (1 + n,). The weight of who is always to one side,
+        `leaning` (n,), goes to the vehicle itself.
         """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
-        weights = self._rule.weights(means_m, covariances_m2, self.mean_m, degrees)
+        weights: list[float] = self._rule.weights(means_m, variances_m2, self.mean_m, degrees).tolist()
         if self._options.defence:
-            weights = (1 - SELF_SHARE) * weights
-            weights[leaning] = 0.0
-            weights[0] += 1 - np.add.reduce(weights)
+            leaning = leaning or [False] * len(frames)
+            each = zip(weights[1:], leaning, strict=True)
+            others = [0.0 if leans else (1 - SELF_SHARE) * weight for weight, leans in each]
+            weights = [1 - sum(others), *others]
         ids = [self._node_id, *(self._admission.ids[name] for name in frames)]
-        self.weights = dict(zip(ids, weights.tolist(), strict=True))
+        self.weights = dict(zip(ids, weights, strict=True))
         return weights
 
     # What is passed on.
 
-    def _passed_on(self, frames: Mapping[str, InformationFrame], weights: Array) -> Array:
+    def _passed_on(self, frames: Sequence[InformationFrame], weights: Sequence[float]) -> Array:
         """Return the increments (m, 5) of the last period from out of range, less what the pooled priors hold."""
-        said = [self._used, *[frame.passed_records for frame in frames.values()]]
-        counts = [len(records) // PASSED.itemsize for records in said]
-        joined = b"".join(said)
-        records = np.frombuffer(joined, dtype=PASSED)
-        if len(records) == counts[0]:
+        listed = [frame.passed_records for frame in frames]
+        shares, forged = self._passing.shares(listed, weights, self._options.defence)
+        if forged:
+            self.rejected["forged"] += forged
+        new = [record for record, share in shares.items() if share < 1]
+        if not new:
             return np.zeros((0, 5))
-        index = self._passing.index(records["name"])
-        origins = self._passing.codes
-        # The first row of each origin, 0 where it has none; the vehicle's own rows are the first of all.
-        first = np.zeros(len(origins), dtype=np.intp)
-        first[index[::-1]] = np.arange(len(records) - 1, -1, -1)
-        weight = np.repeat(weights, counts)
-        new = first >= counts[0]
-        if self._options.defence and (differs := _differing(joined, first.take(index))) is not None:
-            forged = self._forged(differs, np.repeat(np.arange(len(counts)), counts), first[index] < counts[0])
-            weight[forged] = 0.0
-            new &= ~forged[first]
-        share = np.bincount(index, weights=weight, minlength=len(origins))
-        rows = np.flatnonzero(new & (share < 1))
-        if not len(rows):
-            return np.zeros((0, 5))
-        numbers = records["information"][first.take(rows)].astype(np.float64)
-        increments = numbers * (PASSED_SHARE * (1 - share.take(rows)))[:, None]
+        origins, increments = codes_and_increments(new)
+        added = np.array([PASSED_SHARE * (1 - share) for share in shares.values() if share < 1])
+        increments *= added[:, None]
         if not self._options.defence:
-            return np.asarray(increments)
-        origin = origins.take(rows).tolist()
-        agrees = self._origins.agree(origin, increments, self.own.belief, self._now_ns / NS_PER_S)
-        if np.count_nonzero(agrees) < len(rows):
-            self._reject("passed", ~agrees)
+            return increments
+        mean_m, covariance_m2 = self.own.belief
+        (p, q), (_, r) = covariance_m2.tolist()
+        belief = mean_m.tolist(), (p, q, r)
+        agrees = self._origins.agree(origins, increments, belief, self._now_ns / NS_PER_S)
+        if False in agrees:
+            self._reject("passed", agrees.count(False))
             increments = increments[agrees]
         return scaled_down(increments, self._largest_increment)
-
-    def _forged(
-        self, differs: NDArray[np.bool_], sender: NDArray[np.intp], known: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Tell which rows (m,) are of senders that forge: most of what they pass on that is `known` differs."""
-        false = np.bincount(sender[differs & known], minlength=sender[-1] + 1)
-        forged = np.asarray(false > MAX_FORGED_SHARE * np.bincount(sender[known], minlength=sender[-1] + 1))
-        self._reject("forged", forged)
-        return np.asarray(forged[sender])
 
     # What goes out.
 
@@ -365,7 +354,6 @@ class InformationEstimator:
         share = self._share
         heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
         limit = min(self._options.relay_increments, room(len(heard), max_payload))
-        used = np.frombuffer(self._used, dtype=PASSED)
         return InformationFrame(
             name=self.name,
             fix_time_ns=fix.time_ns,
@@ -374,41 +362,6 @@ class InformationEstimator:
             epoch=share.epoch,
             running_sum=share.running_sum,
             heard=heard,
-            passed=used[_in_turns(len(used), limit, fix.time_ns // self._period_ns)],
+            passed=self._passing.to_send(limit, fix.time_ns // self._period_ns),
             largest_degree=min(self._rule.largest_degree, MAX_DEGREE),
         )
-
-
-class Passing:
-    """The origins of increments that are passed on.
-
-    codes: (n,), sorted; they are kept from period to period, because to find a code is less work than to sort.
-    """
-
-    def __init__(self) -> None:
-        self.codes = np.empty(0, dtype=np.uint32)
-
-    def index(self, codes: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """Return the index (m,) of each of `codes` (m,) in `self.codes`; new ones are added."""
-        if len(self.codes):
-            index = np.minimum(self.codes.searchsorted(codes), len(self.codes) - 1)
-            if np.count_nonzero(self.codes.take(index) == codes) == len(codes):
-                return np.asarray(index)
-        kept = self.codes[: MAX_ORIGINS if len(self.codes) < MAX_ORIGINS else 0]
-        self.codes = np.unique(np.concatenate([kept, codes]))
-        return self.codes.searchsorted(codes)
-
-
-def _differing(records: bytes, first: NDArray[np.intp]) -> NDArray[np.bool_] | None:
-    """Tell which rows (m,) of `records` are not equal to their `first` (m,), None if there are none."""
-    entries = np.frombuffer(records, dtype=np.uint16).reshape(len(first), -1)
-    differs = entries != entries.take(first, axis=0)
-    return differs.any(axis=1) if np.count_nonzero(differs) else None
-
-
-def _in_turns(count: int, limit: int, period: int) -> NDArray[np.intp] | slice:
-    """Return the rows of at most `limit` of `count` records, the first and of the others in turns."""
-    if limit >= count:
-        return slice(None)
-    turned = 1 + (np.arange(limit - 1) + period * limit) % (count - 1)
-    return np.append(0, turned)[:limit]

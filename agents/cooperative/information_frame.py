@@ -11,15 +11,18 @@ from __future__ import annotations
 import math
 import struct
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from itertools import chain
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
 from vnet.cmm.consensus import Share
-from vnet.cmm.plausibility import prior_moments
+from vnet.cmm.information import Five, plain_moments
 from vnet.types import Array
 
 VERSION = 4
@@ -40,6 +43,7 @@ _FINGERPRINT = struct.Struct("<5f")
 PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
 """An increment that is passed on: its origin, and (δΛ_xx, δΛ_xy, δΛ_yy, δη_x, δη_y) with half precision."""
 _RECORD = struct.Struct("<I5e")
+_AS_BYTES = struct.Struct(f"{_RECORD.size}s")
 _NUMBERS = struct.Struct("<15d")
 
 
@@ -59,11 +63,11 @@ class InformationFrame:
 
     name: str
     fix_time_ns: int
-    prior: tuple[float, ...]
-    increment: tuple[float, ...]
+    prior: Five
+    increment: Five
     epoch: int
     running_sum: tuple[float, float, float]
-    heard: dict[str, bool]
+    heard: Mapping[str, bool]
     passed: NDArray[np.void] = field(default_factory=_nothing_passed)
     largest_degree: int = 0
 
@@ -90,9 +94,14 @@ class InformationFrame:
         return int(self.name, 16)
 
     @cached_property
+    def moments(self) -> Five:
+        """The prior's mean (x, y) in m and its covariance (xx, xy, yy) in m²."""
+        return plain_moments(*self.prior)
+
+    @cached_property
     def numbers(self) -> bytes:
         """The prior, the increment, and the prior's mean and covariance as in `packed_numbers`."""
-        return packed_numbers(self.prior, self.increment)
+        return packed_numbers(self.prior, self.increment, self.moments)
 
     @cached_property
     def record(self) -> bytes:
@@ -100,11 +109,11 @@ class InformationFrame:
         return passed_record(self.code, self.increment)
 
     @cached_property
-    def passed_records(self) -> bytes:
-        """The records that are passed on, as they are sent."""
-        return self.passed.tobytes()
+    def passed_records(self) -> frozenset[bytes]:
+        """The records that are passed on, as bytes."""
+        return frozenset(chain.from_iterable(_AS_BYTES.iter_unpack(self.passed.tobytes())))
 
-    @cached_property
+    @property
     def passed_numbers(self) -> Array:
         """The increments (n, 5) that are passed on, as numbers."""
         return self.passed["information"].astype(np.float64)
@@ -118,13 +127,12 @@ class InformationFrame:
         return _FINGERPRINT.pack(*self.increment) if any(self.increment) else self.name.encode()
 
 
-def packed_numbers(prior: tuple[float, ...], increment: tuple[float, ...]) -> bytes:
-    """Return prior, increment, and the prior's mean (2,) and covariance (xx, xy, yy): fifteen doubles as bytes."""
-    a, b, d, x, y = prior
-    return _NUMBERS.pack(*prior, *increment, *prior_moments(a, b, d, x, y))
+def packed_numbers(prior: Five, increment: Five, moments: Five) -> bytes:
+    """Return prior, increment, and the prior's mean and covariance (xx, xy, yy): fifteen doubles as bytes."""
+    return _NUMBERS.pack(*prior, *increment, *moments)
 
 
-def passed_record(code: int, increment: tuple[float, ...]) -> bytes:
+def passed_record(code: int, increment: Five) -> bytes:
     """Return the record of `PASSED` of an increment; its numbers are at most `INCREMENT_LIMIT`."""
     return _RECORD.pack(code, *increment)
 
@@ -143,21 +151,20 @@ def encode(frame: InformationFrame) -> bytes:
         frame.epoch,
         *frame.running_sum,
     )
-    names = bytes.fromhex("".join(frame.heard))
-    flags = _pack_flags(list(frame.heard.values()))
-    body = header + names + flags + frame.passed.tobytes()
+    body = header + _packed_names(tuple(frame.heard), tuple(frame.heard.values())) + frame.passed.tobytes()
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
-def _pack_flags(flags: list[bool]) -> bytes:
-    """Return flags as bits, the first the highest of the first byte."""
+@lru_cache(maxsize=1024)  # a vehicle hears the same others for many periods
+def _packed_names(names: tuple[str, ...], flags: tuple[bool, ...]) -> bytes:
+    """Return names, and flags as bits, the first the highest of the first byte."""
     size = (len(flags) + 7) // 8
     bits = int("0" + "".join("1" if flag else "0" for flag in flags), 2)
-    return (bits << (8 * size - len(flags))).to_bytes(size, "big")
+    return bytes.fromhex("".join(names)) + (bits << (8 * size - len(flags))).to_bytes(size, "big")
 
 
 def _unpack_flags(packed: bytes, count: int) -> list[bool]:
-    """Return the first `count` flags of `_pack_flags`."""
+    """Return the first `count` flags of `_packed_names`."""
     bits = f"{int.from_bytes(packed, 'big'):0{8 * len(packed)}b}" if count else ""
     return [bit == "1" for bit in bits[:count]]
 
@@ -166,6 +173,16 @@ def room(heard: int, max_payload: int) -> int:
     """Return the number of increments that fit beside `heard` names in `max_payload` bytes."""
     left = max_payload - _HEADER.size - _CHECKSUM.size - heard * NAME_BYTES - (heard + 7) // 8
     return min(PASSED_LIMIT, max(0, left // PASSED.itemsize))
+
+
+@lru_cache(maxsize=4096)  # a vehicle hears the same others for many periods
+def _heard(names_and_flags: bytes, count: int) -> tuple[Mapping[str, bool], frozenset[str], frozenset[str]]:
+    """Return whether each name heard is an out-neighbour, the out-neighbours, and the names."""
+    names, width = names_and_flags[: count * NAME_BYTES].hex(), 2 * NAME_BYTES
+    each = [names[i : i + width] for i in range(0, len(names), width)]
+    flags = _unpack_flags(names_and_flags[count * NAME_BYTES :], count)
+    heard = dict(zip(each, flags, strict=True))
+    return MappingProxyType(heard), frozenset(name for name in heard if heard[name]), frozenset(heard)
 
 
 @lru_cache(maxsize=4096)  # where many vehicles share a process, a frame is decoded once and not by each receiver
@@ -186,30 +203,35 @@ def decode(payload: bytes) -> InformationFrame:
         raise FrameError("length")
     if (zlib.crc32(payload[:end]),) != _CHECKSUM.unpack_from(payload, end):
         raise FrameError("checksum")
-    prior, increment, epoch, running_sum = numbers[:5], numbers[5:10], numbers[10], numbers[11:]
+    a, b, d, x, y, *increment, epoch, s_x, s_y, weight = numbers
+    prior, running_sum = (a, b, d, x, y), (s_x, s_y, weight)
     _check(prior, increment, running_sum)
-    names, width = payload[_HEADER.size : names_end].hex(), 2 * NAME_BYTES
-    each = [names[i : i + width] for i in range(0, len(names), width)]
+    heard, out_neighbours, names_heard = _heard(payload[_HEADER.size : flags_end], heard_count)
+    passed = np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end)
+    if passed_count:
+        _check_passed(passed["information"].astype(np.float64))
+    a, b, d, x, y = increment
     frame = InformationFrame(
         name=name_of_code(name),
         fix_time_ns=fix_time_ns,
-        prior=tuple(prior),
-        increment=tuple(increment),
+        prior=prior,
+        increment=(a, b, d, x, y),
         epoch=epoch,
-        running_sum=(running_sum[0], running_sum[1], running_sum[2]),
-        heard=dict(zip(each, _unpack_flags(payload[names_end:flags_end], heard_count), strict=True)),
-        passed=np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end),
+        running_sum=running_sum,
+        heard=heard,
+        passed=passed,
         largest_degree=degree,
     )
-    if passed_count:
-        _check_passed(frame.passed_numbers)
+    # The names are those of the period before, as a rule; to compute a property when it is first read takes longer.
+    share = Share(epoch, running_sum, out_neighbours, names_heard)
+    frame.__dict__.update(code=name, share=share, out_neighbours=out_neighbours, names_heard=names_heard)
     return frame
 
 
-def _check(prior: list[float], increment: list[float], running_sum: list[float]) -> None:
-    if not all(map(math.isfinite, (*prior, *increment, *running_sum))):
-        raise FrameError("not_finite")
+def _check(prior: Five, increment: list[float], running_sum: tuple[float, float, float]) -> None:
     s_x, s_y, weight = running_sum
+    if not math.isfinite(sum(prior) + sum(increment) + s_x + s_y + weight):
+        raise FrameError("not_finite")
     if not 0 <= weight < MAX_WEIGHT or max(abs(s_x), abs(s_y)) > COMMON_LIMIT_M * weight:
         raise FrameError("absurd")
     a, b, d, x, y = prior

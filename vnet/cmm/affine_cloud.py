@@ -83,10 +83,11 @@ class AffineCloud:
         """The points (n, K)."""
         return np.asarray(self._linear[:, :-2] @ self._basis[:-1] + self._linear[:, -2:-1])
 
-    def move(self, matrix: Array, by: Array) -> None:
+    def move(self, matrix: Array, by: Array | None = None) -> None:
         """Map each point x to `matrix` x + `by`, (n, n) and (n,)."""
         self._linear = matrix.dot(self._linear)
-        self._linear[:, -2:] += by[:, None]
+        if by is not None:
+            self._linear[:, -2:] += by[:, None]
         self.covariance = matrix.dot(self.covariance).dot(matrix.T)
 
     def diffuse(self, sigma: float, rng: np.random.Generator) -> None:

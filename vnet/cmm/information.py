@@ -9,34 +9,103 @@ weights must be 1, so that losses and one-way links do no harm.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from vnet.types import Array
 
+Three = tuple[float, float, float]
+Five = tuple[float, float, float, float, float]
 
-@dataclass(frozen=True)
+
 class Information:
-    """A Gaussian belief about c, or what is added to it: `matrix` Λ (2, 2) in 1/m², `vector` η (2,) in 1/m."""
+    """A Gaussian belief about c, or what is added to it: Λ in 1/m² and η in 1/m.
 
-    matrix: Array
-    vector: Array
+    numbers: Λ_xx, Λ_xy, Λ_yy, η_x and η_y. So few are worked with as plain numbers: as arrays they take longer.
+    """
+
+    __slots__ = ("numbers",)
+
+    def __init__(self, numbers: Five) -> None:
+        self.numbers = numbers
+
+    @classmethod
+    def from_arrays(cls, matrix: Array, vector: Array) -> Information:
+        """Return what Λ (2, 2) and η (2,) say."""
+        (a, b), (_, d) = matrix.tolist()
+        x, y = vector.tolist()
+        return cls((a, b, d, x, y))
 
     @classmethod
     def of(cls, mean_m: Array, covariance_m2: Array) -> Information:
         """Return the belief with mean (2,) and covariance (2, 2)."""
-        matrix = inverse(covariance_m2)
-        return cls(matrix, matrix.dot(mean_m))
+        (p, q), (_, r) = covariance_m2.tolist()
+        a, b, d = inverted(p, q, r)
+        x, y = mean_m.tolist()
+        return cls((a, b, d, a * x + b * y, b * x + d * y))
+
+    @property
+    def matrix(self) -> Array:
+        """Λ (2, 2) in 1/m²."""
+        a, b, d, _, _ = self.numbers
+        return np.array([[a, b], [b, d]])
+
+    @property
+    def vector(self) -> Array:
+        """η (2,) in 1/m."""
+        return np.array(self.numbers[3:])
 
     def moments(self) -> tuple[Array, Array]:
         """Return mean (2,) in m and covariance (2, 2) in m²; the matrix must be positive definite."""
-        covariance_m2 = inverse(self.matrix)
-        return covariance_m2.dot(self.vector), covariance_m2
+        x, y, p, q, r = plain_moments(*self.numbers)
+        return np.array([x, y]), np.array([[p, q], [q, r]])
 
     def plus(self, other: Information) -> Information:
         """Return this belief with another piece of information added."""
-        return Information(self.matrix + other.matrix, self.vector + other.vector)
+        a, b, d, x, y = self.numbers
+        more_a, more_b, more_d, more_x, more_y = other.numbers
+        return Information((a + more_a, b + more_b, d + more_d, x + more_x, y + more_y))
+
+
+NOTHING = Information((0.0, 0.0, 0.0, 0.0, 0.0))
+"""What says nothing."""
+
+
+# Symmetric matrices (xx, xy, yy) in plain numbers.
+
+
+def inverted(a: float, b: float, d: float) -> Three:
+    """Return the inverse of a symmetric matrix."""
+    determinant = a * d - b * b
+    return d / determinant, -b / determinant, a / determinant
+
+
+def rooted(a: float, b: float, d: float) -> Three:
+    """Return the symmetric square root of a positive definite matrix M: (M + √det M · I) / √(tr M + 2 √det M)."""
+    root = math.sqrt(max(a * d - b * b, 0.0))
+    scale = math.sqrt(a + d + 2 * root)
+    return (a + root) / scale, b / scale, (d + root) / scale
+
+
+def between(a: float, b: float, d: float, p: float, q: float, r: float) -> Three:
+    """Return A P A for symmetric matrices A = (a, b, d) and P = (p, q, r)."""
+    x, y, z, w = a * p + b * q, a * q + b * r, b * p + d * q, b * q + d * r  # A P
+    return x * a + y * b, x * b + y * d, z * b + w * d
+
+
+def transported(p: float, q: float, r: float, new_p: float, new_q: float, new_r: float) -> Three:
+    """Return `transport` of two covariances."""
+    root = rooted(p, q, r)
+    return between(*inverted(*root), *rooted(*between(*root, new_p, new_q, new_r)))
+
+
+def plain_moments(a: float, b: float, d: float, x: float, y: float) -> Five:
+    """Return the mean (x, y) in m and the covariance (xx, xy, yy) in m² of a belief."""
+    variance_x, covariance, variance_y = inverted(a, b, d)
+    return variance_x * x + covariance * y, covariance * x + variance_y * y, variance_x, covariance, variance_y
+
+
+# The same as arrays.
 
 
 def inverse(matrix: Array) -> Array:
@@ -72,7 +141,7 @@ def gained(before: Information, after: Information) -> Information:
     matrix, vector = after.matrix - before.matrix, after.vector - before.vector
     value, direction = np.linalg.eigh(matrix)
     if value[0] >= 0:
-        return Information(matrix, vector)
+        return Information.from_arrays(matrix, vector)
     kept = direction[:, value > 0]
     onto = kept @ kept.T
-    return Information(onto @ matrix @ onto, onto @ vector)
+    return Information.from_arrays(onto @ matrix @ onto, onto @ vector)

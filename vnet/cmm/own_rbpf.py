@@ -10,13 +10,23 @@ the fix says about c alone (`increment`); from them it takes the same (`absorb`)
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vnet.cmm.affine_cloud import LEAST_VARIANCE_M2, AffineCloud
 from vnet.cmm.common_error import systematic
-from vnet.cmm.information import Information, inverse, square_root, transport
+from vnet.cmm.information import (
+    Information,
+    Three,
+    inverse,
+    inverted,
+    plain_moments,
+    rooted,
+    square_root,
+    transported,
+)
 from vnet.cmm.kalman_bound import LaneModel, lane_axes
 from vnet.cmm.sample_size import sample_size
 from vnet.types import Array
@@ -28,7 +38,6 @@ COMPETING_FACTOR = 4
 SIZE_STEP = 1.5
 """Ratio by which the number of particles that is wanted must differ before it changes: each change resamples."""
 _IDENTITY = np.eye(2)
-_NOWHERE = np.zeros(5)
 
 
 class OwnRbpf:
@@ -79,6 +88,7 @@ class OwnRbpf:
         """Go on with one lane; `cloud` (5, K) are its rows."""
         self._one = AffineCloud(cloud, log_weight)
         self._measure = np.hstack([self._axes[0], np.eye(2, 3)])
+        self._measure_t = self._measure.T.copy()
         self._take_moments(self._one)
 
     @property
@@ -116,22 +126,6 @@ class OwnRbpf:
         """Take the moments of the cloud, where one lane is left."""
         self._mean, self._covariance, self.weight = cloud.mean, cloud.covariance, cloud.weight
         self.estimate_m, self.estimate_covariance_m2 = self._mean[:2], self._covariance[:2, :2]
-        self._place: tuple[Array, Array, Array] | None = None
-
-    @property
-    def _slope(self) -> Array:
-        """The regression (3, 2) of the vehicle's own state on c, where one lane is left."""
-        return np.asarray(self._covariance[2:, :2].dot(inverse(self.estimate_covariance_m2)))
-
-    def _placed(self) -> tuple[Array, Array, Array]:
-        """Return position (2,), its slope (2, 2) on c and its covariance (2, 2) given c."""
-        if self._place is None:
-            axes, rows = self._axes[0], self._covariance[2:4]
-            slope = self._slope[:2]
-            given = self._own_covariance[0, :2, :2] + rows[:, 2:4] - slope @ rows[:, :2].T
-            place_m = self._point_m[0] + self._mean[2:4] @ axes
-            self._place = place_m, axes.T @ slope, axes.T @ given @ axes
-        return self._place
 
     def _collapse(self) -> None:
         weight = np.exp(self._lane_log) * self.weight
@@ -163,7 +157,11 @@ class OwnRbpf:
 
     def position_m(self) -> tuple[Array, Array]:
         """Return the position (2,) of the vehicle and its covariance (2, 2)."""
-        place_m, slope, given_m2 = self._placed()
+        if self._one is not None:
+            axes, axes_t = self._axes[0], self._measure_t[:2]
+            covariance_m2 = self._own_covariance[0, :2, :2] + self._covariance[2:4, 2:4]
+            return self._point_m[0] + axes_t.dot(self._mean[2:4]), axes_t.dot(covariance_m2).dot(axes)
+        place_m, slope, given_m2 = self._place
         return place_m, given_m2 + slope @ self.estimate_covariance_m2 @ slope.T
 
     def sample(self, count: int) -> Array:
@@ -185,12 +183,15 @@ class OwnRbpf:
             self._all_moves[:2, :2] *= keep
             self._all_moves[2:, 2:] = self._moves
             self._common_sigma_m = math.sqrt(variance_m2)
-        self._own_covariance = self._moves @ self._own_covariance @ self._moves.T + self._noise
         if self._one is not None:
-            self._one.move(self._all_moves, _NOWHERE)
+            own_covariance = self._moves.dot(self._own_covariance[0]).dot(self._moves.T)
+            own_covariance += self._noise
+            self._own_covariance = own_covariance[None]
+            self._one.move(self._all_moves)
             self._one.diffuse(self._common_sigma_m, self._rng)
             self._take_moments(self._one)
             return
+        self._own_covariance = self._moves @ self._own_covariance @ self._moves.T + self._noise
         noise_m = self._common_sigma_m * self._rng.standard_normal((2, len(self.weight)))
         own = (self._moves @ self._own).reshape(-1, len(self.weight))
         self._cloud = np.concatenate([self._all_moves[0, 0] * self._cloud[:2] + noise_m, own])
@@ -202,21 +203,26 @@ class OwnRbpf:
         The second is what the fix says about c beyond the prior: the increment.
         """
         if self._one is None:
-            place_m, slope, given_m2 = self._placed()
+            place_m, slope, given_m2 = self._place
             off = fix_m - self.estimate_m - place_m
             return _innovation(off, slope + _IDENTITY, given_m2 + noise_m2, self._moments)
-        measure, covariance = self._measure, self._covariance
+        # The fix is z = H x + n, with x ~ N(mean, P) all that is known and n given the particle.
+        seen = self._measure.dot(self._covariance)
         value, fix_noise_m2 = self._measured(fix_m, noise_m2)
-        with_all = measure.dot(covariance)
-        with_common = with_all[:, :2]
-        slope = with_common.dot(inverse(self.estimate_covariance_m2))
-        given_m2 = with_all.dot(measure.T) + fix_noise_m2 - slope.dot(with_common.T)
-        return _innovation(value - measure.dot(self._mean), slope, given_m2, self._moments)
+        off = (value - self._measure.dot(self._mean)).tolist()
+        total = (seen.dot(self._measure_t) + fix_noise_m2).tolist()
+        return _expected(off, seen[:, :2].tolist(), total, *self._common)
 
     @property
     def _moments(self) -> tuple[Array, Array]:
         """Mean (2,) and covariance (2, 2) of c."""
         return self.estimate_m, self.estimate_covariance_m2
+
+    @property
+    def _common(self) -> tuple[list[float], Three]:
+        """Mean and covariance (xx, xy, yy) of c."""
+        (p, q), (_, r) = self.estimate_covariance_m2.tolist()
+        return self.estimate_m.tolist(), (p, q, r)
 
     def _measured(self, fix_m: Array, noise_m2: Array) -> tuple[Array, Array]:
         """Return a fix (2,) along the axes of the only lane, and its covariance (2, 2) given a particle."""
@@ -235,14 +241,17 @@ class OwnRbpf:
             self._log_weight = self._log_weight + vector @ c - 0.5 * ((matrix @ c) * c).sum(axis=0)
             self._settle()
             return
-        mean_m, covariance_m2 = pooled.moments()
-        # What is known of c moves, and the own state along its regression on c: an affine map of the whole cloud.
-        affine, slope = np.eye(5), self._slope
-        affine[:2, :2] = transport(self.estimate_covariance_m2, covariance_m2)
-        affine[2:, :2] = slope.dot(affine[:2, :2] - _IDENTITY)
-        by = -affine.dot(self._mean)
-        by[:2] += mean_m
-        by[2:] += self._mean[2:] + slope.dot(mean_m - self.estimate_m)
+        # What is known of c moves to the new mean by T, and the own state along its regression K on c: an affine
+        # map of the whole cloud, [T 0; K (T − I) I], and by the rest of the way.
+        new_x, new_y, *new_covariance_m2 = plain_moments(*pooled.numbers)
+        (x, y), covariance_m2 = self._common
+        a, b, d = transported(*covariance_m2, *new_covariance_m2)
+        slope = self._covariance[2:, :2].dot(inverse(self.estimate_covariance_m2))
+        affine, by = np.eye(5), np.empty(5)
+        affine[:2, :2] = (a, b), (b, d)
+        affine[2:, :2] = slope.dot(((a - 1, b), (b, d - 1)))
+        by[:2] = new_x - (a * x + b * y), new_y - (b * x + d * y)
+        by[2:] = slope.dot(by[:2])
         self._one.move(affine, by)
         self._take_moments(self._one)
 
@@ -267,11 +276,13 @@ class OwnRbpf:
     def _update_one(self, cloud: AffineCloud, fix_m: Array, noise_m2: Array) -> None:
         """Take a fix where one lane is left."""
         value, noise_m2 = self._measured(fix_m, noise_m2)
-        innovation, covariance = inverse(noise_m2), self._own_covariance[0]
+        covariance, ((p, q), (_, r)) = self._own_covariance[0], noise_m2.tolist()
+        a, b, d = inverted(p, q, r)
+        root_a, root_b, root_d = rooted(a, b, d)
         gain = np.zeros((5, 2))
-        gain[2:] = covariance[:, :2].dot(innovation)
+        gain[2:] = covariance[:, :2].dot(np.array([[a, b], [b, d]]))
         self._own_covariance = (covariance - gain[2:].dot(covariance[:2]))[None]
-        cloud.weigh(self._measure, value, square_root(innovation), gain)
+        cloud.weigh(self._measure, value, np.array([[root_a, root_b], [root_b, root_d]]), gain)
         cloud.settle(self._wanted, self._rng)
         self._take_moments(cloud)
 
@@ -315,6 +326,34 @@ class OwnRbpf:
         self.weight = np.full(len(index), 1 / len(index))
 
 
+def _expected(
+    off: Sequence[float],
+    seen: Sequence[Sequence[float]],
+    total: Sequence[Sequence[float]],
+    mean_m: Sequence[float],
+    covariance_m2: Three,
+) -> tuple[float, Information]:
+    """Return the squared Mahalanobis distance of a fix, and what it says about c ~ N(`mean_m`, `covariance_m2`).
+
+    The fix is `off` (2,) from what is expected, with covariance `total` (2, 2) and `seen` (2, 2) that with c.
+    """
+    (off_x, off_y), (x, y) = off, mean_m
+    (s_xx, s_xy), (_, s_yy) = total
+    a, b, d = inverted(s_xx, s_xy, s_yy)
+    distance = a * off_x * off_x + 2 * b * off_x * off_y + d * off_y * off_y
+    # The slope K = C P⁻¹ of the fix on c, and the information (S − K Cᵀ)⁻¹ of the fix given c.
+    (c_xx, c_xy), (c_yx, c_yy) = seen
+    a, b, d = inverted(*covariance_m2)
+    k_xx, k_xy, k_yx, k_yy = c_xx * a + c_xy * b, c_xx * b + c_xy * d, c_yx * a + c_yy * b, c_yx * b + c_yy * d
+    given_xx, given_yy = s_xx - k_xx * c_xx - k_xy * c_xy, s_yy - k_yx * c_yx - k_yy * c_yy
+    a, b, d = inverted(given_xx, s_xy - k_xx * c_yx - k_xy * c_yy, given_yy)
+    # W = Kᵀ (S − K Cᵀ)⁻¹, Λ = W K, η = W off + Λ x.
+    w_xx, w_xy, w_yx, w_yy = k_xx * a + k_yx * b, k_xx * b + k_yx * d, k_xy * a + k_yy * b, k_xy * b + k_yy * d
+    a, b, d = w_xx * k_xx + w_xy * k_yx, w_xx * k_xy + w_xy * k_yy, w_yx * k_xy + w_yy * k_yy
+    eta_x, eta_y = w_xx * off_x + w_xy * off_y, w_yx * off_x + w_yy * off_y
+    return distance, Information((a, b, d, eta_x + a * x + b * y, eta_y + b * x + d * y))
+
+
 def _innovation(
     off: Array, slope: Array, given_m2: Array, belief: tuple[Array, Array]
 ) -> tuple[float, Information]:
@@ -327,4 +366,4 @@ def _innovation(
     distance = inverse(given_m2 + slope.dot(covariance_m2).dot(slope.T)).dot(off).dot(off)
     whitened = slope.T.dot(inverse(given_m2))
     matrix = whitened.dot(slope)
-    return float(distance), Information(matrix, whitened.dot(off) + matrix.dot(mean_m))
+    return float(distance), Information.from_arrays(matrix, whitened.dot(off) + matrix.dot(mean_m))

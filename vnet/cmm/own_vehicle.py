@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.information import Information
+from vnet.cmm.information import NOTHING, Information
 from vnet.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel
 from vnet.cmm.map_matching import candidate_lanes
 from vnet.cmm.own_rbpf import OwnRbpf
@@ -83,12 +83,12 @@ class OwnVehicle:
     @property
     def estimate_m(self) -> Array:
         """Estimate (2,) of the common error."""
-        return np.asarray(self._filter.estimate_m)
+        return self._filter.estimate_m
 
     @property
     def estimate_covariance_m2(self) -> Array:
         """Covariance (2, 2) of the common error."""
-        return np.asarray(self._filter.estimate_covariance_m2)
+        return self._filter.estimate_covariance_m2
 
     @property
     def belief(self) -> tuple[Array, Array]:
@@ -107,9 +107,8 @@ class OwnVehicle:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
         self._filter.predict(dt_s)
         self.prior = self._filter.belief
-        nothing = Information(np.zeros((2, 2)), np.zeros(2))
         if fix is None:
-            return nothing
+            return NOTHING
         was_placed = self._is_placed
         if not was_placed:
             self._place(fix)
@@ -118,7 +117,7 @@ class OwnVehicle:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
-                return nothing
+                return NOTHING
             self._place(fix)
             _, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
         self._outliers_s = 0.0

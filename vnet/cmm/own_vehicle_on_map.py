@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vnet.cmm.information import Information, gained
+from vnet.cmm.information import NOTHING, Information, gained
 from vnet.cmm.kalman_bound import common_step
 from vnet.cmm.map_evidence import MAX_GATE_M, MIN_GATE_M, STAND_M
 from vnet.cmm.map_matching import MAX_LANES
@@ -20,7 +20,6 @@ from vnet.types import Array
 
 SIZE = OFFSET + 1
 """Coordinates of a hypothesis."""
-NOTHING = Information(np.zeros((2, 2)), np.zeros(2))
 LOST_S = 2.0
 """Time (s) of nothing but outliers after which the vehicle is somewhere else."""
 SAME_LANE_M = 0.5
@@ -183,8 +182,8 @@ class OwnVehicleOnMap:
         Where lanes compete less may be known than before. That cannot be said, and is owed.
         """
         prior, owed, after = self.prior, self.owed, Information.of(*self.belief)
-        said = gained(Information(prior.matrix - owed.matrix, prior.vector - owed.vector), after)
-        self.owed = Information(
+        said = gained(Information.from_arrays(prior.matrix - owed.matrix, prior.vector - owed.vector), after)
+        self.owed = Information.from_arrays(
             owed.matrix + after.matrix - prior.matrix - said.matrix,
             owed.vector + after.vector - prior.vector - said.vector,
         )

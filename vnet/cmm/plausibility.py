@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.information import Information
+from vnet.cmm.information import Five, Information, Three
 from vnet.types import Array
 
 INCREMENT_FACTOR = 1.5
@@ -48,6 +48,11 @@ MAX_ORIGINS = 1024
 """Number of origins whose sums are kept: names cost an attacker nothing."""
 
 
+_THREE = np.ones(3)
+
+Belief = tuple[Sequence[float], Three]
+"""Mean (x, y) in m and covariance (xx, xy, yy) in m² of what is believed about c."""
+
 _ENTRIES = np.array([0, 1, 1, 2])
 
 
@@ -65,14 +70,6 @@ def moments(information: Array) -> tuple[Array, Array]:
     return mean, matrices(entries.T)
 
 
-def prior_moments(a: float, b: float, d: float, x: float, y: float) -> tuple[float, float, float, float, float]:
-    """Return the mean (x, y) in m and the covariance (xx, xy, yy) in m² of one belief, in plain numbers."""
-    determinant = a * d - b * b
-    variance_x, covariance, variance_y = d / determinant, -b / determinant, a / determinant
-    mean_x, mean_y = variance_x * x + covariance * y, covariance * x + variance_y * y
-    return mean_x, mean_y, variance_x, covariance, variance_y
-
-
 def scaled_down(information: Array, largest_trace: float) -> Array:
     """Return information (n, 5) with traces of at most `largest_trace`; means stay."""
     trace = information[:, 0] + information[:, 2]
@@ -81,9 +78,9 @@ def scaled_down(information: Array, largest_trace: float) -> Array:
     return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
 
 
-def deviation(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
+def deviation(information: Array, belief: Belief) -> Array:
     """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for information (n, 5) about c ~ N(x, P): (n,)."""
-    return _squared(_compared(information, mean_m, covariance_m2))
+    return _squared(_compared(information, belief))
 
 
 _LAYOUT = np.array(
@@ -94,109 +91,135 @@ _LAYOUT = np.array(
         [0, 0, 4, 0, 0],
         [5, 6, 0, 1, 0],
         [0, 5, 6, 0, 1],
-        [1, 0, 0, 0, 0],
-        [0, 1, 0, 0, 0],
-        [0, 0, 1, 0, 0],
+        [7, 0, 0, 0, 0],
+        [0, 7, 0, 0, 0],
+        [0, 0, 7, 0, 0],
     ]
 )
-"""Indices into 0, 1, C (xx, yx, yy), −x: a row for each term of `_compared`, a column for each number."""
+"""Indices into 0, 1, C (xx, yx, yy), −x, 1: a row for each term of `_compared`, a column for each number."""
 
 
-def _compared(information: Array, mean_m: Array, covariance_m2: Array) -> Array:
+def _compared(information: Array, belief: Belief, weight: float = 1.0) -> Array:
     """Return the terms (9, n) of the deviation of information (n, 5) from c ~ N(x, P), which may be summed up.
 
-    With P = C Cᵀ these are Λ C by columns, r = η − Λ x, and Λ (xx, xy, yy), the covariance of r given c.
+    With P = C Cᵀ these are Λ C by columns and r = η − Λ x, times `weight`, and Λ (xx, xy, yy), which is the
+    covariance of r given c, times its square. The deviation is the same for any weight.
     """
-    (mean_x, mean_y), ((p, q), (_, r)) = mean_m.tolist(), covariance_m2.tolist()
+    (mean_x, mean_y), (p, q, r) = belief
     c_xx = math.sqrt(p)
     c_yx = q / c_xx
     c_yy = math.sqrt(max(r - c_yx * c_yx, 0.0))
-    factors = np.array([0.0, 1.0, c_xx, c_yx, c_yy, -mean_x, -mean_y]).take(_LAYOUT)
-    return np.asarray(factors.dot(information.T))
+    factors = [0.0, 1.0, c_xx, c_yx, c_yy, -mean_x, -mean_y, weight]
+    return np.asarray((weight * np.array(factors)).take(_LAYOUT).dot(information.T))
 
 
 _LEFT, _RIGHT = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5]), np.array([0, 1, 1, 2, 3, 3, 4, 5, 5])
 """Rows of the factors of the products xx, xy, yy of both columns of Λ C and of r."""
+_OF_PRODUCTS = np.array(
+    [
+        [1e-4, 0, 1 + 1e-4, 1e-4, 0, 1 + 1e-4, 0, 0, 0],
+        [0, 1, 0, 0, 1, 0, 0, 0, 0],
+        [1 + 1e-4, 0, 1e-4, 1 + 1e-4, 0, 1e-4, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 1, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, -2, 0],
+        [0, 0, 0, 0, 0, 0, 0, 0, 1],
+    ]
+)
+_OF_INFORMATION = np.array([[1e-4, 0, 1 + 1e-4], [0, 1, 0], [1 + 1e-4, 0, 1e-4]])
+"""S = Λ + Λ P Λ (yy, xy, xx) and r rᵀ (xx, −2 xy, yy) as sums of the products and of Λ. A lane says nothing along
+itself: a ten thousandth of the trace is added to S, so that rounding there is not counted."""
+_FLOOR = np.array([[1e-9], [0.0], [1e-9]])
 
 
 def _squared(compared: Array) -> Array:
-    """Return the squared deviations (…, n) of terms (9, …, n)."""
+    """Return the squared deviations rᵀ S⁻¹ r (m,) of terms (9, m)."""
     products = compared.take(_LEFT, axis=0)
     products *= compared.take(_RIGHT, axis=0)
-    total = products[:3]
-    total += products[3:6]
-    total += compared[6:9]
-    # A lane says nothing along itself: rounding there is not counted.
-    total[::2] += 1e-4 * (total[0] + total[2]) + 1e-9
-    x, xy, y = total
-    squared = products[6:]
-    squared *= total[::-1]
-    squared[0] += squared[2]
-    squared[0] -= 2 * squared[1]
-    return np.asarray(squared[0] / (x * y - xy * xy))
+    sums = _OF_PRODUCTS.dot(products)
+    adjugate, squares = sums[:3], sums[3:]
+    adjugate += _OF_INFORMATION.dot(compared[6:9])
+    adjugate += _FLOOR
+    y, xy, x = adjugate
+    squares *= adjugate
+    return np.asarray(_THREE.dot(squares) / (x * y - xy * xy))
 
 
-def priors_agree(mean_m: Array, variance_m2: Array, own_mean_m: Array, own_variance_m2: Array) -> NDArray[np.bool_]:
-    """Tell which priors with means (n, 2) and covariances (n, 3), entries (xx, xy, yy), are near one's own."""
-    total, off = (variance_m2 + own_variance_m2).T, (mean_m - own_mean_m).T
-    (a, b, d), (x, y) = total, off
-    # Deviations that are small even where the least variance is: those of nearly all.
-    squares, determinant = off * off, a * d - b * b
-    near = (squares[0] + squares[1]) * (a + d) < PRIOR_GATE * determinant
-    if np.count_nonzero(near) == len(near):
-        return np.asarray(near)
-    return np.asarray((d * x * x - 2 * b * x * y + a * y * y) < PRIOR_GATE * (a * d - b * b))
+def priors_agree(priors: Sequence[Five], own: Five) -> list[bool]:
+    """Tell which priors are near one's own: rᵀ S⁻¹ r < `PRIOR_GATE`, r being the difference of the means.
+
+    S is the sum of both covariances. Each is the mean (x, y) and the covariance (xx, xy, yy).
+    """
+    own_x, own_y, own_xx, own_xy, own_yy = own
+    agrees = []
+    for mean_x, mean_y, xx, xy, yy in priors:
+        x, y = mean_x - own_x, mean_y - own_y
+        a, b, d = xx + own_xx, xy + own_xy, yy + own_yy
+        agrees.append(d * x * x - 2 * b * x * y + a * y * y < PRIOR_GATE * (a * d - b * b))
+    return agrees
 
 
-def spread_limit_m(means_m: Array) -> tuple[Array, float]:
-    """Return the median (2,) of means (n, 2), and the distance from it within which they are taken as they are.
+def spread_limit_m(priors: Sequence[Five]) -> tuple[tuple[float, float], float]:
+    """Return the median (x, y) of the means, and the distance from it within which they are taken as they are.
 
     Estimates that are pooled in each period differ by less than each is uncertain, because they err together: who
     stays within its uncertainty, but always on one side, would draw all others along.
     """
-    median_m = _median(means_m)
-    if len(means_m) < MAJORITY:
-        return median_m, np.inf
-    off_m = means_m - median_m
-    distance_m = float(_median(np.hypot(off_m[:, 0], off_m[:, 1])))
-    return median_m, SPREAD_FLOOR_M + SPREAD_GATE * distance_m / RAYLEIGH_MEDIAN
+    x, y = _median([prior[0] for prior in priors]), _median([prior[1] for prior in priors])
+    if len(priors) < MAJORITY:
+        return (x, y), math.inf
+    distance_m = _median([math.hypot(prior[0] - x, prior[1] - y) for prior in priors])
+    return (x, y), SPREAD_FLOOR_M + SPREAD_GATE * distance_m / RAYLEIGH_MEDIAN
 
 
-def cut_to(off_m: Array, limit_m: float) -> Array:
-    """Return offsets (n, 2) with lengths of at most `limit_m`."""
-    squared = off_m[:, 0] ** 2 + off_m[:, 1] ** 2
-    if max(squared.tolist()) <= limit_m**2:
+def _median(values: list[float]) -> float:
+    values.sort()
+    return (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
+
+
+def cut_to(off_m: list[tuple[float, float]], limit_m: float) -> list[tuple[float, float]]:
+    """Return offsets (x, y) with lengths of at most `limit_m`."""
+    length_m = [math.hypot(x, y) for x, y in off_m]
+    if max(length_m) <= limit_m:
         return off_m
-    return np.asarray(off_m * np.minimum(1.0, limit_m / np.sqrt(np.maximum(squared, 1e-300)))[:, None])
+    share = [min(1.0, limit_m / max(length, 1e-300)) for length in length_m]
+    return [(x * part, y * part) for (x, y), part in zip(off_m, share, strict=True)]
 
 
-def _median(values: Array) -> Array:
-    """Return the median of the rows of `values` (n, …): numpy's takes six times as long where they are few."""
-    ordered, count = values.copy(), len(values)
-    ordered.sort(axis=0)
-    return np.asarray((ordered[(count - 1) // 2] + ordered[count // 2]) / 2)
-
-
-def unless_most_disagree(agrees: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def unless_most_disagree(agrees: list[bool]) -> list[bool]:
     """Return all true where most are false: then it is what is believed that is wrong, and not they."""
-    if len(agrees) >= MAJORITY - 1 and 2 * np.count_nonzero(agrees) < len(agrees):
-        return np.ones_like(agrees)
+    if len(agrees) >= MAJORITY - 1 and 2 * agrees.count(True) < len(agrees):
+        return [True] * len(agrees)
     return agrees
 
 
-class Memory:
-    """Numbers of each origin, `size` of them, with the time at which they were stored."""
+class Sums:
+    """Sums of the terms of each origin's increments, that decay in `MEMORY_S`, and of their number.
 
-    def __init__(self, size: int) -> None:
+    In place of a sum that decays, what is added is given a weight that grows: deviations are the same, and nothing
+    is to be done for those who are silent. Once in `MEMORY_S` all sums are reduced to a weight of 1.
+    """
+
+    def __init__(self) -> None:
         self._row: dict[int, int] = {}
-        self._numbers = np.zeros((size + 1, 0))  # the last is the time
+        self._numbers = np.zeros((11, 0))  # terms, weights, and the time at which they were stored
+        self._since_s = 0.0
 
     def __len__(self) -> int:
         """Number of origins."""
         return len(self._row)
 
-    def recall(self, codes: Sequence[int], now_s: float) -> tuple[NDArray[np.intp], Array, Array]:
-        """Return the rows (n,) of origins, their numbers (size, n), and e^(−age / `MEMORY_S`) of these (n,).
+    def weight(self, now_s: float) -> float:
+        """Return the weight of what is added now."""
+        weight = math.exp((now_s - self._since_s) / MEMORY_S)
+        if weight <= math.e:
+            return weight
+        self._numbers[:10] /= weight
+        self._numbers[6:9] /= weight
+        self._since_s = now_s
+        return 1.0
+
+    def recall(self, codes: Sequence[int], now_s: float) -> tuple[NDArray[np.intp], Array]:
+        """Return the rows (n,) of origins, and their numbers (11, n).
 
         New origins are added with zeros, and old ones forgotten when there are too many.
         """
@@ -205,12 +228,11 @@ class Memory:
             self._add([code for code in codes if code not in self._row], now_s)
             known = list(map(self._row.get, codes))
         rows = np.array(known, dtype=np.intp)
-        numbers = self._numbers.take(rows, axis=1)
-        return rows, numbers[:-1], np.exp((numbers[-1] - now_s) / MEMORY_S)
+        return rows, self._numbers.take(rows, axis=1)
 
-    def store(self, rows: NDArray[np.intp], numbers: Array, now_s: float) -> None:
-        """Replace the numbers (size, n) of the rows (n,)."""
-        self._numbers[:-1, rows], self._numbers[-1, rows] = numbers, now_s
+    def store(self, rows: NDArray[np.intp], numbers: Array) -> None:
+        """Replace the numbers (11, n) of the rows (n,)."""
+        self._numbers[:, rows] = numbers
 
     def _add(self, new: list[int], now_s: float) -> None:
         if len(self._row) + len(new) > MAX_ORIGINS:
@@ -226,66 +248,76 @@ class Memory:
         self._numbers = np.hstack([self._numbers, more])
 
 
-_LEAST_GATES = np.array([[INCREMENT_GATE], [SUM_GATE]])
-"""Gates of increments by themselves, and of sums of many."""
+def _sum_gate(count: float) -> float:
+    """Return the largest squared deviation of a sum of so many increments."""
+    return INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * min(1.0, count / MANY)
 
 
 class Origins:
     """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
     def __init__(self) -> None:
-        self._increments = Memory(10)
-        self._priors = Memory(2)
+        self._increments = Sums()
+        self._leans: dict[int, tuple[float, float, float]] = {}  # mean deviation (x, y) and its time
 
-    def agree(
-        self, codes: Sequence[int], increments: Array, belief: tuple[Array, Array], now_s: float
-    ) -> NDArray[np.bool_]:
+    def agree(self, codes: Sequence[int], increments: Array, belief: Belief, now_s: float) -> list[bool]:
         """Tell which increments (n, 5) of the origins `codes` agree with the belief (x, P), singly and in sum.
 
         An increment that does not is summed up all the same: who has lied is believed again when it has decayed.
         Each is compared with what was believed when it came: c itself moves by half a metre in the sum's memory.
         """
         if not codes:
-            return np.zeros(0, dtype=np.bool_)
-        rows, sums, keep = self._increments.recall(codes, now_s)
-        sums *= keep
-        sums[6:9] *= keep
-        said = np.empty((10, 2, len(codes)))  # each by itself, then the sums; the last row counts
-        said[:9, 0] = _compared(increments, *belief)
-        said[9, 0] = 1.0
-        np.add(sums, said[:, 0], out=said[:, 1])
-        self._increments.store(rows, said[:, 1], now_s)
-        squared = _squared(said[:9])
-        good = squared < _LEAST_GATES
-        if np.count_nonzero(good) < good.size:  # a sum of few may deviate by more
-            limit = INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * np.minimum(1.0, said[9, 1] / MANY)
-            good[1] = squared[1] < limit
-        return np.asarray(good[0] & good[1])
+            return []
+        weight = self._increments.weight(now_s)
+        rows, sums = self._increments.recall(codes, now_s)
+        said = np.empty((11, 2, len(codes)))  # each by itself, then the sums: terms, weights and the time
+        said[:9, 0] = _compared(increments, belief, weight)
+        said[9, 0], said[10, 1] = weight, now_s
+        np.add(sums[:10], said[:10, 0], out=said[:10, 1])
+        self._increments.store(rows, said[:, 1])
+        alone, in_sum = _squared(said[:9].reshape(9, -1)).reshape(2, -1).tolist()
+        agrees = [one < INCREMENT_GATE and many < SUM_GATE for one, many in zip(alone, in_sum, strict=True)]
+        if False in agrees:  # a sum of few may deviate by more
+            counts = (said[9, 1] / weight).tolist()
+            each = zip(alone, in_sum, counts, strict=True)
+            agrees = [one < INCREMENT_GATE and many < _sum_gate(count) for one, many, count in each]
+        return agrees
 
     def without_lean(
-        self, codes: Sequence[int], off_m: Array, variance_m2: Array, now_s: float
-    ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the deviations (n, 2) of the priors of `codes` from the median, less what is always to one side.
+        self, codes: Sequence[int], priors: Sequence[Five], own: Five, middle_m: tuple[float, float], now_s: float
+    ) -> tuple[list[tuple[float, float]], list[bool] | None]:
+        """Return by how much the means of `priors` of `codes` are off `middle_m`, less what is always to one side.
 
-        The second value (n,) tells which priors lean so.
-
-        `variance_m2` (n, 3), entries (xx, xy, yy), is how far each may be off. Deviations of the honest change
-        sides in a second; a mean of more than `LEAN_LIMIT` deviations is taken off.
+        The second value tells which priors lean so, None if none does. Each is a mean (x, y) and a covariance (xx,
+        xy, yy), and may be off by as much as it and one's `own` claim. Deviations of the honest change sides in a
+        second; a mean of more than `LEAN_LIMIT` deviations is taken off.
         """
-        root_xx = np.sqrt(variance_m2[:, 0])
-        root_yx = variance_m2[:, 1] / root_xx
-        root_yy = np.sqrt(variance_m2[:, 2] - root_yx * root_yx)
-        rows, lean, keep = self._priors.recall(codes, now_s)
-        x = off_m[:, 0] / root_xx
-        now = np.array([x, (off_m[:, 1] - root_yx * x) / root_yy])
-        lean = now + keep * (lean - now)
-        self._priors.store(rows, lean, now_s)
-        squared = lean[0] * lean[0] + lean[1] * lean[1]
-        leans = squared > LEAN_LIMIT**2
-        if not np.count_nonzero(leans):
-            return off_m, leans
-        x, y = lean * np.maximum(0.0, 1 - LEAN_LIMIT / np.sqrt(np.maximum(squared, 1e-300)))
-        return off_m - np.stack([root_xx * x, root_yx * x + root_yy * y], axis=1), leans
+        if len(self._leans) + len(codes) > MAX_ORIGINS:
+            kept = [code for code, (_, _, then_s) in self._leans.items() if now_s - then_s < MEMORY_S]
+            self._leans = {code: self._leans[code] for code in kept[-(MAX_ORIGINS // 2) :]}
+        off_m: list[tuple[float, float]] = []
+        leans: list[bool] = []
+        for code, (mean_x, mean_y, xx, xy, yy) in zip(codes, priors, strict=True):
+            # The deviation in terms of what is claimed: C⁻¹ off with C Cᵀ the sum of both covariances.
+            root_xx = math.sqrt(xx + own[2])
+            root_yx = (xy + own[3]) / root_xx
+            root_yy = math.sqrt(yy + own[4] - root_yx * root_yx)
+            off_x, off_y = mean_x - middle_m[0], mean_y - middle_m[1]
+            x = off_x / root_xx
+            y = (off_y - root_yx * x) / root_yy
+            lean_x, lean_y, then_s = self._leans.get(code, (0.0, 0.0, now_s))
+            keep = math.exp((then_s - now_s) / MEMORY_S)
+            lean_x, lean_y = x + keep * (lean_x - x), y + keep * (lean_y - y)
+            self._leans[code] = lean_x, lean_y, now_s
+            squared = lean_x * lean_x + lean_y * lean_y
+            is_leaning = squared > LEAN_LIMIT**2
+            if is_leaning:
+                less = 1 - LEAN_LIMIT / math.sqrt(squared)
+                off_x -= less * root_xx * lean_x
+                off_y -= less * (root_yx * lean_x + root_yy * lean_y)
+            off_m.append((off_x, off_y))
+            leans.append(is_leaning)
+        return off_m, leans if True in leans else None
 
 
 def median_belief(priors: Array) -> Information:

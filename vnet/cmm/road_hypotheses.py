@@ -139,7 +139,7 @@ class RoadHypotheses:
             return
         for row in range(len(self.mean)):
             own = Information.of(self.mean[row, :2], self.covariance[row, :2, :2])
-            after = Information(own.matrix + matrix, own.vector + vector)
+            after = Information.from_arrays(own.matrix + matrix, own.vector + vector)
             a, b, d = after.matrix[0, 0], after.matrix[0, 1], after.matrix[1, 1]
             least = np.linalg.eigvalsh(pooled.matrix)[0] * 0.5
             if a + d > 0 and (a - least) * (d - least) - b * b > 0 and a > least:

@@ -46,20 +46,24 @@ class OptimizedWeights:
         Raises VnetError for a covariance that is not positive definite.
         """
         check_covariances(covariances_m2)
+        return self.solve_by_variance(estimates_m, covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1], mean_m)
+
+    def solve_by_variance(self, estimates_m: Array, variances_m2: Array, mean_m: Array) -> Array:
+        """Return the same for the sums (n,) of both variances of each, which are positive."""
         count = len(estimates_m)
         if count == 1:
             return np.ones(1)
-        hessian = self._hessian(estimates_m, covariances_m2, mean_m)
+        hessian = self._hessian(estimates_m, variances_m2, mean_m)
         weights = self._minimize(hessian)
         weights = np.minimum(np.maximum(weights, 0.0), 1.0)
         total = float(np.add.reduce(weights))
         return np.asarray(weights / total) if math.isfinite(total) and total > 0 else no_fusion_weights(count)
 
-    def _hessian(self, estimates_m: Array, covariances_m2: Array, mean_m: Array) -> Array:
+    def _hessian(self, estimates_m: Array, variances_m2: Array, mean_m: Array) -> Array:
         count = len(estimates_m)
         offset = estimates_m - mean_m
         if self._ridge_m2 is None:
-            ridge = np.maximum(covariances_m2[:, 0, 0] + covariances_m2[:, 1, 1], RIDGE_FLOOR_M2)
+            ridge = np.maximum(variances_m2, RIDGE_FLOOR_M2)
         else:
             ridge = np.full(count, self._ridge_m2)
         hessian = offset.dot(offset.T)

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from agents.cooperative.attack import Attack, Lie
 from agents.cooperative.frame import FrameError, name_of_code, short_name
 from agents.cooperative.information_attacker import InformationAttacker
-from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator, Passing
+from agents.cooperative.information_estimator import LOST_PERIODS, InformationEstimator
 from agents.cooperative.information_frame import PASSED, InformationFrame, decode, encode, room
 from agents.cooperative.options import Options
 from vnet import Fix, Packet
-from vnet.cmm.plausibility import MAX_ORIGINS
+from vnet.cmm.information import Five, Information
 from vnet.roads.lanes import LaneMap
 from vnet.types import Array
 
@@ -135,25 +135,6 @@ def test_what_pooled_priors_hold_is_not_added_again() -> None:
     assert {e.imported for e in network.estimators} == {5}
 
 
-@given(st.lists(st.lists(st.integers(0, 20), min_size=1, max_size=40), max_size=4))
-def test_origins_are_told_apart(periods: list[list[int]]) -> None:
-    passing, seen = Passing(), set[int]()
-    for codes in periods:
-        seen |= set(codes)
-        index = passing.index(np.array(codes, dtype=np.uint32))
-        assert passing.codes[index].tolist() == codes
-        assert passing.codes.tolist() == sorted(seen)
-
-
-def test_origins_without_end_are_forgotten() -> None:
-    passing = Passing()
-    for first in range(0, 10 * MAX_ORIGINS, 200):
-        passing.index(np.arange(first, first + 200, dtype=np.uint32))
-        assert len(passing.codes) < MAX_ORIGINS + 200
-    index = passing.index(np.array([7], dtype=np.uint32))
-    assert passing.codes[index].tolist() == [7]
-
-
 def test_a_frame_holds_as_many_increments_as_there_is_room_for() -> None:
     network = Network(8, relay_increments=30)
     network.run(5)
@@ -170,10 +151,10 @@ def test_a_frame_holds_as_many_increments_as_there_is_room_for() -> None:
     assert len(seen) > 3  # in turns
 
 
-def _shifted(information: tuple[float, ...], by_m: Array, factor: float = 1.0) -> tuple[float, ...]:
+def _shifted(information: Five, by_m: Array, factor: float = 1.0) -> Five:
     a, b, d, x, y = information
     off = np.array([[a, b], [b, d]]) @ by_m
-    return tuple(factor * value for value in (a, b, d, x + off[0], y + off[1]))
+    return factor * a, factor * b, factor * d, factor * (x + off[0]), factor * (y + off[1])
 
 
 @pytest.mark.parametrize(("off_m", "factor"), [(10.0, 1.0), (10.0, 100.0), (3.0, 1.0)])
@@ -234,9 +215,8 @@ def test_a_vehicle_that_is_wrong_begins_again_where_the_others_are() -> None:
     network = Network(6)
     network.run(30)
     lost = network.estimators[0]
-    lost.own.restart(
-        lost.own.prior.plus(replace(lost.own.prior, vector=lost.own.prior.matrix @ np.array([30.0, 0])))
-    )
+    prior = lost.own.prior
+    lost.own.restart(prior.plus(Information.from_arrays(prior.matrix, prior.matrix @ np.array([30.0, 0]))))
     network.run(1)
     assert network.errors_m()[0] > 5
     network.run(LOST_PERIODS + 30)
@@ -343,7 +323,7 @@ def frames(draw: st.DrawFn) -> InformationFrame:
         draw(st.floats(-0.25, 0.25, width=32)),
         draw(st.floats(0.5, 4, width=32)),
     ]
-    information = (*matrix, draw(number), draw(number))
+    information = matrix[0], matrix[1], matrix[2], draw(number), draw(number)
     heard = draw(st.dictionaries(st.integers(0, 2**32 - 1).map(name_of_code), st.booleans(), max_size=12))
     passed = np.zeros(draw(st.integers(0, 30)), dtype=PASSED)
     passed["name"] = np.arange(len(passed))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from vnet.cmm.information import Information
+from vnet.cmm.information import NOTHING, Information
 from vnet.cmm.own_vehicle_on_map import OwnVehicleOnMap
 from vnet.cmm.rbpf import Observation, RbpfConfig
 from vnet.cmm.road_hypotheses import OFF_ROAD
@@ -55,7 +55,7 @@ def driving(seconds: float, at_m: tuple[float, float], heading_rad: float) -> li
 
 def run(vehicle: OwnVehicleOnMap, seen: Iterable[Observation]) -> Information:
     """Take all fixes; returns the sum of the increments."""
-    total = Information(np.zeros((2, 2)), np.zeros(2))
+    total = NOTHING
     for fix in seen:
         total = total.plus(vehicle.step(0.1, fix))
     return total
