@@ -207,9 +207,9 @@ def decode(payload: bytes) -> InformationFrame:
     prior, running_sum = (a, b, d, x, y), (s_x, s_y, weight)
     _check(prior, increment, running_sum)
     heard, out_neighbours, names_heard = _heard(payload[_HEADER.size : flags_end], heard_count)
-    passed = np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end)
-    if passed_count:
-        _check_passed(passed["information"].astype(np.float64))
+    records = [record for (record,) in _AS_BYTES.iter_unpack(payload[flags_end:end])]
+    if any(map(_fault, records)):
+        raise FrameError(next(filter(None, map(_fault, records))))
     a, b, d, x, y = increment
     frame = InformationFrame(
         name=name_of_code(name),
@@ -219,12 +219,20 @@ def decode(payload: bytes) -> InformationFrame:
         epoch=epoch,
         running_sum=running_sum,
         heard=heard,
-        passed=passed,
+        passed=np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end),
         largest_degree=degree,
     )
-    # The names are those of the period before, as a rule; to compute a property when it is first read takes longer.
-    share = Share(epoch, running_sum, out_neighbours, names_heard)
-    frame.__dict__.update(code=name, share=share, out_neighbours=out_neighbours, names_heard=names_heard)
+    moments = plain_moments(*prior)
+    frame.__dict__.update(  # each receiver reads these, and a property takes longer when it is first read
+        code=name,
+        moments=moments,
+        numbers=packed_numbers(prior, frame.increment, moments),
+        out_neighbours=out_neighbours,
+        names_heard=names_heard,
+        share=Share(epoch, running_sum, out_neighbours, names_heard),
+        record=passed_record(name, frame.increment),
+        passed_records=frozenset(records),
+    )
     return frame
 
 
@@ -247,23 +255,16 @@ def _check(prior: Five, increment: list[float], running_sum: tuple[float, float,
         raise FrameError("absurd")
 
 
-def _check_passed(passed: Array) -> None:
-    if not math.isfinite(np.add.reduce(passed, axis=None)):  # numbers of half precision never add up to infinity
-        raise FrameError("not_finite")
-    if np.count_nonzero(is_increment(passed)) < len(passed):
-        raise FrameError("covariance")
+@lru_cache(maxsize=4096)  # most that hear a vehicle pass its increment on
+def _fault(record: bytes) -> str:
+    """Return why a record of `PASSED` cannot be, "" if it can."""
+    _, *increment = _RECORD.unpack(record)
+    if not math.isfinite(sum(increment)):
+        return "not_finite"
+    return "" if _is_semidefinite(*increment[:3]) else "covariance"
 
 
 def _is_semidefinite(a: float, b: float, d: float) -> bool:
     """Tell whether a matrix (xx, xy, yy) is positive semidefinite, but for rounding."""
     slack = 1e-2 * max(abs(a), abs(d)) + 1e-6
     return a >= 0 and d >= 0 and (a + slack) * (d + slack) >= b * b
-
-
-def is_increment(information: Array) -> NDArray[np.bool_]:
-    """Tell which of (n, 5) have a matrix that is positive semidefinite, but for rounding."""
-    a, b, d = information[:, 0], information[:, 1], information[:, 2]
-    slack = np.maximum(a, d)
-    slack *= 1e-2
-    slack += 1e-6
-    return np.asarray((np.minimum(a, d) >= 0) & ((a + slack) * (d + slack) >= b * b))

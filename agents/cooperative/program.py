@@ -111,9 +111,10 @@ def _report(node: Node, estimator: Estimator | InformationEstimator, fix: Fix, c
     """
     position_m, covariance_m2 = estimator.position(fix)
     common_m, common_covariance_m2 = estimator.common_error
-    # Nobody can tell a shift of the map from the common error: it is stated, and not exchanged.
-    shift_m2 = map_shift_m2(node.map)
-    covariance_m2, common_covariance_m2 = covariance_m2 + shift_m2, common_covariance_m2 + shift_m2
+    if isinstance(node.map, RoadMap):
+        # Nobody can tell a shift of the map from the common error: it is stated, and not exchanged.
+        shift_m2 = map_shift_m2(node.map)
+        covariance_m2, common_covariance_m2 = covariance_m2 + shift_m2, common_covariance_m2 + shift_m2
     values: dict[str, Any] = {
         "common_error_m": common_m,
         "common_error_covariance_m2": common_covariance_m2,

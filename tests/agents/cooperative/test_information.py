@@ -381,3 +381,20 @@ def test_numbers_that_cannot_be_are_refused(change: dict[str, tuple[float, ...]]
     assert decode(encode(frame)).prior == one
     with pytest.raises(FrameError, match=reason):
         decode(encode(replace(frame, **change)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("information", "reason"),
+    [
+        ((1.0, 0.0, 1.0, np.inf, 0.0), "not_finite"),
+        ((1.0, 0.0, 1.0, 0.0, np.nan), "not_finite"),
+        ((1.0, 2.0, 1.0, 0.0, 0.0), "covariance"),
+        ((-1.0, 0.0, 1.0, 0.0, 0.0), "covariance"),
+    ],
+)
+def test_increments_passed_on_that_cannot_be_are_refused(information: Five, reason: str) -> None:
+    one = (1.0, 0.0, 1.0, 0.0, 0.0)
+    passed = np.array([(7, one), (8, information)], dtype=PASSED)
+    frame = InformationFrame("00000001", 0, one, one, 0, (0.0, 0.0, 1.0), {}, passed)
+    with pytest.raises(FrameError, match=reason):
+        decode(encode(frame))
