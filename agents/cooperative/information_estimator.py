@@ -79,7 +79,7 @@ def _trace(information: Five) -> float:
 
 
 def _sum(rows: Array) -> Array:
-    """Return the sum (5,) of rows (n, 5): numpy's takes longer where they are few."""
+    """Return the sum (m,) of rows (n, m): numpy's takes longer where they are few."""
     return np.asarray(np.ones(len(rows)).dot(rows))
 
 
@@ -193,9 +193,7 @@ class InformationEstimator:
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
-            self.mean_m = tracked_mean(
-                np.add.reduce(means_m) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE
-            )
+            self.mean_m = tracked_mean(_sum(means_m) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE)
         priors, increments = self._limited(heard, priors, table[:, 5:10])
         weights = self._weigh(frames, means_m, table[:, 12] + table[:, 14], leaning)
         passed = self._passed_on(heard, weights[1:])

@@ -68,7 +68,7 @@ class Information:
 
 
 NOTHING = Information((0.0, 0.0, 0.0, 0.0, 0.0))
-"""What says nothing."""
+"""A fix that is not used says this."""
 
 
 # Symmetric matrices (xx, xy, yy) in plain numbers.

@@ -109,9 +109,10 @@ class OwnRbpf:
     @property
     def _wanted(self) -> int:
         """Number of particles to go on with: for the spread, unless that is near the present one."""
-        most, count = self._most, len(self.weight)
+        most = self._most
         if self._least >= self._particles:
             return most
+        count = len(self.weight)
         wanted = sample_size(self.estimate_covariance_m2, self._least, most)
         is_near = count / SIZE_STEP < wanted < count * SIZE_STEP
         return count if is_near and count <= most else wanted

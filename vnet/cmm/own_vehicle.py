@@ -93,7 +93,7 @@ class OwnVehicle:
     @property
     def belief(self) -> tuple[Array, Array]:
         """Estimate (2,) of the common error, and its covariance (2, 2)."""
-        return self.estimate_m, self.estimate_covariance_m2
+        return self._filter.estimate_m, self._filter.estimate_covariance_m2
 
     def position_m(self) -> tuple[Array, Array] | None:
         """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""

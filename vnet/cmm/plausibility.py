@@ -48,8 +48,6 @@ MAX_ORIGINS = 1024
 """Number of origins whose sums are kept: names cost an attacker nothing."""
 
 
-_THREE = np.ones(3)
-
 Belief = tuple[Sequence[float], Three]
 """Mean (x, y) in m and covariance (xx, xy, yy) in m² of what is believed about c."""
 
@@ -73,7 +71,7 @@ def moments(information: Array) -> tuple[Array, Array]:
 def scaled_down(information: Array, largest_trace: float) -> Array:
     """Return information (n, 5) with traces of at most `largest_trace`; means stay."""
     trace = information[:, 0] + information[:, 2]
-    if not len(trace) or np.maximum.reduce(trace) <= largest_trace:
+    if max(trace.tolist(), default=0.0) <= largest_trace:
         return information
     return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
 
@@ -129,6 +127,9 @@ _OF_INFORMATION = np.array([[1e-4, 0, 1 + 1e-4], [0, 1, 0], [1 + 1e-4, 0, 1e-4]]
 """S = Λ + Λ P Λ (yy, xy, xx) and r rᵀ (xx, −2 xy, yy) as sums of the products and of Λ. A lane says nothing along
 itself: a ten thousandth of the trace is added to S, so that rounding there is not counted."""
 _FLOOR = np.array([[1e-9], [0.0], [1e-9]])
+_ADJUGATE, _SQUARES = np.array([0, 1, 2, 0, 1]), np.array([3, 4, 5, 2, 1])
+_RATIO = np.array([[1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])
+"""rᵀ adj(S) r and det S as sums of products of these rows."""
 
 
 def _squared(compared: Array) -> Array:
@@ -136,12 +137,13 @@ def _squared(compared: Array) -> Array:
     products = compared.take(_LEFT, axis=0)
     products *= compared.take(_RIGHT, axis=0)
     sums = _OF_PRODUCTS.dot(products)
-    adjugate, squares = sums[:3], sums[3:]
+    adjugate = sums[:3]
     adjugate += _OF_INFORMATION.dot(compared[6:9])
     adjugate += _FLOOR
-    y, xy, x = adjugate
-    squares *= adjugate
-    return np.asarray(_THREE.dot(squares) / (x * y - xy * xy))
+    products = sums.take(_ADJUGATE, axis=0)
+    products *= sums.take(_SQUARES, axis=0)
+    squared, determinant = _RATIO.dot(products)
+    return np.asarray(squared / determinant)
 
 
 def priors_agree(priors: Sequence[Five], own: Five) -> list[bool]:

@@ -35,7 +35,7 @@ def test_what_is_not_used_yet_is_new_and_priors_hold_the_weight_of_who_lists_it(
 
 @pytest.mark.parametrize("defence", [True, False])
 def test_who_changes_most_that_is_known_first_hand_is_not_counted(defence: bool) -> None:
-    """What it lists first of an origin is not used either; without the defence the first record counts for all."""
+    """A record that it lists first is not used either; without the defence the first record counts for all."""
     false = frozenset([_record(2, 9.0), _record(3, 9.0), OWN, _record(300, 9.0)])
     honest = frozenset([FIRST, FAR, FURTHER])
     shares, forged = _passing().shares([false, honest], [0.25, 0.5], defence)
