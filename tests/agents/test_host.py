@@ -29,7 +29,7 @@ def test_malformed_messages_are_dropped_counted_and_logged_once(
     data: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     attached = attachment()
-    grant = wire.Grant(0, 7, 8, [], [], [], next_fixes=[], busy=[], results=[])
+    grant = wire.Grant(0, 7, 8, [], [], [], next_fixes=[], busy=[], results=[], messages=[])
     for message in (data, data, wire.encode(grant)):
         attached.inbox.put((message, 0))
     assert attached.next_message() == grant
