@@ -109,6 +109,8 @@ class Radio:
         self._acknowledges = abilities.acknowledges
         self._next_send = 0
         self._sends: dict[int, asyncio.Future[SendResult]] = {}
+        self._unknown: set[int] = set()
+        """Numbers of the frames whose results have not come, also if nobody waits for them."""
         self._node_id = node_id
         self._transport = transport
 
@@ -149,6 +151,7 @@ class Radio:
         number, self._next_send = self._next_send, self._next_send + 1
         result: asyncio.Future[SendResult] = asyncio.get_running_loop().create_future()
         self._sends[number] = result
+        self._unknown.add(number)
         try:
             self._transport.send_frame(self._node_id, content, SendOptions(power_dbm, rate_mbps, to, number))
             return await result
@@ -157,11 +160,16 @@ class Radio:
 
     @property
     def is_sending(self) -> bool:
-        """True if a task waits for the result of `send`."""
-        return bool(self._sends)
+        """True if the result of a `send` is still to come, also of one that has been cancelled."""
+        return bool(self._unknown)
+
+    def forget_results(self) -> None:
+        """Expect no more results: the program is over, and nobody is told them."""
+        self._unknown.clear()
 
     def settle(self, number: int, result: SendResult) -> None:
         """Give the call of `send` with this number its result, if it still waits for one."""
+        self._unknown.discard(number)
         waiting = self._sends.get(number)
         if waiting is not None and not waiting.done():
             waiting.set_result(result)

@@ -50,7 +50,7 @@ PARTS = {
     "node.map": LaneMap,
     "node.map of a city": RoadMap,
 }
-HOSTS_ONLY = {"sever", "to_wire", "from_wire", "is_sending", "settle"}
+HOSTS_ONLY = {"sever", "to_wire", "from_wire", "is_sending", "forget_results", "settle"}
 """Public, but none of a program's business."""
 WAITING = f"""
 `async for` waits for the next one, and goes on until the run ends. The newest {INBOX_LIMIT} that the program has

@@ -295,6 +295,7 @@ class Host:
         if not self._active[node]:
             return
         self._active[node] = False
+        self.nodes[node].radio.forget_results()
         self._outbox.endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         for task in self._tasks_of(self.nodes[node]):

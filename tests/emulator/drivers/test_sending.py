@@ -1,6 +1,7 @@
 """Programs that send frames to single vehicles: what they are told is the same live and simulated."""
 
 import asyncio
+import contextlib
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ RADIO: dict[str, Any] = {
 SENDS = "tests.emulator.drivers.test_sending:sends"
 FORGETS = "tests.emulator.drivers.test_sending:forgets"
 ASKS = "tests.emulator.drivers.test_sending:asks"
+GIVES_UP = "tests.emulator.drivers.test_sending:gives_up"
 ASKS_NOBODY = "tests.emulator.drivers.test_sending:asks_nobody"
 
 
@@ -47,6 +49,23 @@ async def forgets(node: Node) -> None:
         if turn == 30 and node.id == "v01":
             return
         node.event("turn", done=task.done(), waits=node.radio.is_sending)
+
+
+async def gives_up(node: Node) -> None:
+    """v01 gives up soon, then only sleeps; v02 ends in the midst of a send."""
+    if node.id == "v01":
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(node.radio.send("v03", bytes(400)), 0.0005)
+        node.event("gave up")
+        await asyncio.sleep(0.1)
+        node.event("slept")
+    elif node.id == "v02":
+        task = asyncio.create_task(node.radio.send("v03", bytes(400)))
+        await asyncio.sleep(0.0005)
+        task.cancel()
+        return
+    async for _ in node.gnss:
+        pass
 
 
 async def asks_nobody(node: Node) -> None:
@@ -86,6 +105,16 @@ def test_live_processes_are_told_what_their_simulation_is(entry: str, latency_ms
     for other in (run_apart(plan), run_together(without), run_apart(without)):
         assert told(other) == expected
         assert other.engine.trace.sha256() == together.engine.trace.sha256()
+
+
+@pytest.mark.parametrize("nodes_per_process", [1, 2])
+def test_a_live_process_that_gives_up_a_send_goes_on(nodes_per_process: int) -> None:
+    """Its result is an instant of the process all the same, for which it has to be granted."""
+    plan = scenario(GIVES_UP)
+    plan = plan.model_copy(update={"run": plan.run.model_copy(update={"nodes_per_process": nodes_per_process})})
+    expected = told(run_together(plan))
+    assert [time_ns for _, time_ns, _ in expected] == [500_000, 100_500_000]
+    assert told(run_apart(plan)) == expected
 
 
 def test_a_result_is_that_of_the_trace() -> None:
