@@ -315,10 +315,12 @@ def _badly_acknowledged(recorded: RecordedRun) -> NDArray[np.intp]:
     order = order[single[order]]
     same = np.diff(frame[order]) == 0
     wrong[order[1:]] |= same & (acked[order[:-1]] | (np.diff(attempt[order]) != 1))
-    received = np.zeros(len(rows), bool)
+    delivered = arrived & ~recorded.outcome_is("receiver_down")[rows]
+    came, handed_over = np.zeros((2, len(rows)), bool)  # an earlier attempt, to the vehicle and to its program
     for before, after in zip(order[:-1][same].tolist(), order[1:][same].tolist(), strict=True):
-        received[after] = received[before] or arrived[before]
-    return np.asarray(rows[wrong | (single & ((arrived & received) | (duplicate & ~received)))])
+        came[after] = came[before] or arrived[before]
+        handed_over[after] = handed_over[before] or delivered[before]
+    return np.asarray(rows[wrong | (single & ((delivered & handed_over) | (duplicate & ~came)))])
 
 
 def _too_idle(air: _Air) -> int:

@@ -171,7 +171,7 @@ class Trace:
         rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
         rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
         rows["cause"] -= NO_CAUSE
-        rows["arrival_ns"] = np.where(outcome == PENDING, arrival_ns, NOT_ARRIVING)
+        rows["arrival_ns"] = np.where(np.isin(outcome, (PENDING, Outcome.receiver_down)), arrival_ns, NOT_ARRIVING)
         if powers_db is not None:
             powers = self._powers.add(len(outcome))
             for name, power_db in zip(UNHASHED, powers_db, strict=True):

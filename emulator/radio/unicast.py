@@ -7,7 +7,7 @@ transmitted again after a backoff from a window that doubles, up to the short re
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
 from typing import NamedTuple, Protocol
@@ -185,7 +185,9 @@ class Unicasts:
         return taken
 
 
-def address(frame: Frame, outcome: NDArray[np.uint8], locked: Mask, cause: NDArray[np.int16]) -> None:
+def address(
+    frame: Frame, outcome: NDArray[np.uint8], locked: Mask, cause: NDArray[np.int16], is_up: bool = True
+) -> None:
     """Note who could read a frame, and who not; of a frame to one vehicle keep its reception alone.
 
     `outcome` and `cause` (N,) are those of all vehicles, as if it were a broadcast, and are changed; `locked` marks
@@ -200,7 +202,9 @@ def address(frame: Frame, outcome: NDArray[np.uint8], locked: Mask, cause: NDArr
         return
     others = np.arange(len(outcome)) != frame.to
     outcome[others], cause[others] = Outcome.out_of_range.value, NO_CAUSE
-    if frame.was_received and frame.decoded[frame.to]:
+    if frame.decoded[frame.to] and not is_up:  # whoever is down acknowledges nothing, and knows nothing again
+        frame.decoded[frame.to], outcome[frame.to] = False, Outcome.receiver_down.value
+    elif frame.was_received and frame.decoded[frame.to]:
         outcome[frame.to] = Outcome.duplicate.value
 
 
@@ -208,6 +212,7 @@ class SharedMedium(Protocol):
     """Part of the MAC that decides what becomes of frames to single vehicles."""
 
     has_eifs: bool
+    is_up: Callable[[int], bool]
     medium: Medium
     unicasts: Unicasts
 
@@ -219,7 +224,8 @@ def address_all(frames: Sequence[Frame], receptions: Receptions, mac: SharedMedi
             continue
         outcome, cause = receptions.outcome[index], receptions.cause[index]
         if frame.sender_outcome == Outcome.pending:
-            address(frame, outcome, mac.medium.locked(frame), cause)
+            is_up = frame.to == BROADCAST or mac.is_up(frame.to)
+            address(frame, outcome, mac.medium.locked(frame), cause, is_up)
         elif frame.attempt:
             outcome[np.arange(len(outcome)) != frame.to] = Outcome.out_of_range.value
             mac.unicasts.leave(frame)

@@ -60,6 +60,29 @@ def test_checks_accept_what_the_radio_does(more: Any, faults: Any, tmp_path: Pat
     assert 0 < figures.acknowledged < figures.sent
 
 
+def test_checks_accept_vehicles_that_come_back_between_attempts(tmp_path: Path) -> None:
+    """Each is down for a millisecond or nine, in turn, while the others send to it."""
+    kills = [
+        {
+            "kind": "kill",
+            "at_s": 0.005 + 0.006 * n,
+            "duration_s": 0.001 * (1 + n % 3 * 4),
+            "nodes": [f"v{n % 8 + 1:02d}"],
+        }
+        for n in range(60)
+    ]
+    scenario = {
+        "run": {"duration_s": 0.4, "settle_s": 0.0},
+        "network": {"vehicles": 8, "layout": "dense"},
+        "radio": {**RADIO, "loss": 0.3},
+        "fault": kills,
+    }
+    result = emulator.simulate(scenario, program=mixes, out=tmp_path / "run")
+    assert not [check for check in result.checks if check.verdict == "invalid"]
+    rows = [row for row in RecordedRun.open(tmp_path / "run").trace.to_pylist() if row["attempt"] > 1]
+    assert {"receiver_down", "delivered", "duplicate"} <= {row["outcome"] for row in rows}
+
+
 @pytest.mark.slow
 def test_a_broken_exchange_is_found(tmp_path: Path) -> None:
     recorded = run_of(tmp_path / "run", radio={**RADIO, "loss": 0.2})

@@ -198,3 +198,18 @@ def test_a_vehicle_that_is_down_acknowledges_nothing_and_is_told_nothing() -> No
     subject.drain()
     assert subject.take_results(10**12) == [] and rows_of(subject)[0]["acked"]
     assert subject.next_result_ns() is None
+
+
+def test_a_vehicle_that_comes_back_between_attempts_receives_the_first_that_finds_it() -> None:
+    """Attempts that reach it while it is down are `receiver_down`, and none of them has been received."""
+    subject = engine(line(0, 50), **PHYSICAL)
+    subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+    subject.advance(200_000)
+    subject.set_up(1, False)  # while the first attempt is on air
+    arrived = list(subject.advance(3 * MS))
+    subject.set_up(1, True)
+    arrived += list(subject.advance(1000 * MS))
+    *before, last = rows_of(subject)
+    assert before and {row["outcome"] for row in before} == {"receiver_down"}
+    assert (last["outcome"], last["acked"]) == ("delivered", True)
+    assert [result.delivered for result in subject.take_results(10**12)] == [True] and len(arrived) == 1
