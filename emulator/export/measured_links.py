@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.radio.outcomes import Stage, decided_at
+from emulator.records.exchanges import sent_by_programs
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.world.link_table import COLUMNS, LinkTable
-from vnet.types import IntArray
+from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 
 DIGITS = 9
@@ -43,26 +44,41 @@ def measured_links(recorded: RecordedRun, every_ns: int) -> LinkTable:
     """Return the links of a run, with the shares of frames that did not arrive in intervals of `every_ns`.
 
     A link begins with its first frame in range and ends when the receiver goes out of range. Losses by faults, the
-    peer cap, fading and collisions count; frames that never were on air, and copies by faults, do not.
+    peer cap, fading and collisions count; frames that never were on air, and copies by faults, do not. Each attempt
+    of a frame to one vehicle counts, and its acknowledgement as a frame of the opposite link.
     """
     count = len(recorded.node_ids)
     starts_ns = recorded.places.starts_ns
     entered, left = _spans(recorded)
-    used = np.flatnonzero((recorded.copy == 0) & ~recorded.outcome_is(*AT_SENDER) & recorded.placed)
-    pair = recorded.sender[used] * count + recorded.receiver[used]
-    sent_ns = recorded.sent_ns[used]
+    pair, sent_ns, came = _transmissions(recorded)
     epoch = np.searchsorted(starts_ns, sent_ns, side="right") - 1
     since_ns = starts_ns[_last_up_to(entered, pair, epoch, len(starts_ns))]
     start_ns = np.maximum(sent_ns // every_ns * every_ns if every_ns else sent_ns, since_ns)
     groups, group = np.unique(np.stack([start_ns, pair]), axis=1, return_inverse=True)
     attempts = np.bincount(group.ravel(), minlength=groups.shape[1])
-    share = np.bincount(group.ravel(), ~recorded.arrived[used], groups.shape[1]) / attempts
+    share = np.bincount(group.ravel(), ~came, groups.shape[1]) / attempts
     time_ns = np.append(groups[0], starts_ns[left[0]])
     pairs = np.append(groups[1], left[1])
     loss = np.append(share, np.full(left.shape[1], np.nan))
     order = np.lexsort((pairs, time_ns))
     order = order[_changes(pairs[order], loss[order])]
     return LinkTable(time_ns[order], pairs[order] // count, pairs[order] % count, loss[order])
+
+
+def _transmissions(recorded: RecordedRun) -> tuple[IntArray, IntArray, Mask]:
+    """Return what was transmitted on links in range: pair (n,), when its frame was sent, and whether it came.
+
+    All attempts and acknowledgements have the positions of the time at which the program sent the frame.
+    """
+    count = len(recorded.node_ids)
+    used = sent_by_programs(recorded) & ~recorded.outcome_is(*AT_SENDER, "out_of_range") & recorded.placed
+    data, answered = np.flatnonzero(used), np.flatnonzero(used & (recorded.ack_on_air_ns >= 0))
+    sender, receiver, sent_ns = recorded.sender, recorded.receiver, recorded.sent_ns
+    in_range = recorded.places.pairs_in_range(receiver[answered], sender[answered], sent_ns[answered])
+    answered = answered[in_range]
+    pair = sender[data] * count + receiver[data], receiver[answered] * count + sender[answered]
+    came = (recorded.arrived | recorded.outcome_is("duplicate"))[data], recorded.acked[answered]
+    return np.concatenate(pair), sent_ns[np.append(data, answered)], np.concatenate(came)
 
 
 def _spans(recorded: RecordedRun) -> tuple[IntArray, IntArray]:
