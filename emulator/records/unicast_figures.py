@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from emulator.records.exchanges import sent_by_programs
 from emulator.records.recorded_run import RecordedRun
 
 
@@ -25,7 +26,7 @@ class UnicastFigures:
 
 def unicast_figures(recorded: RecordedRun) -> UnicastFigures | None:
     """Return the figures of a run without what faults send again; None without frames to single vehicles."""
-    rows = np.flatnonzero((recorded.attempt > 0) & (recorded.cause < 0))
+    rows = np.flatnonzero((recorded.attempt > 0) & sent_by_programs(recorded))
     if not len(rows):
         return None
     frame = recorded.frame[rows]

@@ -23,6 +23,7 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.scenario.scenario import Scenario
 from emulator.world.link_table import read_link_table
 from tests.emulator.checks.test_judge import run_scenario
+from tests.support.exchange_programs import COPYING, exchange_run
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 
 VEHICLES = {
@@ -328,36 +329,8 @@ def test_the_links_of_a_run_are_what_the_file_says(
     assert expected.loss[before][-1] > 0
 
 
-async def exchanges(node: Any) -> None:
-    """The vehicle a sends to b, in range, and to far, out of range."""
-    if node.id == "a":
-        for _ in range(40):
-            await node.radio.send("b", bytes(100))
-            await node.radio.send("far", bytes(100))
-    async for _ in node.radio:
-        pass
-
-
-def exchange_run(folder: Path, **radio: Any) -> OpenedRun:
-    """A run in which one vehicle sends to others, with losses and copies by faults."""
-    (folder / "n.csv").write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,50,0,0\nfar,50000,0,0\n")
-    scenario = {
-        "run": {"duration_s": 1.0, "settle_s": 0.0},
-        "network": {"kind": "file", "path": str(folder / "n.csv")},
-        "world": {"lateral": {"sigma_m": 0.0}},
-        "radio": {"mac": {}, "loss": 0.3, **radio},
-        "program": {"entry": f"{__name__}:exchanges"},
-        "fault": [
-            {"kind": "DoS", "at_s": 0.3, "duration_s": 0.1, "factor": 2, "nodes": ["a"]},
-            {"kind": "duplicate", "at_s": 0.1, "duration_s": 0.2, "probability": 0.5},
-        ],
-    }
-    run_scenario(folder / "run", Scenario.model_validate(scenario))
-    return RecordedRun.open(folder / "run")
-
-
 def test_links_of_frames_to_one_vehicle_are_those_of_attempts_and_acknowledgements(tmp_path: Path) -> None:
-    recorded = exchange_run(tmp_path)
+    recorded = exchange_run(tmp_path, COPYING)
     table = measured_links(recorded, 10**9)
     names = recorded.node_ids
     links = {
