@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from emulator.checks.channel import binomial_band, received_twice
 from emulator.faults.plan import PlannedFault
+from emulator.records.exchanges import sent_by_programs
 from emulator.records.recorded_run import NO_FAULT, ON_AIR, UNHEARD_OF, RecordedRun
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result, unknown
 from emulator.scenario.fault_families import Fault, LossFault, ProcessFault, SenderFault
@@ -89,7 +90,7 @@ def _(fault: SenderFault, recorded: RecordedRun) -> Mask:
 
 @can_cause.register
 def _(fault: StaleMessages, recorded: RecordedRun) -> Mask:
-    return np.asarray((recorded.copy == 0) & ~recorded.outcome_is("fault"))
+    return np.asarray(sent_by_programs(recorded) & ~recorded.outcome_is("fault"))
 
 
 @can_cause.register
