@@ -104,8 +104,7 @@ class Engine:
         self._trace = Trace(node_ids, self._csma is not None, knows_power=radio.path_loss is not None)
         self._counts = dict.fromkeys(Outcome, 0)
         self._next_seq = [0] * len(node_ids)
-        self._choices = self._default_choices = Choices(0.0, radio.bitrate_mbps)
-        """Choices for the frame that is enqueued."""
+        self._default_choices = Choices(0.0, radio.bitrate_mbps)
         self._number = {node: number for number, node in enumerate(node_ids)}
         self._copies: Counter[tuple[int, int]] = Counter()
         self._in_flight = InFlight(len(node_ids))
@@ -150,9 +149,8 @@ class Engine:
         self._copies[sender, seq] += 1
         return self._copies[sender, seq]
 
-    def _ask_sender(self, planned: PlannedFault, time_ns: int, node: int, seq: int, payload: bytes) -> list[bytes]:
-        frame = self._frame(time_ns, node, Outgoing(payload, seq))
-        return self._rules.ask_sender(planned, frame, self._max_payload_bytes)
+    def _ask_sender(self, planned: PlannedFault, time_ns: int, node: int, outgoing: Outgoing) -> list[bytes]:
+        return self._rules.ask_sender(planned, self._frame(time_ns, node, outgoing), self._max_payload_bytes)
 
     # Enqueueing.
 
@@ -168,40 +166,42 @@ class Engine:
         self._mac.run(time_ns)
         self._topology.advance(time_ns)
         for index, payload in enumerate(payloads):
-            self._choices = self._default_choices
-            if index in options and not self._choose(time_ns, node, options[index]):
+            choices = self._chosen(time_ns, node, options[index]) if index in options else self._default_choices
+            if choices is None:
                 continue
             seq = self._next_seq[node]
             self._next_seq[node] = seq + 1
             if self.on_payload is not None:
                 self.on_payload(time_ns, node, seq, payload)
+            original = Outgoing(payload, seq, choices)
             if not self._senders.misbehave:
-                self._enqueue(time_ns, node, Outgoing(payload, seq))
+                self._enqueue(time_ns, node, original)
                 continue
             self._settle()  # duplicates of frames sent before are numbered before the copies sent now
-            for outgoing in self._senders.frames(time_ns, node, seq, payload):
+            for outgoing in self._senders.frames(time_ns, node, original):
                 self._enqueue(time_ns, node, outgoing)
 
-    def _choose(self, time_ns: int, node: int, options: SendOptions) -> bool:
-        """Take the choices for the next frame; returns false for one to nobody, which is not sent."""
-        self._choices = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
-        if self._choices != self._default_choices:
+    def _chosen(self, time_ns: int, node: int, options: SendOptions) -> Choices | None:
+        """Return the choices for the next frame; None for one to nobody, which is not sent."""
+        choices = allowed_choices(self._radio, options, self._rules.largest_dbm(node))
+        is_chosen = choices != self._default_choices
+        if options.to is not None:
+            to = self._number.get(options.to, BROADCAST)
+            if self._csma is None:
+                return None
+            if to in (node, BROADCAST):
+                self._csma.unicasts.refuse(node, options.number, time_ns)
+                return None
+            self._trace.acknowledges = True
+            choices = choices._replace(to=to, ticket=self._csma.unicasts.register(node, options.number))
+        if is_chosen:
             self._trace.begin_choices(self._radio.bitrate_mbps)
-        if options.to is None or self._csma is None:
-            return options.to is None
-        to = self._number.get(options.to, BROADCAST)
-        if to in (node, BROADCAST):
-            self._csma.unicasts.refuse(node, options.number, time_ns)
-            return False
-        ticket = self._csma.unicasts.register(node, options.number)
-        self._choices = self._choices._replace(to=to, ticket=ticket)
-        self._trace.acknowledges = True
-        return True
+        return choices
 
     def _frame(self, time_ns: int, node: int, outgoing: Outgoing) -> Frame:
         return Frame(
             sender=node,
-            bitrate_mbps=(choices := self._choices).bitrate_mbps,
+            bitrate_mbps=(choices := outgoing.choices).bitrate_mbps,
             gain_db=choices.gain_db,
             seq=outgoing.seq,
             sent_ns=time_ns,

@@ -20,6 +20,7 @@ FAULTS: list[dict[str, Any]] = [
     {"kind": "duplicate", "at_s": 0.5, "duration_s": 0.3, "probability": 0.5, "nodes": {"count": 8}},
     {"kind": "kill", "at_s": 0.7, "duration_s": 0.2, "nodes": ["v02"]},
     {"kind": "StaleMessages", "at_s": 0.1, "duration_s": 0.4, "age_s": 0.05, "nodes": ["v04"]},
+    {"kind": "DataReplay", "at_s": 0.3, "duration_s": 0.3, "age_s": 0.05, "nodes": ["v05"]},
     {"kind": "range", "at_s": 0.9, "duration_s": 0.1, "nodes": ["v03"], "range_m": 1.0},
 ]
 

@@ -13,6 +13,7 @@ import emulator
 from emulator.radio.dot11p import abilities_of, airtime_ns
 from emulator.scenario.radio import RATES_MBPS
 from emulator.scenario.scenario import Radio as RadioSection
+from tests.support.faulty_engine import PERIOD_NS, FaultyEngine, fault
 from tests.support.radio import engine, line
 from vnet import Node
 from vnet.radio import Radio, SendOptions
@@ -151,3 +152,27 @@ def test_the_checks_know_of_powers_and_rates(mac: bool, tmp_path: Path) -> None:
     for name in ("fading", "latency", "conservation", *(["medium"] if mac else [])):
         assert found[name] == "valid", (name, found)
     assert set(result.trace.column("bitrate_mbps").to_pylist()) == set(RATES_MBPS)
+
+
+def test_a_replayed_frame_has_the_addressee_power_and_rate_of_the_old_one() -> None:
+    """Frames are sent in turn to v1 alone, to all, and to all with less power at another rate."""
+    air = FaultyEngine([fault("DataReplay", nodes={"ids": ["v0"]}, age_s=0.1)], count=3, **PHYSICAL)
+    kinds = [SendOptions(to="v1"), None, SendOptions(19.0, 9.0)]
+    for period in range(9):
+        air.send(period * PERIOD_NS, 0, bytes([period]) * 20, options=kinds[period % 3])
+    rows = air.rows()
+    replayed = [row for row in rows if row["cause"] and row["attempt"] < 2]
+    assert len({row["seq"] for row in replayed}) == 8
+    for row in replayed:
+        kind = kinds[row["seq"] % 3]
+        assert bool(row["attempt"]) == (row["seq"] % 3 == 0)
+        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if kind and kind.power_dbm else (0, 6))
+    assert {packet.receiver for packet in air.delivered if not packet.packet.payload[0] % 3} == {1}
+
+
+def test_a_frame_to_nobody_leaves_no_columns_for_its_choices() -> None:
+    subject = engine(line(0, 50), **PHYSICAL)
+    subject.transmit(0, 0, [b"x", b"y"], {0: SendOptions(5.0, 12.0, to="v9")})
+    subject.drain()
+    (row,) = subject.trace.to_table().to_pylist()
+    assert not {"gain_db", "attempt"} & row.keys()
