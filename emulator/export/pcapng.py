@@ -3,8 +3,9 @@
 Each vehicle is an interface, with the frames that it sent (outbound, at the time they were enqueued or, with
 `[radio.mac]`, went on air) and those delivered to it (inbound, at their arrival). A packet consists of radiotap, a
 QoS data frame of 802.11 outside a BSS (as in 802.11p), LLC and SNAP with the ethertype 0x88B5 for local
-experiments, and the payload; a CAM or DENM may have the headers and the ethertype that it has on air. Payloads that
-the run has not kept, or that a fault has altered, are truncated (captured length < length); the digest is in the
+experiments, and the payload; a CAM or DENM may have the headers and the ethertype that it has on air. A frame to
+one vehicle asks for an acknowledgement, which is a packet of its own; retries have the retry bit. Payloads that the
+run has not kept, or that a fault has altered, are truncated (captured length < length); the digest is in the
 packet's comment. Frames without a node in range have no rows in the trace and are missing. Times are nanoseconds
 from the start of the run.
 
@@ -24,8 +25,11 @@ from numpy.typing import NDArray
 
 from emulator.export import geonetworking
 from emulator.export.geonetworking import Router
+from emulator.radio.dot11p import SIFS_NS
+from emulator.radio.unicast import BASIC_RATES_MBPS, ack_airtime_ns, ack_rate_mbps
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from vnet.errors import VnetError
+from vnet.types import Array, IntArray
 
 LINKTYPE_RADIOTAP = 127
 """Link type of the interfaces: 802.11 with radiotap."""
@@ -45,16 +49,24 @@ _MAX_RATE_MBPS = 127.5
 """Greatest rate in radiotap's field."""
 _BROADCAST = b"\xff" * 6
 """Address of all stations, also used as BSSID outside a BSS."""
+_QOS_DATA, _ACK, _RETRY = 0x0088, 0x00D4, 0x0800
+"""Frame control of QoS data and of acknowledgements, and its retry bit."""
+_NO_ACK = 0x0020
+"""QoS control of frames that nobody acknowledges."""
 
 
 @dataclass(frozen=True)
 class _Packet:
-    """A packet of the capture: interface (number of a vehicle), time, direction, and its row of the trace."""
+    """A packet of the capture: interface (number of a vehicle), time, direction, and its row of the trace.
+
+    If it `is_ack` it is the acknowledgement of the frame of that row.
+    """
 
     interface: int
     time_ns: int
     direction: int
     row: int
+    is_ack: bool
 
 
 def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> int:
@@ -71,11 +83,14 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
         described = _option(_NAME, node.encode()) + _option(_DESCRIPTION, f"vehicle {node}".encode())
         body = struct.pack("<HHI", LINKTYPE_RADIOTAP, 0, 0) + described + _option(_RESOLUTION, b"\x09")
         file.write(_block(_INTERFACE, body))
-    radiotaps = {rate: _radiotap(rate) for rate in np.unique(recorded.bitrate_mbps).tolist()}
-    comments = _Comments(recorded)
+    headers, comments = _Headers(recorded), _Comments(recorded)
     columns = [recorded.sender, recorded.seq, recorded.column("size_bytes")]
     count = 0
     for packet in _packets(recorded):
+        count += 1
+        if packet.is_ack:
+            file.write(_packet_block(packet, headers.of_ack(packet.row), b"", 0, comments.of(packet)))
+            continue
         sender, seq, size_bytes = (int(column[packet.row]) for column in columns)
         kept = recorded.payloads
         payload = None
@@ -86,9 +101,8 @@ def write_pcapng(recorded: OpenedRun, file: BinaryIO, as_its: bool = False) -> i
             routed = routers.packet(sender, seq, int(recorded.sent_ns[packet.row]), payload)
         if routed is not None:
             ethertype, payload, size_bytes = geonetworking.ETHERTYPE, routed, len(routed)
-        header = radiotaps[float(recorded.bitrate_mbps[packet.row])] + _frame_header(sender, seq, ethertype)
+        header = headers.of_frame(packet.row, ethertype)
         file.write(_packet_block(packet, header, payload or b"", size_bytes, comments.of(packet)))
-        count += 1
     return count
 
 
@@ -98,15 +112,27 @@ def _packets(recorded: RecordedRun) -> Iterator[_Packet]:
     # A frame that a fault duplicates at a receiver was sent only once.
     sent = sent[~(recorded.caused_by("duplicate") & (recorded.copy > 0))[sent]]
     delivered = np.flatnonzero(recorded.outcome_is("delivered"))
-    row = np.concatenate([sent, delivered])
-    interface = np.concatenate([recorded.sender[sent], recorded.receiver[delivered]])
     left_ns = recorded.sent_ns[sent] if recorded.scenario.radio.mac is None else _on_air_ns(recorded, sent)
-    time_ns = np.concatenate([left_ns, recorded.arrival_ns[delivered]])
-    direction = np.repeat([_OUTBOUND, _INBOUND], [len(sent), len(delivered)])
-    order = np.argsort(time_ns, kind="stable")
-    columns = (column[order].tolist() for column in (interface, time_ns, direction, row))
-    for fields in zip(*columns, strict=True):
+    answered = np.flatnonzero(recorded.ack_on_air_ns >= 0)
+    acked = answered[recorded.acked[answered]]
+    acked_ns = recorded.ack_on_air_ns[acked] + _ack_airtimes_ns(recorded.bitrate_mbps[acked])
+    parts = (
+        (recorded.sender[sent], left_ns, _OUTBOUND, sent, False),
+        (recorded.receiver[delivered], recorded.arrival_ns[delivered], _INBOUND, delivered, False),
+        (recorded.receiver[answered], recorded.ack_on_air_ns[answered], _OUTBOUND, answered, True),
+        (recorded.sender[acked], acked_ns, _INBOUND, acked, True),
+    )
+    filled = [[np.broadcast_to(column, len(part[0])) for column in part] for part in parts]
+    columns = [np.concatenate(column) for column in zip(*filled, strict=True)]
+    order = np.argsort(columns[1], kind="stable")
+    for fields in zip(*(column[order].tolist() for column in columns), strict=True):
         yield _Packet(*fields)
+
+
+def _ack_airtimes_ns(bitrate_mbps: Array) -> IntArray:
+    """Return the airtimes (n,) of the acknowledgements of frames at these bit rates."""
+    rates, index = np.unique(bitrate_mbps, return_inverse=True)
+    return np.array([ack_airtime_ns(rate) for rate in rates.tolist()], np.int64)[index]
 
 
 def _on_air_ns(recorded: RecordedRun, rows: NDArray[np.intp]) -> NDArray[np.int64]:
@@ -132,6 +158,10 @@ class _Comments:
         copy = int(recorded.copy[row])
         name = recorded.node_ids[int(recorded.sender[row])]
         text = f"{name} frame {int(recorded.seq[row])}{f', copy {copy}' if copy else ''}"
+        if packet.is_ack:
+            return f"acknowledgement of {text}"
+        attempt = int(recorded.attempt[row])
+        text += f"; to {recorded.node_ids[int(recorded.receiver[row])]}, attempt {attempt}" if attempt else ""
         text += f"; payload {int(recorded.digest[row]):016x}"
         text += f"; {self._cause[row]}" if self._cause[row] else ""
         return text if packet.direction == _INBOUND else f"{text}; {self._outcomes(int(recorded.emission[row]))}"
@@ -166,12 +196,36 @@ def _radiotap(bitrate_mbps: float) -> bytes:
     return struct.pack("<BxHI", 0, 8 + len(fields), present) + fields
 
 
-def _frame_header(sender: int, seq: int, ethertype: int) -> bytes:
-    """Return a QoS data header from `sender` to all stations, outside a BSS, without acknowledgement; LLC, SNAP."""
-    address = b"\x02\x00" + struct.pack(">I", sender + 1)  # locally administered
-    control = struct.pack("<HH", 0x0088, 0)
-    mac = control + _BROADCAST + address + _BROADCAST + struct.pack("<HH", (seq & 0xFFF) << 4, 0x0020)
-    return mac + b"\xaa\xaa\x03\x00\x00\x00" + struct.pack(">H", ethertype)
+class _Headers:
+    """Radiotap and 802.11 headers of the packets of a run."""
+
+    def __init__(self, recorded: RecordedRun) -> None:
+        self._recorded = recorded
+        rates = np.unique(recorded.bitrate_mbps).tolist()
+        self._radiotaps = {rate: _radiotap(rate) for rate in (*rates, *BASIC_RATES_MBPS)}
+
+    def of_frame(self, row: int, ethertype: int) -> bytes:
+        """Return the headers of the frame of a row: radiotap, QoS data outside a BSS, LLC, SNAP."""
+        recorded = self._recorded
+        rate, attempt = float(recorded.bitrate_mbps[row]), int(recorded.attempt[row])
+        control, duration_us, receiver, qos = _QOS_DATA, 0, _BROADCAST, _NO_ACK
+        if attempt:
+            control |= _RETRY if attempt > 1 else 0
+            duration_us = -(-(SIFS_NS + ack_airtime_ns(rate)) // 1000)
+            receiver, qos = _address(int(recorded.receiver[row])), 0
+        mac = struct.pack("<HH", control, duration_us) + receiver + _address(int(recorded.sender[row])) + _BROADCAST
+        mac += struct.pack("<HH", (int(recorded.seq[row]) & 0xFFF) << 4, qos)
+        return self._radiotaps[rate] + mac + b"\xaa\xaa\x03\x00\x00\x00" + struct.pack(">H", ethertype)
+
+    def of_ack(self, row: int) -> bytes:
+        """Return the acknowledgement of the frame of a row, with radiotap."""
+        rate = ack_rate_mbps(float(self._recorded.bitrate_mbps[row]))
+        return self._radiotaps[rate] + struct.pack("<HH", _ACK, 0) + _address(int(self._recorded.sender[row]))
+
+
+def _address(number: int) -> bytes:
+    """Return the address of a vehicle: locally administered."""
+    return b"\x02\x00" + struct.pack(">I", number + 1)
 
 
 def _packet_block(packet: _Packet, header: bytes, payload: bytes, size_bytes: int, comment: str) -> bytes:

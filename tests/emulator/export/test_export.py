@@ -163,6 +163,28 @@ def test_packets_are_frames_of_802_11p_whose_payload_is_cut_off(capture: bytes, 
         assert struct.unpack_from("<H", mac, 22)[0] >> 4 == int(seq.split()[0]) % 4096
 
 
+def test_a_frame_to_one_vehicle_has_its_address_retries_and_acknowledgements(tmp_path: Path) -> None:
+    recorded = exchange_run(tmp_path, COPYING)
+    file = io.BytesIO()
+    write_pcapng(recorded, file)
+    rows = [row for row in recorded.trace.to_pylist() if not row["cause"].startswith("duplicate")]
+    address = {name: b"\x02\x00\0\0\0" + bytes([number + 1]) for name, number in recorded.number.items()}
+    data, acks = set(), set()
+    for packet in packets(file.getvalue()):
+        who, mac = (recorded.node_ids[packet["interface"]], packet["direction"]), packet["bytes"][14:]
+        control, duration_us = struct.unpack_from("<HH", mac)
+        if control == 0x00D4:
+            assert (duration_us, len(mac), packet["length"]) == (0, 10, 24) and "ack" in packet["comment"]
+            acks.add((*who, packet["time_ns"], mac[4:]))
+        elif packet["direction"] == 2:
+            assert (control & 0xFF, duration_us, mac[16:22], mac[24:26]) == (0x88, 32 + 64, b"\xff" * 6, b"\0\0")
+            data.add((*who, packet["time_ns"], mac[4:10], bool(control & 0x0800)))
+    assert data == {(r["sender"], 2, r["on_air_ns"], address[r["receiver"]], r["attempt"] > 1) for r in rows}
+    sent = {(r["receiver"], 2, r["ack_on_air_ns"], address[r["sender"]]) for r in rows if r["ack_on_air_ns"]}
+    heard = {(r["sender"], 1, r["ack_on_air_ns"] + 64_000, address[r["sender"]]) for r in rows if r["acked"]}
+    assert len(heard) > 30 and acks == sent | heard
+
+
 async def changes_its_rate(node: Any) -> None:
     """Send frames by turns at the scenario's bit rate, and at 27 Mbit/s."""
     async for fix in node.gnss:
