@@ -90,6 +90,11 @@ def _number(value: float) -> float:
         return math.nan
 
 
+def _can_be_name(to: object) -> bool:
+    """Return whether it is a text that can be sent: UTF-8 has no lone surrogates."""
+    return isinstance(to, str) and to.encode(errors="ignore").decode() == to
+
+
 class Radio:
     """The vehicle's radio: sends broadcasts to all nodes in range or frames to one, and receives theirs.
 
@@ -144,7 +149,7 @@ class Radio:
             raise ValueError(
                 f"send({shown(to)}, …): only with [radio.mac] a frame is acknowledged; use broadcast()"
             )
-        if not isinstance(to, str) or to == self._node_id:
+        if not _can_be_name(to) or to == self._node_id:
             raise ValueError(f"send({shown(to)}, …): the name of another vehicle is expected")
         content = self._checked_payload("send", payload)
         power_dbm, rate_mbps = self._checked_power("send", power_dbm), self._checked_rate("send", rate_mbps)

@@ -176,3 +176,11 @@ def test_a_frame_to_nobody_leaves_no_columns_for_its_choices() -> None:
     subject.drain()
     (row,) = subject.trace.to_table().to_pylist()
     assert not {"gain_db", "attempt"} & row.keys()
+
+
+@pytest.mark.parametrize("to", ["v01", "\ud800", None, 2, b"v02"])
+def test_what_can_be_no_other_vehicle_s_name_is_a_value_error(to: Any) -> None:
+    radio, sink = radio_of(**PHYSICAL)
+    with pytest.raises(ValueError, match="the name of another vehicle is expected"):
+        radio.send(to, b"x").send(None)
+    assert not sink.sent
