@@ -174,7 +174,7 @@ class _Simulation:
         finally:
             asyncio.set_event_loop(None)
             self.loop.close()
-            self._host.discard_killed()
+            self._host.discard_abandoned()
             self._emulation.costs.take_programs(self._meter.cpu_ns, self._meter.wake_ups)
             if (ordered := self._host.mail.ordered) is not None:
                 self._emulation.orders.steps = ordered.steps

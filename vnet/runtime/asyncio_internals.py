@@ -100,6 +100,14 @@ def abandon(task: asyncio.Task[Any]) -> None:
         coroutine.close()
 
 
+def abandon_pending(tasks: Sequence[asyncio.Task[Any]]) -> list[asyncio.Task[Any]]:
+    """Abandon those of the tasks that are pending, and return them."""
+    pending = [task for task in tasks if not task.done()]
+    for task in pending:
+        abandon(task)
+    return pending
+
+
 def close_abandoned(task: asyncio.Task[Any]) -> None:
     """Close an abandoned task's coroutine, whose loop is closed, whatever it raises.
 
@@ -187,6 +195,15 @@ def suspended_at(task: asyncio.Task[Any]) -> Iterator[str]:
     while (frame := getattr(coroutine, "cr_frame", None)) is not None:
         yield f"{frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_qualname}"
         coroutine = coroutine.cr_await
+
+
+def stacks_of(tasks: Sequence[asyncio.Task[Any]]) -> str:
+    """Return the stacks of suspended tasks, as text."""
+    lines = []
+    for task in tasks:
+        lines.append(f"task {task.get_name()}:")
+        lines += [f"  {place}" for place in suspended_at(task)]
+    return "\n".join(lines)
 
 
 async def all_done(tasks: Sequence[asyncio.Task[Any]]) -> None:

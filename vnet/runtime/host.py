@@ -82,6 +82,7 @@ class Host:
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
+        self._left: list[asyncio.Task[Any]] = []
         self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)), on_line)
 
     def _node(self, welcome: wire.Welcome) -> Node:
@@ -189,9 +190,7 @@ class Host:
         self.news.drop(node)
         if killed:
             self._unhandled.silence(gone)
-            self._killed[gone] = self._tasks_of(gone)
-            for task in self._killed[gone]:
-                asyncio_internals.abandon(task)
+            self._killed[gone] = asyncio_internals.abandon_pending(self._tasks_of(gone))
             self._hold()
         else:
             self._stopped_ns[gone] = time_ns
@@ -352,11 +351,7 @@ class Host:
 
     def stacks(self, node: str) -> str:
         """Stacks of the tasks of a node, as text."""
-        lines = []
-        for task in self._tasks_of(self.nodes[node]):
-            lines.append(f"task {task.get_name()}:")
-            lines += [f"  {place}" for place in asyncio_internals.suspended_at(task)]
-        return "\n".join(lines)
+        return asyncio_internals.stacks_of(self._tasks_of(self.nodes[node]))
 
     def _cancel_all(self) -> list[asyncio.Task[Any]]:
         live = [(task, owner) for task, owner in self._tasks.items() if not task.done()]
@@ -385,12 +380,13 @@ class Host:
                     break
                 except SystemExit as leave:
                     self.end_exited(leave)
+        self._left = asyncio_internals.abandon_pending(tasks)
         del tasks  # it would keep their exceptions from being discarded
         self._settle()
 
-    def discard_killed(self) -> None:
-        """Discard what is left of killed programs, after the loop has been closed (simulated)."""
-        for task in [task for tasks in self._killed.values() for task in tasks]:
+    def discard_abandoned(self) -> None:
+        """Discard what is left of programs that were killed or wait at the end, after the loop has been closed."""
+        for task in [task for tasks in (*self._killed.values(), self._left) for task in tasks]:
             asyncio_internals.close_abandoned(task)
 
     async def cancel(self) -> None:

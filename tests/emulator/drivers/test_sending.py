@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 from typing import Any
 
 import pytest
@@ -21,6 +22,7 @@ SENDS = "tests.emulator.drivers.test_sending:sends"
 FORGETS = "tests.emulator.drivers.test_sending:forgets"
 ASKS = "tests.emulator.drivers.test_sending:asks"
 GIVES_UP = "tests.emulator.drivers.test_sending:gives_up"
+SAYS_GOODBYE = "tests.emulator.drivers.test_sending:says_goodbye"
 ASKS_NOBODY = "tests.emulator.drivers.test_sending:asks_nobody"
 
 
@@ -66,6 +68,15 @@ async def gives_up(node: Node) -> None:
         return
     async for _ in node.gnss:
         pass
+
+
+async def says_goodbye(node: Node) -> None:
+    """Send once more when the run is over."""
+    try:
+        async for _ in node.radio:
+            pass
+    finally:
+        await node.radio.send("v02" if node.id != "v02" else "v01", b"bye")
 
 
 async def asks_nobody(node: Node) -> None:
@@ -141,6 +152,13 @@ def test_a_name_that_no_vehicle_has_is_not_acknowledged() -> None:
     said = [event.details["details"] for event in emulation.folder.events if event.kind == "event"]
     assert said == [{"delivered": False, "attempts": 0}] * 5
     assert not len(emulation.engine.trace)
+
+
+def test_a_send_that_outlasts_the_run_is_dropped_without_a_word(caplog: pytest.LogCaptureFixture) -> None:
+    emulation = run_together(scenario(SAYS_GOODBYE))
+    gc.collect()
+    assert not caplog.records
+    assert not [event for event in emulation.folder.events if event.kind == "unhandled"]
 
 
 def test_a_result_for_a_paused_vehicle_waits_and_the_run_goes_on() -> None:
