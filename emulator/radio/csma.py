@@ -38,7 +38,7 @@ from typing import NamedTuple
 
 from emulator.radio.congestion import CongestionControl, congestion_control_of
 from emulator.radio.dot11p import AIFSN_AND_CW, DETECTION_NS, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
-from emulator.radio.frames import Frame
+from emulator.radio.frames import BROADCAST, Frame
 from emulator.radio.mac import Throttle
 from emulator.radio.medium import WINDOW_NS, Medium
 from emulator.radio.outcomes import Outcome
@@ -350,6 +350,15 @@ class Csma:
         assert self._deferral is not None
         self.judge(frame)
         self._deferral.hear(frame, now_ns)
+        if frame.to == BROADCAST:
+            return
+        for node, station in self._counting.items():  # who has read it without sensing it counts, and stops
+            reserved = self._deferral.reserved_ns(node) > now_ns
+            if reserved and not station.busy and station.access_ns > now_ns:
+                station.slots -= max(0, (now_ns - station.from_ns) // SLOT_NS + 1)
+                station.from_ns = self._free_ns(node, int(self.medium.idle_ns[node]))
+                if station.contends:
+                    self._plan(station.access_ns, ACCESS, station)
 
     def _back_off(self, station: _Station, frame: Frame, now_ns: int, attempts: int = 0) -> None:
         """Draw a backoff after a frame, which had so many attempts without an acknowledgement."""

@@ -150,6 +150,25 @@ def test_others_keep_silent_until_an_acknowledgement_that_they_cannot_sense_has_
         assert rest == 0 and 0 <= slots <= 15
 
 
+def test_a_backoff_that_counts_stops_where_a_frame_is_read_and_not_sensed() -> None:
+    """v2 has a frame behind it, and so a backoff; it reads the frame of v0 below its carrier sense."""
+    radio = {**PHYSICAL, "mac": {"carrier_sense_dbm": -60.0}, "receiver": {"min_rssi_dbm": -82.0}}
+    silent_ns, waited = SIFS_NS + ACK_NS + AIFS_NS, 0
+    for start_ns in range(330_000, 420_000, 5_000):
+        subject = engine(line(0, -50, 300), start_ns, **radio)
+        subject.transmit(0, 2, [bytes(200)])
+        subject.transmit(start_ns, 0, [bytes(20)], {0: SendOptions(to="v1")})
+        subject.transmit(start_ns, 2, [bytes(200)])
+        subject.drain()
+        rows = rows_of(subject)
+        left_ns = next(row["left_ns"] for row in rows if row["sender"] == "v0")
+        after_ns = next(row["on_air_ns"] for row in rows if (row["sender"], row["seq"]) == ("v2", 1)) - left_ns
+        slots, rest = divmod(after_ns - silent_ns, SLOT_NS)
+        assert after_ns <= 0 or (rest == 0 and 0 <= slots <= 15)
+        waited += after_ns > 0
+    assert waited > 5
+
+
 def test_no_frame_overlaps_an_acknowledgement_where_all_can_read_its_frame() -> None:
     subject = engine(line(0, 30, 60, 90, 120), 5, **PHYSICAL)
     rng = np.random.default_rng(5)
