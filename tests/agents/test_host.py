@@ -1,5 +1,7 @@
 """An agent's attachment: what comes from the emulator is taken as it is meant, and anything else is dropped."""
 
+import asyncio
+import queue
 from contextlib import ExitStack, nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -7,8 +9,11 @@ from typing import Any
 import pytest
 
 from agents.attachment import Attachment
+from agents.host import _RealTimeAgent
+from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
 from vnet.transport import wire
+from vnet.transport.send_results import WireSendResult
 
 
 def attachment() -> Attachment:
@@ -54,3 +59,26 @@ def test_an_emulator_of_another_version_is_told_in_one_line(monkeypatch: pytest.
         TransportError, match=r"the emulator speaks version 1 of the messages, this agent version 2"
     ):
         attached.join(5.0)
+
+
+def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
+    """What nobody awaits waits for the agent's next turn, up to a second later."""
+    welcome = emulation_of(scenario_of((), "agents.beacon:main", radio={"mac": {}})).welcome("v01", b"n")
+    said: list[Any] = []
+    attached: Any = SimpleNamespace(inbox=queue.SimpleQueue(), nonce=b"n", say=said.append, publish=said.append)
+    attached.decode = lambda item: wire.decode_rx(item[0])
+
+    async def awaits_a_result() -> None:
+        agent = _RealTimeAgent(attached, [welcome], {}, None)
+        agent._loop, agent._started = asyncio.get_running_loop(), True  # type: ignore[assignment]
+        result = wire.encode(wire.Batch([], 0, [], results=[WireSendResult("v01", 0, 1, True, 2)]))
+        agent._wake(result)
+        assert not agent._wake_pending
+        sending = asyncio.create_task(agent._host.nodes["v01"].radio.send("v02", b"x"))
+        await asyncio.sleep(0)
+        attached.inbox.put((result, 0))
+        agent._wake(result)
+        assert agent._wake_pending
+        assert await sending == (True, 2)
+
+    asyncio.run(awaits_a_result())
