@@ -33,6 +33,11 @@ class NewsFeed:
             if self._up[message.node]:
                 self._waiting.setdefault(message.node, []).append(message)
 
+    def repeat(self, results: Iterable[WireSendResult]) -> None:
+        """Put results that a process has missed where it will find them again."""
+        for result in results:
+            self._waiting.setdefault(result.node, []).append(result)
+
     def firsts(self) -> Iterator[tuple[str, int]]:
         """Yield each node for which something has come, and the time in ns of the first."""
         for node, arrivals in self._waiting.items():

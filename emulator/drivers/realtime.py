@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import check_ownership, wire_packet
 from emulator.radio.engine import Delivery
 from vnet.transport import lateness, wire
+from vnet.transport.send_results import WireSendResult
 from vnet.units import NS_PER_S
 
 WORST_PROCESSES = 8
@@ -23,11 +24,19 @@ WORST_SECONDS = 20
 """Number of seconds, those with the most late deliveries, that an event names."""
 
 
+class _Sent(NamedTuple):
+    """Contents of a batch that are dealt with if its process has missed it."""
+
+    deliveries: list[Delivery]
+    results: list[WireSendResult]
+
+
 class RealTime:
     """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
 
-    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`. Processes
-    come and go with faults: do what `take_actions` says, and tell `returned` when one is there again.
+    Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`, but for the
+    results of frames to single vehicles: they go out again, because programs await them. Processes come and go with
+    faults: do what `take_actions` says, and tell `returned` when one is there again.
     """
 
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
@@ -36,7 +45,7 @@ class RealTime:
         self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
         self._batch_seq = dict.fromkeys(self._nodes, 0)
         self._frames_seq = dict.fromkeys(self._nodes, 0)
-        self._unacknowledged: dict[str, dict[int, list[Delivery]]] = {process_id: {} for process_id in self._nodes}
+        self._unacknowledged: dict[str, dict[int, _Sent]] = {process_id: {} for process_id in self._nodes}
         self._lateness: dict[tuple[str, int], Sequence[int]] = {}  # by process and incarnation
         self._late_in: Counter[int] = Counter()  # how many deliveries were late, by the second that reported them
         self._present = {
@@ -106,7 +115,9 @@ class RealTime:
         for first, last in message.missed:
             self.gaps += 1
             for seq in [seq for seq in waiting if first <= seq <= last]:
-                self._lose(waiting.pop(seq))
+                missed = waiting.pop(seq)
+                self._lose(missed.deliveries)
+                self._news.repeat(missed.results)
         for seq in [seq for seq in waiting if seq < message.received_seq]:
             del waiting[seq]
 
@@ -187,7 +198,6 @@ class RealTime:
         seq = self._batch_seq[process_id]
         self._batch_seq[process_id] = seq + 1
         deliveries, fixes = self._packets.pop(process_id, []), self._fixes.pop(process_id, [])
-        self._unacknowledged[process_id][seq] = deliveries
         node_ids = self._emulation.world.node_ids
         packets = [wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
         clocks, self._clocks[process_id] = self._clocks[process_id], []
@@ -195,6 +205,7 @@ class RealTime:
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
         results, messages = self._news.take(self._nodes[process_id])
+        self._unacknowledged[process_id][seq] = _Sent(deliveries, results)
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
@@ -209,8 +220,8 @@ class RealTime:
         """End of the run: what nobody acknowledged is lost in transport; say how late deliveries were."""
         self._emulation.finish(self._emulation.duration_ns)
         for waiting in self._unacknowledged.values():
-            for deliveries in waiting.values():
-                self._lose(deliveries)
+            for sent in waiting.values():
+                self._lose(sent.deliveries)
         if self.gaps:
             self._emulation.folder.event(self._emulation.duration_ns, "transport_gap", count=self.gaps)
         counts = [sum(column) for column in zip(*self._lateness.values(), strict=True)]

@@ -62,7 +62,7 @@ def test_an_emulator_of_another_version_is_told_in_one_line(monkeypatch: pytest.
 
 
 def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
-    """What nobody awaits waits for the agent's next turn, up to a second later."""
+    """Other batches wait until the program asks for them, or for a second."""
     welcome = emulation_of(scenario_of((), "agents.beacon:main", radio={"mac": {}})).welcome("v01", b"n")
     said: list[Any] = []
     attached: Any = SimpleNamespace(inbox=queue.SimpleQueue(), nonce=b"n", say=said.append, publish=said.append)

@@ -26,6 +26,21 @@ def started(*faults: dict[str, Any]) -> tuple[RealTime, Emulation]:
     return realtime, emulation
 
 
+def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
+    plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"}, radio={"mac": {}})
+    realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
+    realtime.start(0)
+    traffic = wire.Traffic([wire.Frame("v01", b"x", to="v02", number=7)])
+    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], traffic))
+    batch = realtime.due(100 * MS)["v01"]
+    (result,) = batch.results
+    assert (result.number, result.delivered) == (7, True)
+    assert "v01" not in realtime.due(101 * MS)
+    realtime.receive(150 * MS, "v01", wire.Frames(b"n", 1, batch.seq + 1, [(batch.seq, batch.seq)], wire.Traffic()))
+    assert realtime.due(151 * MS)["v01"].results == [result]
+    assert "v01" not in realtime.due(152 * MS)
+
+
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
     return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
 
