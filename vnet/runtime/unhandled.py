@@ -116,7 +116,7 @@ class UnhandledExceptions:
         for key, failure in list(self._failures.items()):
             future = failure.future()
             if owner in (None, failure.owner) and future is not None and asyncio_internals.is_unretrieved(future):
-                del self._failures[key]
+                self._failures.pop(key, None)
                 self._held.append((failure, asyncio_internals.disclaim(future)))
         held, self._held = self._held, []
         for failure, error in held:
@@ -191,7 +191,7 @@ class UnhandledExceptions:
             failure = self._failures.get(id(each))
             if failure is not None and (each is future or asyncio_internals.error_of(each) is error):
                 if each is future:
-                    del self._failures[id(each)]
+                    self._failures.pop(id(each), None)  # `_forget_retrieved` may have, in another thread
                 return failure
         owner = current_node.get()
         return _Failure(_nothing, self._now_ns(owner), owner, "in a future")

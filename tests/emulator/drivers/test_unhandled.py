@@ -21,6 +21,7 @@ from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Verdict
 from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
 from vnet.node import Node
+from vnet.runtime.unhandled import UnhandledExceptions
 
 Run = Callable[[Any], Emulation]
 held: list[object] = []
@@ -448,3 +449,22 @@ def test_a_program_that_stops_the_loop_has_crashed(run: Run) -> None:
     events = run(scenario_of([], f"{__name__}:stops_the_loop", vehicles=2)).folder.events
     crashes = [(event.node, event.details["error"][:25]) for event in events if event.kind == "crashed"]
     assert crashes == [("v01", "RuntimeError: loop.stop()"), ("v02", "RuntimeError: loop.stop()")]
+
+
+class ForgottenMeanwhile(dict[int, Any]):
+    """Failures of which another thread forgets one as soon as it has been looked up."""
+
+    def get(self, key: int, default: Any = None) -> Any:
+        return self.pop(key, default)
+
+
+def test_a_failure_that_another_thread_forgets_meanwhile_is_told_all_the_same() -> None:
+    told = UnhandledExceptions(lambda node: 5, "v01", lambda node, line: None)
+    loop = asyncio.new_event_loop()
+    future = loop.create_future()
+    future.set_exception(ValueError("x"))
+    told._note(future, None, "in a future")
+    told._failures = ForgottenMeanwhile(told._failures)
+    assert told._unhandled({"future": future, "exception": future.exception()}) is False
+    assert [each.error for each in told.take()] == ["ValueError: x"]
+    loop.close()
