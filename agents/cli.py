@@ -23,6 +23,9 @@ from vnet.runtime.program_path import search_programs_in
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
 
+LONGEST_TIMEOUT_S = 86_400.0
+"""Longest time for which an agent waits to connect or to be welcomed: a day."""
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
@@ -100,6 +103,8 @@ def agent(
         for name in [run, *node]:
             if not is_segment(name):
                 raise VnetError(f"{name!r}: names are letters, digits, '_', '.', '-', at most 64")
+        _check_timeout("--connect-timeout-s", connect_timeout_s)
+        _check_timeout("--join-timeout-s", join_timeout_s)
         login = None if credentials is None else Credentials.load(credentials)
         debugger = None if debug is None or debug_socket is None else _debugger(debug, debug_socket)
         run_agent(connect, run, node, login, join_timeout_s, Disks(files), debugger, connect_timeout_s)
@@ -108,6 +113,12 @@ def agent(
         sys.exit(2 if isinstance(error, ProgramError) else 3)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+def _check_timeout(option: str, timeout_s: float) -> None:
+    """Raise VnetError for a time that cannot be waited."""
+    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
+        raise VnetError(f"{option} {timeout_s:g}: a time above 0 s, and up to {LONGEST_TIMEOUT_S:g} s, is needed")
 
 
 def _debugger(target: str, socket: Path) -> NodeDebugger:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
+from vnet.runtime import interrupts
 from vnet.runtime.ahead import RunAhead
 from vnet.runtime.disks import Disks
 from vnet.runtime.forced_end import end_within
@@ -54,7 +55,8 @@ def run_agent(
     """
     with ExitStack() as stack:
         set_time_slice(PROMPT_SLICE_NS)  # Zenoh's threads keep it
-        session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS, connect_timeout_s))
+        with interrupts.ended_by_system():  # Zenoh connects in code of its own, where no handler of Python's runs
+            session = stack.enter_context(open_client(endpoint, credentials, LEASE_MS, connect_timeout_s))
         attachment = Attachment(session, run, nodes, stack)
         stack.callback(attachment.write_total)
         stack.callback(end_within)

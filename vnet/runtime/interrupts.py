@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -47,6 +48,26 @@ def ended_at_once() -> Iterator[None]:
         yield
     finally:
         raise_from_now_on()
+
+
+@contextmanager
+def ended_by_system() -> Iterator[None]:
+    """Have Ctrl-C and SIGTERM end this process at once within the block, also in code that is not Python's.
+
+    There is nothing to close yet. Changes nothing where they are ignored, or outside of the main thread.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handled = {number: handler for number, handler in handlers.items() if handler not in (signal.SIG_IGN, None)}
+    for number in handled:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number, handler in handled.items():
+            signal.signal(number, handler)
 
 
 def hold() -> None:
