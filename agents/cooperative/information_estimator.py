@@ -12,6 +12,8 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
 
@@ -71,6 +73,12 @@ def as_sent(information: Information) -> Five:
     """Return the five numbers of `information` with the precision in which frames carry them."""
     a, b, d, x, y = _SENT.unpack(_SENT.pack(*information.numbers))
     return a, b, d, x, y
+
+
+@lru_cache(maxsize=256)  # a vehicle hears the same others for many periods
+def _out_neighbours_by_name(heard: frozenset[str], out_neighbours: frozenset[str]) -> Mapping[str, bool]:
+    """Return whether each of `heard` is one of `out_neighbours`, for as many as a frame can name."""
+    return MappingProxyType({name: name in out_neighbours for name in sorted(heard)[:MAX_HEARD]})
 
 
 def _trace(information: Five) -> float:
@@ -177,10 +185,7 @@ class InformationEstimator:
 
     def agree(self) -> None:
         """Do a round of consensus, and fuse, with the frames of this period."""
-        frames = {
-            sender: frame for sender, frame in sorted(self._frames.items()) if self._is_current(sender, frame)
-        }
-        self._frames = {}
+        frames = self._current_frames()
         # What this vehicle says itself is the first row of all.
         own = plain_moments(*self._prior)
         table = _joined([packed_numbers(self._prior, self._increment, own), *[f.numbers for f in frames.values()]])
@@ -204,14 +209,19 @@ class InformationEstimator:
             self.own.absorb(Information(tuple(pooled.tolist())))
         self.fused_m = self.own.estimate_m
 
-    def _is_current(self, sender: str, frame: InformationFrame) -> bool:
-        """Tell whether a frame is of this period: what it says is of one instant, and is fused then or never."""
-        if sender not in self._admission.ids or (self._neighbours is not None and sender not in self._neighbours):
-            return False
-        if frame.fix_time_ns == self._now_ns:
-            return True
-        self.rejected["late"] += 1
-        return False
+    def _current_frames(self) -> dict[str, InformationFrame]:
+        """Take the frames of this period, by sender: what one says is of one instant, fused then or never."""
+        ids, neighbours, now_ns = self._admission.ids, self._neighbours, self._now_ns
+        frames = {}
+        for sender in sorted(self._frames):
+            if sender in ids and (neighbours is None or sender in neighbours):
+                frame = self._frames[sender]
+                if frame.fix_time_ns == now_ns:
+                    frames[sender] = frame
+                else:
+                    self.rejected["late"] += 1
+        self._frames = {}
+        return frames
 
     def _believed(self, frames: Sequence[InformationFrame], own: Five, table: Array) -> list[bool] | None:
         """Tell which of the frames (n,) are plausible, None if all are.
@@ -350,7 +360,7 @@ class InformationEstimator:
     def compose(self, fix: Fix, max_payload: int) -> InformationFrame:
         """Compose the frame with the newest fix: names, then increments to pass on, while `max_payload` lasts."""
         share = self._share
-        heard = {name: name in share.out_neighbours for name in sorted(share.heard)[:MAX_HEARD]}
+        heard = _out_neighbours_by_name(share.heard, share.out_neighbours)
         limit = min(self._options.relay_increments, room(len(heard), max_payload))
         return InformationFrame(
             name=self.name,

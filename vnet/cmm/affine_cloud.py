@@ -64,6 +64,7 @@ class AffineCloud:
         # Deviations from the origin, noise, a row of ones.
         self._basis = np.ones((self._size + DIFFUSING + 1, count))
         self._unmoved = np.eye(self._size, self._size + DIFFUSING + 2)
+        self._affine = np.zeros((self._size + 2, self._size + DIFFUSING + 1))  # what `weigh` carries out
         self._linear = self._unmoved
         self.covariance = np.zeros((self._size, self._size))
         self._is_diffused = False
@@ -111,7 +112,7 @@ class AffineCloud:
         seen = measure.dot(self._linear)  # the map, the origin and the mean as they are measured
         seen[:, -2:] -= value[:, None]
         self._linear -= gain.dot(seen)
-        affine = np.zeros((size + 2, size + DIFFUSING + 1))
+        affine = self._affine
         affine[:size, :-1] = self._linear[:, :-2]
         affine[size:] = (_ROOT_HALF * root).dot(seen[:, :-1])
         self._carry_out(affine)
@@ -139,9 +140,9 @@ class AffineCloud:
         self._basis = spare
 
     def _normalized(self) -> Array:
-        self._log_weight -= self._log_weight.max()
+        self._log_weight -= np.maximum.reduce(self._log_weight)
         weight = np.exp(self._log_weight)
-        weight /= weight.sum()
+        weight /= np.add.reduce(weight)
         return np.asarray(weight)
 
     def _take_moments(self, origin: Array) -> None:
@@ -149,8 +150,7 @@ class AffineCloud:
         off = self._basis[: self._size]
         mean_off = off.dot(self.weight)
         weighted = _scratch.of(self._basis)[: self._size]
-        for row, out in zip(off, weighted, strict=True):  # in half the time of one call for all rows
-            np.multiply(row, self.weight, out=out)
+        np.multiply(off, self.weight, out=weighted)
         self.covariance = weighted.dot(off.T) - mean_off[:, None] * mean_off
         for axis in range(DIFFUSING):
             self.covariance[axis, axis] += LEAST_VARIANCE_M2
