@@ -14,11 +14,15 @@ LARGEST_M_S2 = 1e6
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
-    """Request of the program of `node`: an acceleration, or a change by `lane` lanes, 1 to the left."""
+    """Request of the program of `node`: an acceleration, or a change by `lane` lanes, 1 to the left.
+
+    `release` leaves the speed to the vehicle: to SUMO's driver where there is one, else it is kept.
+    """
 
     node: str
     acceleration_m_s2: Annotated[float, msgspec.Meta(ge=-LARGEST_M_S2, le=LARGEST_M_S2)] | None = None
     lane: Annotated[int, msgspec.Meta(ge=-1, le=1)] = 0
+    release: bool = False
 
     @property
     def is_sound(self) -> bool:
@@ -26,10 +30,12 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
         return self.acceleration_m_s2 is None or math.isfinite(self.acceleration_m_s2)
 
 
-def checked_action(node: str, can_drive: bool, acceleration_m_s2: float | None, lane: int) -> Action:
+def checked_action(
+    node: str, can_drive: bool, acceleration_m_s2: float | None, lane: int, release: bool = False
+) -> Action:
     """Return an action of `node`. Raise ValueError for one that is none, and if programs do not drive."""
     if not can_drive:
-        raise ValueError('drive(…): programs drive only with [network] kind = "driven"')
+        raise ValueError('drive(…): programs drive only with [network] kind = "driven", or with step = true')
     asked = acceleration_m_s2
     if asked is not None:
         try:
@@ -41,6 +47,8 @@ def checked_action(node: str, can_drive: bool, acceleration_m_s2: float | None, 
             raise ValueError(f"drive(acceleration_m_s2={shown(acceleration_m_s2)}): {text}")
     if lane not in (-1, 0, 1):
         raise ValueError(f"drive(lane={shown(lane)}): allowed are -1 (right), 1 (left) and 0 (stay)")
-    if asked is None and lane == 0:
+    if asked is not None and release:
+        raise ValueError("drive(…, release=True): gives the speed back, and takes no acceleration_m_s2")
+    if asked is None and lane == 0 and not release:
         raise ValueError("drive(): give acceleration_m_s2, lane or both")
-    return Action(node, asked, int(lane))
+    return Action(node, asked, int(lane), bool(release))

@@ -38,7 +38,9 @@ LEVELS = ("debug", "info", "warning", "error", "critical")
 """Levels of a line of a node's log."""
 
 
-NOTHING_SENSED: Mapping[str, float | tuple[float, ...]] = MappingProxyType({})
+Reading = float | tuple[float, ...] | dict[str, str]
+"""Reading of a sensor: a number, some, or the state of each of several things, as of traffic lights."""
+NOTHING_SENSED: Mapping[str, Reading] = MappingProxyType({})
 """Readings of a vehicle without sensors of the scenario's own."""
 
 
@@ -51,7 +53,8 @@ class Fix:
     as its receiver measures it, with noise; None if the emulator does not tell it. Where `[world.ranging]` says
     so, driven vehicles measure at the same instant `gap_m`, the clear distance to the vehicle ahead in their lane,
     and its rate of change `gap_rate_m_s`, negative while it closes; None where nobody is ahead in range. `sensors`
-    has what sensors of the scenario's own (`[world.sensor.NAME]`) read at that instant, by their names.
+    has what sensors of the scenario's own (`[world.sensor.NAME]`) read at that instant, by their names; where
+    `network.sumo.lights_to` names this node, also `traffic_lights`, the state of each of SUMO's by its id.
     """
 
     time_ns: int
@@ -61,7 +64,7 @@ class Fix:
     speed_m_s: float | None = None
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
-    sensors: Mapping[str, float | tuple[float, ...]] = field(default_factory=lambda: NOTHING_SENSED)
+    sensors: Mapping[str, Reading] = field(default_factory=lambda: NOTHING_SENSED)
 
 
 class NodeTransport(RadioTransport, BackboneTransport, Protocol):
@@ -176,15 +179,17 @@ class Node:
             raise OSError(f"{self.id}: this node has no disk")
         return self._disk()
 
-    def drive(self, acceleration_m_s2: float | None = None, lane: int = 0) -> None:
+    def drive(self, acceleration_m_s2: float | None = None, lane: int = 0, release: bool = False) -> None:
         """Ask the vehicle for an acceleration, and with `lane` 1 or -1 for a change to the left or right lane.
 
         It holds from the first control instant that is not before the present one (there is one every `control_ns`)
-        until another is asked for, or 0 once the program has ended. The vehicle follows with the lag of its
-        actuators. What it cannot do is limited, with an event `drive_limited`. Raise ValueError for what is no
-        number, for another `lane`, and unless the scenario has `[network] kind = "driven"`.
+        until another is asked for. The vehicle follows with the lag of its actuators. What it cannot do is limited,
+        with an event `drive_limited`. `release` gives the speed back, as the end of the program does: in SUMO to
+        its own driver; elsewhere the vehicle keeps its speed. Raise ValueError for what is no number, for another
+        `lane`, and unless the scenario has `[network] kind = "driven"`, or SUMO with `step = true`.
         """
-        self._transport.send_action(checked_action(self.id, self.control_ns > 0, acceleration_m_s2, lane))
+        action = checked_action(self.id, self.control_ns > 0, acceleration_m_s2, lane, release)
+        self._transport.send_action(action)
 
     def disconnect(self) -> None:
         """Disconnect the rest of the program from the world, after the vehicle's process has ended."""

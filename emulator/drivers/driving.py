@@ -8,8 +8,8 @@ import pyarrow as pa
 
 from emulator.records.driven_table import driven_table
 from emulator.records.run_folder import RunFolder
+from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
-from emulator.world.driven.world import DrivenWorld
 from emulator.world.world import World
 from vnet.driving import Action
 
@@ -18,7 +18,7 @@ class Driving:
     """Vehicles of a run and their programs' actions; nothing in a world whose truth is known from the start."""
 
     def __init__(self, world: World, folder: RunFolder, number: Mapping[str, int]) -> None:
-        self._world = world if isinstance(world, DrivenWorld) else None
+        self._world = world if isinstance(world, SteppedWorld) else None
         self._node_ids = () if self._world is None else self._world.driven
         self._drive = frozenset(self._node_ids)
         self._folder = folder
@@ -46,8 +46,8 @@ class Driving:
                 self._tell(self._world.vehicles.take(time_ns, self._number[action.node], action))
 
     def release(self, time_ns: int, node: str) -> None:
-        """Let a vehicle whose program has ended keep its speed."""
-        self.take(time_ns, [Action(node, 0.0)])
+        """Leave the speed of a vehicle whose program has ended to the vehicle."""
+        self.take(time_ns, [Action(node, release=True)])
 
     def advance_to(self, time_ns: int) -> bool:
         """Let vehicles drive to the last control instant until `time_ns`; returns whether they have moved."""
@@ -56,6 +56,11 @@ class Driving:
             self._tell(self._world.advance())
             moved = True
         return moved
+
+    def close(self) -> None:
+        """Let go of what moves the vehicles; the run is over."""
+        if self._world is not None:
+            self._world.close()
 
     def _tell(self, happened: Iterable[Happening]) -> None:
         for each in happened:

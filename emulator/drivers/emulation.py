@@ -417,6 +417,7 @@ class Emulation:
             self.close_periods(time_ns)
             self.folder.reach(time_ns)
             self.engine.drain()
+            self.driving.close()
 
     def close_periods(self, time_ns: int) -> None:
         """Record the periods that end by then; nobody has anything more to report of them.

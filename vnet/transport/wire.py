@@ -17,7 +17,7 @@ import numpy as np
 from vnet.backbone import UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError, printable
-from vnet.node import NOTHING_SENSED, Fix
+from vnet.node import NOTHING_SENSED, Fix, Reading
 from vnet.radio import Packet
 from vnet.reports import Report
 from vnet.transport.backbone import SentMessage, WireMessage
@@ -67,7 +67,7 @@ class WireFix(msgspec.Struct, frozen=True, array_like=True):
     speed_m_s: float | None = None
     gap_m: float | None = None
     gap_rate_m_s: float | None = None
-    sensors: dict[str, float | tuple[float, ...]] | None = None
+    sensors: dict[str, Reading] | None = None
 
     @classmethod
     def of(cls, node: str, fix: Fix) -> WireFix:

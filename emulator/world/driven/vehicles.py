@@ -113,6 +113,8 @@ class DrivenVehicles:
 
     def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
         """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
+        if action.release:  # nobody else drives: the vehicle keeps its speed
+            action = Action(action.node, 0.0, action.lane)
         self._pending.append((time_ns, number, action))
         asked = action.acceleration_m_s2
         if asked is None:

@@ -146,7 +146,7 @@ def test_driving_is_refused_in_one_line_where_programs_do_not_drive(tmp_path: Pa
             said.append(str(error))
 
     simulated(scenario_of([], "x:y", 1), tmp_path / "run", program=drives)
-    assert said == ['drive(…): programs drive only with [network] kind = "driven"']
+    assert said == ['drive(…): programs drive only with [network] kind = "driven", or with step = true']
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,183 @@
+"""Worlds whose truth comes to be as the run goes on: what all have in common, whatever moves their vehicles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from emulator.scenario.random_streams import stream
+from emulator.scenario.scenario import Scenario
+from emulator.world.driven.vehicles import Happening, Log
+from emulator.world.projection import Frame
+from emulator.world.receivers import MotionSensors
+from emulator.world.trips.motion import Motion
+from emulator.world.truth import World, periods_of
+from vnet.driving import Action
+from vnet.errors import ScenarioError
+from vnet.node import Fix
+from vnet.roads.lanes import LaneMap
+from vnet.roads.road_map import RoadMap
+from vnet.types import Array, Mask
+from vnet.units import NS_PER_S
+
+
+class SteppedVehicles(Protocol):
+    """Vehicles from control instant to control instant, `step_ns` apart. `now_ns` is the last they have come to."""
+
+    step_ns: int
+    now_ns: int
+
+    @property
+    def speed(self) -> Array:
+        """Speeds (N,) in m/s; NaN for an absent vehicle."""
+        ...
+
+    def place(self) -> tuple[Array, Array]:
+        """Return positions (N, 2) in m and headings (N,) in [0, 2π); NaN for an absent vehicle."""
+        ...
+
+    def gaps(self, range_m: float) -> tuple[Array, Array]:
+        """Return the gaps (N,) to the vehicles ahead, in m, and their rates in m/s; NaN where none is in range."""
+        ...
+
+    def take(self, time_ns: int, number: int, action: Action) -> list[Happening]:
+        """Take what a program asks for at `time_ns`, not before `now_ns`; returns whether it is limited."""
+        ...
+
+    def advance(self) -> list[Happening]:
+        """Let all drive to the next control instant; returns what happens."""
+        ...
+
+    def remove_arrived(self) -> bool:
+        """Take those off the road that have come to its end; returns whether there are any."""
+        ...
+
+    def finished_log(self) -> Log:
+        """Return the log of a run that is over, up to the last control instant."""
+        ...
+
+
+class SteppedWorld(World):
+    """A world whose truth is known up to the control instant that its `vehicles` have come to, and no further.
+
+    Subclasses say in `vehicle_area_m` where vehicles can be, before they call this constructor.
+    """
+
+    vehicles: SteppedVehicles
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        node_ids: Sequence[str],
+        lane_map: LaneMap | RoadMap,
+        notes: tuple[str, ...] = (),
+        frame: Frame | None = None,
+    ) -> None:
+        self._count, periods = len(node_ids), periods_of(scenario)
+        self._units_m = [unit.position_m for unit in scenario.roadside]
+        self._duration_ns = scenario.duration_ns
+        self._known = 1  # periods whose truth is known
+        self._changed: list[int] = []  # periods with which vehicles enter or leave
+        position_m, heading_rad = self.vehicles.place()
+        course_m, course_rad = np.tile(position_m, (periods, 1, 1)), np.tile(heading_rad, (periods, 1))
+        motion = Motion(tuple(node_ids), course_m, course_rad, notes=notes)
+        super().__init__(scenario, motion, lane_map, np.zeros(0, dtype=np.intp), frame)
+        self._sensors = MotionSensors(scenario, periods, self._count)
+        self._ranging = scenario.world.ranging
+        self._gap_m, self._gap_rate_mps = np.full((2, periods, len(self.node_ids)), np.nan)
+        if self._ranging is not None:
+            seed = scenario.run.seed
+            draws = [stream(seed, "ranging", n).standard_normal((periods, 2)) for n in range(self._count)]
+            self._ranging_normal = np.stack(draws, axis=1)
+        self._fill(0)
+
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """Ids of the vehicles that programs drive: all nodes but roadside units."""
+        return self.node_ids[: self._count]
+
+    @property
+    def vehicle_area_m(self) -> Array:
+        """Corners (2, 2) of the box in which vehicles can be during the run."""
+        raise NotImplementedError
+
+    @property
+    def area_m(self) -> Array:
+        """Corners (2, 2) of the box in which nodes can be during the run."""
+        corners_m = np.array([*self.vehicle_area_m, *self._units_m])
+        return np.array([corners_m.min(axis=0), corners_m.max(axis=0)])
+
+    def present(self, period: int) -> Mask:
+        """Return the mask (N,) of the vehicles that are present in `period`."""
+        return np.asarray(np.isfinite(self.position_m(period)[:, 0]))
+
+    @property
+    def last_known_period(self) -> int:
+        """The last period that vehicles have come to."""
+        return self._known - 1
+
+    def position_m(self, period: int) -> Array:
+        """Return the positions (N, 2) at the start of `period`; NaN for an absent vehicle.
+
+        Raise ScenarioError for a period that vehicles have not come to.
+        """
+        if period >= self._known:
+            time_s = period * self.period_ns / NS_PER_S
+            raise ScenarioError(
+                f"positions at {time_s:g} s depend on what programs do until then: where programs drive, "
+                "select nodes by name"
+            )
+        return super().position_m(period)
+
+    def next_change_ns(self, after_ns: int) -> int | None:
+        """Return the first time after `after_ns` at which vehicles enter or leave, as far as is known, or None."""
+        times_ns = (period * self.period_ns for period in self._changed)
+        return next((time_ns for time_ns in times_ns if time_ns > after_ns), None)
+
+    def next_control_ns(self) -> int | None:
+        """Return the next control instant within the run, or None."""
+        next_ns = self.vehicles.now_ns + self.vehicles.step_ns
+        return next_ns if next_ns < self._duration_ns else None
+
+    def advance(self) -> list[Happening]:
+        """Let all drive to the next control instant; returns what happens."""
+        happened = self.vehicles.advance()
+        period, rest_ns = divmod(self.vehicles.now_ns, self.period_ns)
+        if rest_ns == 0:
+            self.vehicles.remove_arrived()
+            self._fill(period)
+            if (self.present(period) != self.present(period - 1)).any():
+                self._changed.append(period)
+        return happened
+
+    def close(self) -> None:
+        """Let go of what moves the vehicles; the run is over."""
+
+    def _fill(self, period: int) -> None:
+        """Take the truth at the start of a period, and what receivers and sensors make of it."""
+        position_m, heading_rad = self.vehicles.place()
+        rows, speed = slice(period, period + 1), self.vehicles.speed[None]
+        driven = slice(self._count)  # behind them there are roadside units
+        self.course_m[period, driven], self._heading_rad[period, driven] = position_m, heading_rad
+        self._fix_m[period, driven] = position_m + self._common_m[period] + self._noise_m[period, driven]
+        self._fix_heading_rad[rows, driven] = self._sensors.heading_rad(heading_rad[None], speed, rows)
+        self._fix_speed_mps[rows, driven] = self._sensors.speed_mps(speed, rows)
+        self._true_speed_mps[rows, driven] = speed
+        if self._ranging is not None:
+            gap_m, rate_mps = self.vehicles.gaps(self._ranging.range_m)
+            noise = self._ranging_normal[period]
+            self._gap_m[period, driven] = gap_m + self._ranging.sigma_m * noise[:, 0]
+            self._gap_rate_mps[period, driven] = rate_mps + self._ranging.rate_sigma_mps * noise[:, 1]
+        self._known = period + 1
+
+    def fix(self, period: int, node: int) -> Fix:
+        """Return the fix of vehicle number `node`, which must be present, with the gap that it measures."""
+        fix = super().fix(period, node)
+        gap_m = self._gap_m[period, node].item()
+        if math.isnan(gap_m):
+            return fix
+        return replace(fix, gap_m=gap_m, gap_rate_m_s=self._gap_rate_mps[period, node].item())
