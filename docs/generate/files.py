@@ -59,6 +59,7 @@ SCENARIO = """
 Two sections are not the scenario's own: they hold SHA-256 of what the run has read at its start.
 
 - `[inputs]`: each input file by its path. `vnet run FOLDER/scenario.toml` refuses a file that has changed, by name.
+  Where SUMO is stepped with the run, `libsumo` is its version and build, and another one is refused.
 - `[code]`: `program` is one digest of the programs named in `entries` and of every module that they import,
   directly or not, from outside the standard library and site-packages; `vnet` is one digest of vnet's own sources.
   If either has changed, `vnet run FOLDER/scenario.toml` says so in one line, records it (the event `code_changed`,
@@ -136,11 +137,11 @@ DRIVEN = {
     "time_ns": "the control instant",
     "node": "id of the vehicle",
     "along_m": "truth: position of its centre along the road, or on a map its route; on a ring it goes on "
-    "counting. NaN once it has left",
-    "left_m": "truth: its distance to the left of the rightmost lane's centre",
+    "counting. NaN once it has left. In SUMO the way since it was inserted",
+    "left_m": "truth: its distance to the left of the rightmost lane's centre; in SUMO of its own lane's",
     "speed_m_s": "truth: its speed",
     "acceleration_m_s2": "truth: its acceleration",
-    "command_m_s2": "the acceleration that it was told from this instant on, within its limits",
+    "command_m_s2": "the acceleration that it was told from this instant on, within its limits; NaN if SUMO drives",
 }
 ON_BACKBONE = {
     "sent_ns": "when it was sent",

@@ -130,6 +130,7 @@ def conclude(
             "vnet": version("vnet-emulator"),
             "python": platform.python_version(),
             "numpy": np.__version__,
+            **emulation.driving.versions,
         },
     }
     folder.put_json(VERDICT_FILE, verdict)

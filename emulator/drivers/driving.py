@@ -33,6 +33,11 @@ class Driving:
         """Return the time between two control instants; 0 for a node that its program does not drive."""
         return 0 if self._world is None or node not in self._drive else self._world.vehicles.step_ns
 
+    @property
+    def versions(self) -> Mapping[str, str]:
+        """Versions of programs that move vehicles, by name."""
+        return {} if self._world is None else self._world.versions
+
     def table(self) -> pa.Table | None:
         """Return what vehicles did at each control instant; None where programs do not drive."""
         return None if self._world is None else driven_table(self._world.vehicles.finished_log(), self._node_ids)

@@ -166,7 +166,7 @@ class RunFiles:
     @cached_property
     def driven(self) -> pa.Table | None:
         """A row for each control instant and vehicle; None where programs do not drive."""
-        return self._table(DRIVEN_FILE) if self.scenario.network.kind == "driven" else None
+        return self._table(DRIVEN_FILE) if self.scenario.network.programs_drive else None
 
     @cached_property
     def backbone(self) -> pa.Table | None:

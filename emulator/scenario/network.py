@@ -11,6 +11,7 @@ from emulator.scenario.driven import Driven
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
 from emulator.scenario.program import Entry
 from emulator.scenario.sections import Section
+from emulator.scenario.sumo_loop import Sumo
 
 OF_TRIPS = ("start_s", "max_vehicles", "disc", "origin_deg")
 """Keys of `[network]` for vehicles that move."""
@@ -59,13 +60,24 @@ class Network(Section):
     """Trips: a vehicle with many steps that no vehicle can make is left out, which one line says, or the run is
     refused. If most vehicles are so, units or ids are wrong, and the run is refused in any case."""
 
+    step: bool = False
+    """`sumo`: SUMO is stepped with the run, and programs drive their vehicles among its others; else it has driven
+    all of them before the run begins."""
+
     driven: Driven | None = None
     """Road and dynamics of driven vehicles; `kind = "driven"` has them by default."""
+    sumo: Sumo | None = None
+    """Vehicles of SUMO that have programs; goes with `step`."""
 
     @property
     def moves(self) -> bool:
         """True if vehicles drive, enter and leave."""
         return self.kind in ("trips", "sumo", "city", "driven", "own")
+
+    @property
+    def programs_drive(self) -> bool:
+        """True if programs drive their vehicles, so that the truth comes to be as the run goes on."""
+        return self.kind == "driven" or self.step
 
     @model_validator(mode="before")
     @classmethod
@@ -86,6 +98,14 @@ class Network(Section):
             raise ValueError(f'{given[0]} goes with kind = "trips" or "sumo", not with "{self.kind}"')
         if self.driven is not None and self.kind != "driven":
             raise ValueError(f'driven goes with kind = "driven", not with "{self.kind}"')
+        if self.step and self.kind != "sumo":
+            raise ValueError(f'step goes with kind = "sumo", not with "{self.kind}"')
+        if self.sumo is not None and not self.step:
+            raise ValueError("sumo goes with step = true")
+        if self.step and self.disc is not None:
+            raise ValueError("disc goes not with step = true: vehicles are there as long as SUMO has them")
+        if self.sumo is not None and self.sumo.nodes is not None and self.max_vehicles is not None:
+            raise ValueError("max_vehicles goes not with sumo.nodes, which names the vehicles")
         return self
 
 

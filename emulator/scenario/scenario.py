@@ -27,8 +27,9 @@ from emulator.scenario.roadside import Backbone, RoadsideUnit, with_names, with_
 from emulator.scenario.sections import Section, first_problem
 from emulator.scenario.shipped import find_scenario, shipped_names
 from emulator.scenario.sumo import input_files
+from emulator.scenario.sumo_loop import LIBSUMO, libsumo_build
 from emulator.scenario.toml import check_plain, read_toml
-from emulator.scenario.world import WorldSection, check_driving
+from emulator.scenario.world import WorldSection, check_driving, check_stepped_sumo
 from vnet.errors import ScenarioError, did_you_mean, first_names, printable, shown
 from vnet.units import NS_PER_S
 
@@ -219,8 +220,10 @@ class Scenario(Section):
             raise ValueError(f'map goes with network.driven.road = "map", not with "{self.driven.road}"')
         if kind == "driven":
             check_driving(self.driven, self.run.control_hz, self.period_ns, self.world)
+        elif self.network.step:
+            check_stepped_sumo(self.run.control_hz, self.period_ns, self.world)
         elif self.world.ranging is not None:
-            raise ValueError(f'world.ranging goes with network.kind = "driven", not with "{kind}"')
+            raise ValueError(f'world.ranging goes with network.kind = "driven" or network.step, not with "{kind}"')
         return self
 
     @model_validator(mode="after")
@@ -302,6 +305,8 @@ def scenario_from(
     recorded = digests or {}
     for name, digest in input_digests(scenario).items():
         if recorded.get(name, digest) != digest:
+            if name == LIBSUMO:
+                raise ScenarioError(f"{path}: recorded with libsumo {shown(recorded[name])}; here is {digest!r}")
             raise ScenarioError(f"{path}: {name} has changed since this run was recorded (sha256 differs)")
     return scenario
 
@@ -344,7 +349,10 @@ def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] |
 
 
 def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names."""
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names.
+
+    Where SUMO is stepped with the run, `libsumo` is its version and build.
+    """
     read = (
         scenario.network.path,
         scenario.radio.links,
@@ -356,7 +364,8 @@ def input_digests(scenario: Scenario) -> dict[str, str]:
     paths = [path for path in read if isinstance(path, Path)]
     if scenario.network.kind == "sumo" and scenario.network.path is not None:
         paths += input_files(scenario.network.path)
-    return {str(path): _sha256(path) for path in paths}
+    build = libsumo_build() if scenario.network.step else None
+    return {str(path): _sha256(path) for path in paths} | ({} if build is None else {LIBSUMO: build})
 
 
 def _sha256(path: Path) -> str:

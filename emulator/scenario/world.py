@@ -11,7 +11,7 @@ from emulator.scenario.driven import Driven, Ranging, control_step_ns
 from emulator.scenario.limits import DAY_S, FAR_M, FAR_S, WILD_M
 from emulator.scenario.program import Entry
 from emulator.scenario.sections import Section
-from vnet.units import NS_PER_S
+from vnet.units import NS_PER_MS, NS_PER_S
 
 
 class CommonError(Section):
@@ -112,11 +112,7 @@ class WorldSection(Section):
 
 def check_driving(driven: Driven, control_hz: float, period_ns: int, world: WorldSection) -> None:
     """Raise ValueError unless control instants, dynamics and GNSS errors fit together."""
-    if period_ns % control_step_ns(control_hz):
-        raise ValueError(
-            f"run.control_hz = {control_hz:g}: must be a whole multiple of world.gnss.rate_hz = "
-            f"{NS_PER_S / period_ns:g}, with intervals of whole nanoseconds"
-        )
+    _check_control(control_hz, period_ns)
     if driven.max_speed_mps / control_hz >= 2 * driven.vehicle_length_m:
         raise ValueError(
             f"network.driven.max_speed_mps = {driven.max_speed_mps:g}: vehicles could pass through one another "
@@ -124,3 +120,20 @@ def check_driving(driven: Driven, control_hz: float, period_ns: int, world: Worl
         )
     if world.common_error.gradient_m_per_km:
         raise ValueError('world.common_error.gradient_m_per_km goes not with network.kind = "driven"')
+
+
+def check_stepped_sumo(control_hz: float, period_ns: int, world: WorldSection) -> None:
+    """Raise ValueError unless control instants are steps that SUMO can make, and GNSS errors fit."""
+    _check_control(control_hz, period_ns)
+    if control_step_ns(control_hz) % NS_PER_MS:
+        raise ValueError(f"run.control_hz = {control_hz:g}: SUMO steps by whole milliseconds, so 10, 20, 50")
+    if world.common_error.gradient_m_per_km:
+        raise ValueError("world.common_error.gradient_m_per_km goes not with network.step = true")
+
+
+def _check_control(control_hz: float, period_ns: int) -> None:
+    if period_ns % control_step_ns(control_hz):
+        raise ValueError(
+            f"run.control_hz = {control_hz:g}: must be a whole multiple of world.gnss.rate_hz = "
+            f"{NS_PER_S / period_ns:g}, with intervals of whole nanoseconds"
+        )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
+from emulator.world.driven.sumo_world import SumoWorld
 from emulator.world.driven.world import DrivenWorld
 from emulator.world.graph import components_of_links
 from emulator.world.lateral import lateral_offsets_m
@@ -83,6 +84,8 @@ def build_world(scenario: Scenario) -> World:
     network = scenario.network
     if network.kind == "driven":
         return DrivenWorld(scenario)
+    if network.step:
+        return SumoWorld(scenario)
     if network.moves:
         return _drive(scenario)
     if network.path is not None:

@@ -47,3 +47,15 @@ async def brakes_not(node: Node) -> None:
     """Drive on, whatever is ahead."""
     node.drive(0.5)
     await asyncio.sleep(3600)
+
+
+async def brakes_and_releases(node: Node) -> None:
+    """In SUMO: brake in the second second, then leave it to SUMO; say where one is."""
+    async for fix in node.gnss:
+        time_s = fix.time_ns / NS_PER_S
+        if 1.0 <= time_s < 2.0:
+            node.drive(-2.0, lane=int(time_s == 1.5))
+        else:
+            node.drive(release=True)
+        await node.radio.broadcast(struct.pack("2d", *fix.position_m))
+        node.report(fix.position_m, speed_m_s=fix.speed_m_s or 0.0)

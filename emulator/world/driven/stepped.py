@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -68,6 +69,8 @@ class SteppedWorld(World):
     """
 
     vehicles: SteppedVehicles
+    versions: Mapping[str, str] = MappingProxyType({})
+    """Versions of programs that move the vehicles, by name, for the run's verdict."""
 
     def __init__(
         self,
