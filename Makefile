@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # What `make test-all` tests with, each in a virtual environment of its own, if it is installed.
 PYTHONS ?= 3.11 3.12 3.13
 
-.PHONY: demo test coverage test-all quick lint docs site bench soak fuzz hunt setup clean
+.PHONY: demo test coverage test-all quick lint docs site bench soak fuzz hunt sumo setup clean
 
 setup: $(READY)
 
@@ -78,6 +78,12 @@ bench: $(READY)
 fuzz: $(READY)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz --runs 1000000
+
+# SUMO as a library: 100 MB to fetch, so that `make test` does without, and with a stand-in for it.
+sumo: $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt libsumo
+	$(BIN)/pytest -n 0 tests/emulator/world/driven/test_sumo_itself.py
+	$(BIN)/pytest -n 0 tests/docs/test_blocks.py -k sumo-in-the-loop
 
 hunt: $(READY)
 	$(BIN)/python -m tests.hunt

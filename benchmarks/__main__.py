@@ -280,6 +280,13 @@ def bench_driving() -> Figures:
     return driving.measure()
 
 
+def bench_sumo() -> Figures:
+    """Fifty programs among five hundred vehicles of SUMO, stepped with the run, simulated."""
+    from benchmarks import sumo
+
+    return sumo.measure()
+
+
 BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "rbpf": bench_rbpf,
     "city_rbpf": bench_city_rbpf,
@@ -291,6 +298,7 @@ BENCHMARKS: dict[str, Callable[[], Figures]] = {
     "simulate": bench_simulate,
     "lockstep": bench_lockstep,
     "driving": bench_driving,
+    "sumo": bench_sumo,
     "demo": bench_demo,
     "realtime": bench_realtime,
     "awaiting": bench_awaiting,
@@ -315,7 +323,8 @@ def main() -> None:
         try:
             results[name] = BENCHMARKS[name]()
         except ModuleNotFoundError as error:
-            print(f"{name}: skipped, {error.name} is missing; `make bench` installs it", file=sys.stderr)
+            installs = "the extra sumo" if name == "sumo" else "`make bench`"
+            print(f"{name}: skipped, {error.name} is missing; {installs} installs it", file=sys.stderr)
             continue
         for figure, value in results[name].items():
             table.add_row(name, figure, f"{value:.4g}")

@@ -30,3 +30,15 @@ async def always_awaits(node: Node) -> None:
 async def _listen(node: Node) -> None:
     async for _ in node.radio:
         pass
+
+
+async def brakes_now_and_then(node: Node) -> None:
+    """A beacon at each fix, whose vehicle brakes for one second in ten."""
+    phase_s = float(node.rng.uniform(0.0, 10.0))
+    async for fix in node.gnss:
+        await node.radio.broadcast(bytes(SIZE_BYTES))
+        node.radio.drain()
+        if (fix.time_ns / 1e9 + phase_s) % 10.0 < 1.0:
+            node.drive(-2.0)
+        else:
+            node.drive(release=True)

@@ -28,7 +28,10 @@ def recipe(target: str) -> list[str]:
 def test_the_workflow_can_be_run() -> None:
     check_workflow(WORKFLOW)
     (job,) = WORKFLOW["jobs"].values()
-    assert [step["run"] for step in job["steps"] if "run" in step] == ["make test PYTHON=python"]
+    assert [step["run"] for step in job["steps"] if "run" in step] == [
+        "make test PYTHON=python",
+        "make sumo PYTHON=python",
+    ]
 
 
 def test_the_action_runs_a_campaign_with_its_inputs(tmp_path: Path) -> None:

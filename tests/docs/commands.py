@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import re
 import shlex
@@ -37,6 +38,8 @@ ONLY_PARSED = {
     r"dask://HOST": "needs other hosts",
     r"^vnet experiment .*DIR/": "needs recorded trips that are not part of vnet",
 }
+if importlib.util.find_spec("libsumo") is None:
+    ONLY_PARSED[r"/sumo_loop/"] = "needs libsumo, of the extra sumo"
 """Patterns of commands that are parsed and not run, and why."""
 NOT_RUN = {
     "cd": "the shell's own",
