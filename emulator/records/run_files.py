@@ -247,7 +247,8 @@ class RunFiles:
         """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
         if path.name == TRACE_FILE:
             there = self._read(path, lambda: pq.read_schema(path.absolute()).names)
-            return [name for name in WITH_UNICASTS if name in there]
+            beside = [*WITH_UNICASTS, "on_air_ns"] if "attempt" in there else WITH_UNICASTS
+            return [name for name in beside if name in there and name not in wanted]
         if path.name != STATES_FILE or "values" not in wanted:
             return []
         return self._read(path, lambda: value_columns(pq.read_schema(path.absolute())))
