@@ -33,10 +33,10 @@ class NewsFeed:
             if self._up[message.node]:
                 self._waiting.setdefault(message.node, []).append(message)
 
-    def repeat(self, results: Iterable[WireSendResult]) -> None:
-        """Put results that a process has missed where it will find them again."""
-        for result in results:
-            self._waiting.setdefault(result.node, []).append(result)
+    def repeat(self, news: Iterable[NewsItem]) -> None:
+        """Put what a process has missed where it will find it again."""
+        for item in news:
+            self._waiting.setdefault(item.node, []).append(item)
 
     def firsts(self) -> Iterator[tuple[str, int]]:
         """Yield each node for which something has come, and the time in ns of the first."""

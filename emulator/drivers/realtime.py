@@ -14,8 +14,8 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import check_ownership, wire_packet
 from emulator.radio.engine import Delivery
+from vnet.runtime.news import NewsItem
 from vnet.transport import lateness, wire
-from vnet.transport.send_results import WireSendResult
 from vnet.units import NS_PER_S
 
 WORST_PROCESSES = 8
@@ -28,15 +28,15 @@ class _Sent(NamedTuple):
     """Contents of a batch that are dealt with if its process has missed it."""
 
     deliveries: list[Delivery]
-    results: list[WireSendResult]
+    news: list[NewsItem]
 
 
 class RealTime:
     """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
 
     Each batch is remembered until its process acknowledges it; what it missed is lost in `transport`, but for the
-    results of frames to single vehicles: they go out again, because programs await them. Processes come and go with
-    faults: do what `take_actions` says, and tell `returned` when one is there again.
+    results of frames to single vehicles, which programs await, and messages of the backbone: they go out again.
+    Processes come and go with faults: do what `take_actions` says, and tell `returned` when one is there again.
     """
 
     def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]]) -> None:
@@ -117,7 +117,7 @@ class RealTime:
             for seq in [seq for seq in waiting if first <= seq <= last]:
                 missed = waiting.pop(seq)
                 self._lose(missed.deliveries)
-                self._news.repeat(missed.results)
+                self._news.repeat(missed.news)
         for seq in [seq for seq in waiting if seq < message.received_seq]:
             del waiting[seq]
 
@@ -205,7 +205,7 @@ class RealTime:
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
         results, messages = self._news.take(self._nodes[process_id])
-        self._unacknowledged[process_id][seq] = _Sent(deliveries, results)
+        self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages])
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:

@@ -8,8 +8,10 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.realtime import RealTime
 from emulator.radio.outcomes import Outcome
 from emulator.scenario.faults import parse_fault
+from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
+from vnet.transport.backbone import SentMessage
 
 IDS = ["v01", "v02", "v03", "v04"]
 MS = 1_000_000
@@ -39,6 +41,21 @@ def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
     realtime.receive(150 * MS, "v01", wire.Frames(b"n", 1, batch.seq + 1, [(batch.seq, batch.seq)], wire.Traffic()))
     assert realtime.due(151 * MS)["v01"].results == [result]
     assert "v01" not in realtime.due(152 * MS)
+
+
+def test_a_message_of_the_backbone_in_a_batch_that_was_missed_goes_out_again() -> None:
+    units = [{"position_m": [0.0, 0.0]}, {"position_m": [10.0, 0.0]}]
+    plan = Scenario.model_validate({"run": {"pacing": "realtime"}, "network": {"vehicles": 1}, "roadside": units})
+    realtime = RealTime(emulation_of(plan), [["v01"], ["rsu01"], ["rsu02"]])
+    realtime.start(0)
+    traffic = wire.Traffic(messages=[SentMessage("rsu01", None, b"x")])
+    realtime.receive(10 * MS, "rsu01", wire.Frames(b"n", 0, 1, [], traffic))
+    batch = realtime.due(20 * MS)["rsu02"]
+    (message,) = batch.messages
+    assert (message.sender, message.payload, message.time_ns) == ("rsu01", b"x", 15 * MS)
+    missed = [(batch.seq, batch.seq)]
+    realtime.receive(30 * MS, "rsu02", wire.Frames(b"n", 0, batch.seq + 1, missed, wire.Traffic()))
+    assert realtime.due(31 * MS)["rsu02"].messages == [message]
 
 
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
