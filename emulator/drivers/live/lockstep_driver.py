@@ -20,7 +20,9 @@ from vnet.transport import wire
 FINAL_WAIT_S = 1.0
 """Seconds for which the last message of a process that a fault ends is awaited."""
 STACKS_WAIT_S = 1.0
-"""Seconds for which the stacks of processes that do not yield are awaited."""
+"""Seconds after which the emulator looks whether processes that do not yield have sent their stacks."""
+STACKS_LOOKS = 5
+"""Number of looks after which it does without what is missing."""
 
 HorizonCallback = Callable[[Lockstep], Awaitable[None]]
 """Sets the barrier's horizon: called before time 0, and whenever the run is held there."""
@@ -145,7 +147,10 @@ class LockstepDriver(Driver):
         for process_id in asked:
             self._send(process_id, wire.StackRequest())
             parts.agents.request_stack(process_id)
-        await asyncio.sleep(STACKS_WAIT_S)
+        for _ in range(STACKS_LOOKS):  # on a busy machine an answer takes its time
+            await asyncio.sleep(STACKS_WAIT_S)
+            if all(process_id in parts.inbox.stacks for process_id in asked):
+                break
         before_ns = dict(self._reached_ns)
         for process_id, dump in parts.inbox.stacks.items():
             if dump.time_ns is not None and process_id in before_ns:
