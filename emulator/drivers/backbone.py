@@ -77,7 +77,7 @@ class BackboneNetwork:
             arrival_ns = max(arrival_ns, self._last_ns.get((sender, receiver), 0))
             sent = _Sent(arrival_ns, sender, number, receiver, time_ns, message.payload)
             if drawn[2 * receiver + 1] < self._section.loss:
-                self._record(sent, "loss")
+                self._rows.append(self._row(sent, "loss"))
                 continue
             self._last_ns[sender, receiver] = arrival_ns
             heappush(self._unseen, sent)
@@ -100,22 +100,19 @@ class BackboneNetwork:
         """Record the arrivals up to `time_ns`: who is up now was so when they came."""
         while self._undecided and self._undecided[0].arrival_ns <= time_ns:
             sent = heappop(self._undecided)
-            self._record(sent, "delivered" if self._up[self._names[sent.receiver]] else "receiver_down")
+            is_up = self._up[self._names[sent.receiver]]
+            self._rows.append(self._row(sent, "delivered" if is_up else "receiver_down"))
 
-    def _record(self, sent: _Sent, outcome: str) -> None:
+    def _row(self, sent: _Sent, outcome: str) -> BackboneRow:
         sender, receiver = self._names[sent.sender], self._names[sent.receiver]
         digest = payload_digest(sent.payload)
         arrival_ns = None if outcome == "loss" else sent.arrival_ns
-        self._rows.append(
-            BackboneRow(sent.sent_ns, sender, sent.number, receiver, len(sent.payload), digest, arrival_ns, outcome)
-        )
+        size = len(sent.payload)
+        return BackboneRow(sent.sent_ns, sender, sent.number, receiver, size, digest, arrival_ns, outcome)
 
     def table(self) -> pa.Table | None:
         """Return a row for each message and receiver, in the order of sending; None without roadside units."""
         if not self._units:
             return None
-        rows = [*self._rows]
-        for sent in self._undecided:  # still under way when the run ends
-            self._record(sent, "in_flight")
-        rows, self._rows = self._rows, rows
-        return backbone_table(rows)
+        under_way = [self._row(sent, "in_flight") for sent in self._undecided]
+        return backbone_table([*self._rows, *under_way])
