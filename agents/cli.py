@@ -17,7 +17,7 @@ import typer
 from vnet.errors import ProgramError, VnetError
 from vnet.runtime import interrupts
 from vnet.runtime.die_with_parent import signal_at_parent_death
-from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread
+from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_same_arithmetic
 from vnet.runtime.program_path import search_programs_in
 
 if TYPE_CHECKING:
@@ -164,7 +164,7 @@ def main() -> None:
     """The console script."""
     interrupts.end_at_once()
     open_standard_descriptors()
-    use_one_blas_thread()
+    use_same_arithmetic()
     fix_hash_seed("agents.cli")
     app(prog_name="vnet-agent")
 

@@ -1,8 +1,8 @@
 """Runs from Python: `emulator.simulate` and `emulator.run`, which do what the commands of these names do.
 
-A run's programs need a process with hash seed 0 and one thread of linear algebra, as the commands have. Where this
-process is not like that, a worker process runs them; only a function that no other process can import is run here
-all the same, and then the verdict says that a replay is not warranted.
+A run's programs need a process with hash seed 0 and an arithmetic that no processor changes, as the commands have.
+Where this process is not like that, a worker process runs them; only a function that no other process can import is
+run here all the same, and then the verdict says that a replay is not warranted.
 """
 
 from __future__ import annotations
@@ -186,4 +186,4 @@ def _why_not_warranted(function: Program) -> str:
     why = f"not warranted: the program is {name_of(function)}, which no command can import"
     if is_fit():
         return why
-    return f"{why}, and this process has not PYTHONHASHSEED=0 and one thread of linear algebra"
+    return f"{why}, and this process has not PYTHONHASHSEED=0 and the arithmetic of other processors"

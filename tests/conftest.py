@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from vnet.runtime.environment import use_one_blas_thread
+from vnet.runtime.environment import use_same_arithmetic
 
-use_one_blas_thread()  # as in the commands, whose results some tests compare with those of this process
+use_same_arithmetic()  # as in the commands, whose results some tests compare with those of this process
 
 # The same examples in each run, so that it fails for what was changed, and however slow the machine.
 # Others: --hypothesis-profile=default.

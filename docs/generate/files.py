@@ -277,7 +277,7 @@ VERDICT = {
     "same of up to 100 `vehicles`, the slowest first. The "
     "machine decides `cpu_s`: no hash and no comparison has it",
     "reproduce": "the command that runs it again, from any folder of the machine",
-    "versions": "of vnet, Python and numpy",
+    "versions": "of vnet, Python and numpy, and `arithmetic`: which processors compute the same bits",
 }
 
 

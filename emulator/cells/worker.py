@@ -1,4 +1,4 @@
-"""Processes that are fit to run programs: hash seed 0, one thread of linear algebra, each serving many jobs.
+"""Processes that are fit to run programs: hash seed 0, the same arithmetic as elsewhere, each serving many jobs.
 
 A job is a function of vnet's and its arguments. `call_fitly` runs it in this process if that is fit, else in a
 worker that it starts once for each thread and keeps. So any executor's workers will do: threads, processes, Dask's.
@@ -28,7 +28,7 @@ from typing import IO, Any, TypeVar
 from emulator.records.code_digest import digests_of, entries_of, rules_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
-from vnet.runtime.environment import ONE_BLAS_THREAD
+from vnet.runtime.environment import SAME_ARITHMETIC, has_same_arithmetic
 
 T = TypeVar("T")
 LONGEST_TAIL_BYTES = 1000
@@ -81,8 +81,8 @@ def modules_of(scenario: Scenario) -> tuple[str, ...]:
 
 
 def is_fit() -> bool:
-    """Return whether this process has hash seed 0 and one thread of linear algebra."""
-    return sys.flags.hash_randomization == 0 and all(os.environ.get(n) == v for n, v in ONE_BLAS_THREAD.items())
+    """Return whether this process has hash seed 0 and the arithmetic of other machines."""
+    return sys.flags.hash_randomization == 0 and has_same_arithmetic()
 
 
 def call_fitly(place: Place, function: Callable[..., T], *arguments: Any, limit_s: float | None = None) -> T:
@@ -125,7 +125,7 @@ class Worker:
                 pass_fds=[its.fileno()],
                 process_group=0,  # Ctrl-C is for whoever has started it
                 cwd=place.folder if Path(place.folder).is_dir() else None,
-                env={**os.environ, **_with_vnet(os.environ), **ONE_BLAS_THREAD, "PYTHONHASHSEED": "0"},
+                env={**os.environ, **_with_vnet(os.environ), **SAME_ARITHMETIC, "PYTHONHASHSEED": "0"},
             )
         self._connection = Connection(mine.detach())
         self.close = weakref.finalize(self, _end, self._process, self._connection, self._errors)

@@ -16,10 +16,10 @@ def main() -> None:
     except KeyboardInterrupt:  # of `python -m emulator`, which no console script has guarded
         sys.exit(130)
     from emulator.cli.table import find
-    from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_one_blas_thread
+    from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_same_arithmetic
 
     open_standard_descriptors()
-    use_one_blas_thread()
+    use_same_arithmetic()
     arguments = sys.argv[1:]
     command = find(arguments)
     if command is not None and command.runs_programs:

@@ -49,6 +49,7 @@ from emulator.records.run_folder import (
 )
 from emulator.records.tape import TAPE_FILE, described, dump_tape
 from emulator.records.verdicts import Finding, NotExercised, unknown
+from vnet.runtime.environment import arithmetic
 
 
 def _start_up_s(emulation: Emulation) -> float | None:
@@ -130,6 +131,7 @@ def conclude(
             "vnet": version("vnet-emulator"),
             "python": platform.python_version(),
             "numpy": np.__version__,
+            "arithmetic": arithmetic(),
             **emulation.driving.versions,
         },
     }

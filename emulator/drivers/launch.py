@@ -1,9 +1,9 @@
 """Starting agent processes, watching them, and ending every one of them.
 
 Each process gets a log, a process group of its own (so that Ctrl-C in the terminal reaches only the emulator) that
-ends with it, a fixed hash seed, one BLAS thread, and its credentials through an inherited descriptor. Agents are
-forked from a zygote, or are interpreters of their own. They stay in the emulator's session: Linux shares processors
-out between sessions first (autogroups, sched(7), where no CPU cgroup does), whatever their niceness.
+ends with it, a fixed hash seed, the same arithmetic, and its credentials through an inherited descriptor. Agents
+are forked from a zygote, or are interpreters of their own. They stay in the emulator's session: Linux shares
+processors out between sessions first (autogroups, sched(7), where no CPU cgroup does), whatever their niceness.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from emulator.drivers.process_group import GroupProcess
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
 from vnet.errors import VnetError
 from vnet.runtime import forking
-from vnet.runtime.environment import ONE_BLAS_THREAD
+from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.transport.access import Access, node_user
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import default_time_slice
@@ -221,7 +221,7 @@ class Launcher:
                     pass_fds=[read_end],
                     process_group=None if own_session else 0,
                     start_new_session=own_session,
-                    env={**ONE_BLAS_THREAD, **os.environ, **environment},
+                    env={**SAME_ARITHMETIC, **os.environ, **environment},
                 )
         except OSError as error:
             raise _cannot_start(name, error.strerror) from None

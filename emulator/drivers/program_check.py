@@ -17,7 +17,7 @@ from emulator.drivers.zygote import AGENT_ENVIRONMENT
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import ProgramError
-from vnet.runtime.environment import ONE_BLAS_THREAD
+from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 
 _LONGEST_REASON = 1 << 16
@@ -41,7 +41,7 @@ class ProgramCheck:
                 stderr=subprocess.DEVNULL,
                 pass_fds=[write_end],
                 process_group=0,  # Ctrl-C in the terminal is the emulator's
-                env={**ONE_BLAS_THREAD, **os.environ, **AGENT_ENVIRONMENT},
+                env={**SAME_ARITHMETIC, **os.environ, **AGENT_ENVIRONMENT},
             )
         finally:
             os.close(write_end)

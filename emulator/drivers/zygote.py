@@ -22,7 +22,7 @@ from typing import Protocol
 from emulator.drivers.process_group import has_ended, rest_of_group_ended, wait_until_ended
 from vnet.errors import VnetError
 from vnet.runtime import forking
-from vnet.runtime.environment import KEPT_MEMORY, ONE_BLAS_THREAD
+from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.scheduling import default_time_slice
 from vnet.transport.session import AGENT_RUNTIME
@@ -172,7 +172,7 @@ class Zygote:
                     stderr=subprocess.STDOUT,
                     pass_fds=[other_end.fileno()],
                     process_group=0,
-                    env={**ONE_BLAS_THREAD, **os.environ, **AGENT_ENVIRONMENT},
+                    env={**SAME_ARITHMETIC, **os.environ, **AGENT_ENVIRONMENT},
                 )
         except OSError as error:
             raise VnetError(f"cannot start the process from which agents are forked: {error.strerror}") from None

@@ -67,7 +67,7 @@ def test_importing_the_package_imports_nothing_heavy() -> None:
 
 @pytest.fixture
 def fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have this process count as one with hash seed 0 and one thread of linear algebra."""
+    """Have this process count as one with hash seed 0 and the arithmetic of other processors."""
     monkeypatch.setattr("emulator.api.is_fit", lambda: True)
 
 

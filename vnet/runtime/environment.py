@@ -6,14 +6,54 @@ vnet changes nothing. This module imports nothing heavy: BLAS reads its variable
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
+from collections.abc import Collection
+from pathlib import Path
 
 from vnet.runtime import interrupts
 from vnet.runtime.own_packages import foreign_on_path
 
-ONE_BLAS_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""One thread of linear algebra: more would not be faster here, and less reproducible."""
+
+def same_arithmetic(processor_flags: Collection[str]) -> dict[str, str]:
+    """Return the variables with which numpy computes the same bits on every x86-64 processor that has AVX2.
+
+    One thread of linear algebra: more would not be faster here. OpenBLAS otherwise takes the kernel made for the
+    processor it finds, and numpy the widest vectors; sums are then rounded elsewhere, and runs part.
+
+    Args:
+        processor_flags: what the processor can do, in the words of Linux.
+    """
+    threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    if not {"avx2", "fma"} <= set(processor_flags):
+        return threads  # a kernel for AVX2 would end the process
+    return threads | {
+        "OPENBLAS_CORETYPE": "Haswell",
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",  # names of numpy from 2.4 on
+    }
+
+
+def _processor_flags() -> list[str]:
+    with contextlib.suppress(OSError), Path("/proc/cpuinfo").open(errors="replace") as lines:
+        return next((line.partition(":")[2].split() for line in lines if line.startswith("flags")), [])
+    return []
+
+
+SAME_ARITHMETIC = same_arithmetic(_processor_flags())
+"""The variables of this machine."""
+
+
+def has_same_arithmetic() -> bool:
+    """Return whether this process was started to compute as on other machines, as far as this one can."""
+    return all(os.environ.get(name) == value for name, value in SAME_ARITHMETIC.items())
+
+
+def arithmetic() -> str:
+    """Return where numpy computes the same bits: on all processors with `AVX2`, or on `this processor`."""
+    same = has_same_arithmetic() and "OPENBLAS_CORETYPE" in SAME_ARITHMETIC
+    return "AVX2" if same else "this processor"
+
 
 KEPT_MEMORY = {
     "MALLOC_TRIM_THRESHOLD_": str(64 * 2**20),
@@ -38,9 +78,9 @@ def open_standard_descriptors() -> None:
             setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
 
 
-def use_one_blas_thread() -> None:
-    """Have numpy, once it is imported, compute in one thread, unless the environment already says otherwise."""
-    for name, value in ONE_BLAS_THREAD.items():
+def use_same_arithmetic() -> None:
+    """Have numpy, once imported, compute as on other machines, unless the environment says otherwise."""
+    for name, value in SAME_ARITHMETIC.items():
         os.environ.setdefault(name, value)
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from tests.support.paths import ROOT
-from vnet.runtime.environment import ONE_BLAS_THREAD
+from vnet.runtime.environment import SAME_ARITHMETIC, same_arithmetic
 
-PLAIN = {key: value for key, value in os.environ.items() if key not in {*ONE_BLAS_THREAD, "PYTHONHASHSEED"}}
+PLAIN = {key: value for key, value in os.environ.items() if key not in {*SAME_ARITHMETIC, "PYTHONHASHSEED"}}
 LOOK = "import json, os, sys; print(json.dumps([dict(os.environ), 'numpy' in sys.modules]))"
 
 
@@ -32,7 +32,7 @@ def test_what_sets_the_environment_imports_no_numpy() -> None:
     done = python("-c", f"import {modules}; {LOOK}")
     environment, numpy = json.loads(done.stdout)
     assert not numpy
-    assert not set(ONE_BLAS_THREAD) & set(environment)
+    assert not set(SAME_ARITHMETIC) & set(environment)
 
 
 # A package that python imports at its start, to see the environment when numpy is imported, and to end there.
@@ -56,13 +56,13 @@ ENTRY_POINTS = {
 
 @pytest.mark.parametrize("arguments", ENTRY_POINTS.values(), ids=ENTRY_POINTS.keys())
 @pytest.mark.parametrize("own", [{}, {"OMP_NUM_THREADS": "2"}], ids=["default", "own"])
-def test_an_entry_point_sets_one_thread_before_numpy_is_imported_unless_told_otherwise(
+def test_an_entry_point_sets_the_arithmetic_before_numpy_is_imported_unless_told_otherwise(
     arguments: list[str], own: dict[str, str], tmp_path: Path
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(SPY)
     done = python(*arguments, PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}", PYTHONHASHSEED="0", **own)
     seen = json.loads(done.stdout)
-    assert {name: seen.get(name) for name in ONE_BLAS_THREAD} == {**ONE_BLAS_THREAD, **own}
+    assert {name: seen.get(name) for name in SAME_ARITHMETIC} == {**SAME_ARITHMETIC, **own}
 
 
 def test_a_command_starts_itself_again_with_a_fixed_hash_seed() -> None:
@@ -100,3 +100,23 @@ def test_files_do_not_take_the_place_of_closed_standard_output(closed: str, tmp_
     done = subprocess.run(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)})
     assert done.returncode == 0
     assert int((tmp_path / "first.txt").read_text()) > 2, "and what was said is not in it"
+
+
+def test_a_processor_with_avx2_computes_as_all_that_have_it() -> None:
+    new, old = same_arithmetic(["sse2", "avx", "fma", "avx2", "avx512f"]), same_arithmetic(["sse2", "avx"])
+    assert new["OPENBLAS_CORETYPE"] == "Haswell" and old.items() < new.items()
+    assert "OPENBLAS_CORETYPE" not in old, "a kernel for AVX2 would end the process"
+
+
+@pytest.mark.skipif("OPENBLAS_CORETYPE" not in SAME_ARITHMETIC, reason="this processor has no AVX2")
+def test_openblas_and_numpy_take_what_they_are_told_and_a_run_says_so() -> None:
+    program = (
+        "from numpy._core._multiarray_umath import __cpu_features__ as features\n"
+        "from vnet.runtime.environment import arithmetic\n"
+        "print(features['X86_V4'], arithmetic())\n"
+    )
+    done = python("-W", "error", "-c", program, OPENBLAS_VERBOSE="2", **SAME_ARITHMETIC)
+    assert "Core: Haswell" in done.stdout + done.stderr
+    assert done.stdout.splitlines()[-1] == "False AVX2"
+    other = python("-c", program, **SAME_ARITHMETIC | {"OPENBLAS_CORETYPE": "Nehalem"})
+    assert other.stdout.splitlines()[-1] == "False this processor"
