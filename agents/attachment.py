@@ -15,7 +15,9 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 import zenoh
+from msgspec.structs import replace
 
+from agents.unit_keys import UnitKeys
 from vnet.errors import TransportError, WireError
 from vnet.transport import keys, wire
 
@@ -36,7 +38,11 @@ class Found:
     """Stands in the message queue for: the emulator is there (again)."""
 
 
-Item = tuple[bytes, int] | type[Lost] | type[Found]
+class MessageCame:
+    """Stands in the message queue for: a message of the backbone has come on a unit's own key."""
+
+
+Item = tuple[bytes, int] | type[Lost] | type[Found] | type[MessageCame]
 """Entry of the queue that Zenoh's threads fill: a message with its arrival (monotonic ns), or a state."""
 
 
@@ -55,6 +61,7 @@ class Attachment:
         self._malformed = 0
         self._host = socket.gethostname()
         self._main_thread = threading.main_thread().ident
+        self.units: UnitKeys | None = None
         self._publishers = {
             node: stack.enter_context(
                 session.declare_publisher(
@@ -92,6 +99,15 @@ class Attachment:
         self.inbox.put(Found if sample.kind == zenoh.SampleKind.PUT else Lost)
         self.on_message(b"")
 
+    def open_units(self, session: zenoh.Session, run: str, units: Sequence[str], stack: ExitStack) -> None:
+        """Open the keys of roadside units, whose messages come there: after their welcome, and before all else."""
+        if units:
+            self.units = UnitKeys(session, run, units, self._message_came, stack)
+
+    def _message_came(self) -> None:
+        self.inbox.put(MessageCame)
+        self.on_message(b"")
+
     def _stack(self) -> str:
         frame = sys._current_frames().get(self._main_thread or 0)
         return "".join(traceback.format_stack(frame)[-12:]) if frame else ""
@@ -99,7 +115,9 @@ class Attachment:
     # The program's thread.
 
     def say(self, message: wire.AgentMessage) -> None:
-        """Put a message on the process's own `tx`."""
+        """Put a message on the process's own `tx`, and before it the messages of units on theirs."""
+        if self.units is not None:
+            message = self.units.put(message)
         self._publishers[self.nodes[0]].put(wire.encode(message))
 
     def publish(self, traffic: wire.Traffic) -> None:
@@ -157,7 +175,15 @@ class Attachment:
         message = None
         while message is None:
             message = self._next(None)
+        if isinstance(message, wire.Grant) and message.messages and self.units is not None:
+            return self._in_full(message, self.units)
         return message
+
+    def _in_full(self, grant: wire.Grant, units: UnitKeys) -> wire.Grant:
+        """Return a grant with the messages of units in the place of references, once all have come."""
+        while units.missing(grant.messages):
+            self._next(None)
+        return replace(grant, messages=units.take(grant.messages)[0])
 
     def _next(self, timeout_s: float | None) -> wire.EmulatorMessage | None:
         try:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from agents.attachment import Attachment, Found, RunOverError, no_wake, write_line
+from agents.attachment import Attachment, Found, MessageCame, RunOverError, no_wake, write_line
 from vnet.errors import ProgramError, TransportError, VnetError
 from vnet.runtime import interrupts
 from vnet.runtime.ahead import RunAhead
@@ -25,6 +25,7 @@ from vnet.runtime.mail import Mail
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import lateness, wire
+from vnet.transport.backbone import MessageRef
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
 from vnet.transport.session import open_client
@@ -68,6 +69,7 @@ def run_agent(
             attachment.say_hello(failure=str(error))
             raise
         gc.freeze()  # what is loaded stays: it need not be searched for garbage again and again
+        attachment.open_units(session, run, [each.node for each in welcomes if each.unit is not None], stack)
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
             _run_lockstep(attachment, welcomes, programs, disks, debugger)
@@ -163,6 +165,8 @@ class _RealTimeAgent:
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
         self._lateness = [0] * lateness.LATENESS_BINS
+        self._unseen: list[MessageRef] = []
+        """Messages of the backbone to which a batch has referred and that have not come."""
         self._orphan_timer: asyncio.TimerHandle | None = None
 
     def _now_ns(self) -> int:
@@ -213,7 +217,9 @@ class _RealTimeAgent:
         try:
             while True:
                 item = self._attachment.inbox.get_nowait()
-                if not isinstance(item, tuple):
+                if item is MessageCame:
+                    self._deliver_messages()
+                elif not isinstance(item, tuple):
                     self._emulator_present(item is Found)
                 elif isinstance(message := self._attachment.decode(item), wire.Batch):
                     self._take(message, item[1])
@@ -255,7 +261,16 @@ class _RealTimeAgent:
         for packet in () if batch.held else batch.packets:
             self._lateness[lateness.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
-        self._host.mail.deliver_news([*batch.results, *batch.messages])
+        self._host.mail.deliver_news(batch.results)
+        if batch.messages:
+            self._unseen += batch.messages
+            self._deliver_messages()
+
+    def _deliver_messages(self) -> None:
+        """Deliver those messages of the backbone that batches have referred to and that have come."""
+        if self._attachment.units is not None and self._unseen:
+            arrived, self._unseen = self._attachment.units.take(self._unseen)
+            self._host.mail.deliver_news(arrived)
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:
@@ -274,8 +289,10 @@ class _RealTimeAgent:
                 traffic,
                 wire.Lateness(self._lateness),
                 final,
+                self._unseen,
             )
         )
+        self._unseen = []
         self._seq += 1
         self._missed = []
         self._attachment.publish(traffic)

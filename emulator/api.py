@@ -140,7 +140,7 @@ def run_into(scenario: Scenario, out: Path | None) -> Path:
         emulation = Emulation(scenario, build_world(scenario), RunFolder.prepare(out, scenario))
         check.wait()
     groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
-    options = LiveOptions(Access.create(scenario.run.name, groups))
+    options = LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
     emulation.folder.open(scenario)
     wall_s, interrupted = asyncio.run(run_live(emulation, options))
     conclude(emulation, wall_s, "run")

@@ -123,7 +123,7 @@ def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
     if live:
         quiet_zenoh()
         groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
-        options = LiveOptions(Access.create(scenario.run.name, groups))
+        options = LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
         wall_s, interrupted = asyncio.run(run_live(emulation, options, lambda state: None))
     else:
         wall_s, interrupted = simulate(emulation)

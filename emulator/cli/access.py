@@ -77,7 +77,7 @@ def create_access(
     """New users of a run, on these hosts; with certificates where the router listens at tls/HOST:PORT."""
     groups = split_into_processes(world.node_ids, scenario.run.nodes_per_process)
     certify = certifier(listen, tls_names) if is_tls(listen) else None
-    return Access.create(scenario.run.name, groups, certify, hosts)
+    return Access.create(scenario.run.name, groups, certify, hosts, scenario.unit_ids)
 
 
 def load_or_create_access(
@@ -90,7 +90,8 @@ def load_or_create_access(
     if (folder / "access.json").exists() or separate:
         access = Access.load(folder)
         nodes = {node for process in access.processes for node in process}
-        if access.run != scenario.run.name or nodes != set(world.node_ids):
+        is_same = nodes == set(world.node_ids) and set(access.units) == set(scenario.unit_ids)
+        if access.run != scenario.run.name or not is_same:
             raise TransportError(
                 f"access folder {folder} was made for another scenario; write a new one with: vnet access"
             )

@@ -16,7 +16,7 @@ import zenoh
 from emulator.drivers.router import SeparateRouter
 from emulator.viewer.sinks import Sinks
 from vnet.runtime.debug_target import DebugTarget
-from vnet.transport import keys, wire
+from vnet.transport import backbone_keys, keys, wire
 from vnet.transport.access import EMULATOR, Access
 from vnet.transport.session import open_client, open_router, router_endpoint
 
@@ -44,7 +44,8 @@ class LiveOptions:
 class Attachment:
     """The emulator's end of the wire. The callbacks run on Zenoh's threads, with a name or a verb.
 
-    With hosts, `to_hosted` takes what is said to nodes, and `send_host` sends it to their hosts in bundles.
+    With hosts, `to_hosted` takes what is said to nodes, `to_hosted_unit` what is on keys of the backbone, and
+    `send_host` sends it to their hosts in bundles.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Attachment:
         on_query: Callable[[str, zenoh.Query], None],
         on_host_tx: Callable[[str, bytes], None] = lambda host, payload: None,
         on_host_alive: Callable[[str, bool], None] = lambda host, alive: None,
+        on_backbone: Callable[[str, bytes], None] = lambda unit, payload: None,
     ) -> None:
         self._connect = options.connect if options.router is None else options.router.endpoint
         self.endpoint = self._connect or options.listen
@@ -71,9 +73,12 @@ class Attachment:
         self._on_query = on_query
         self._on_host_tx = on_host_tx
         self._on_host_alive = on_host_alive
+        self._on_backbone = on_backbone
         self.to_hosted: Callable[[str, wire.EmulatorMessage], None] | None = None
+        self.to_hosted_unit: Callable[[str, bytes], None] | None = None
         self._stack = ExitStack()
         self._rx: dict[str, zenoh.Publisher] = {}
+        self._unit_rx: dict[str, zenoh.Publisher] = {}
         self._host_rx: dict[str, zenoh.Publisher] = {}
         self._observers: dict[str, zenoh.Publisher] = {}
 
@@ -96,6 +101,7 @@ class Attachment:
             for node in self._node_ids
             if not options.access.hosts
         }
+        self._open_units(session, control)
         self._open_hosts(session)
         self._observers = {
             stream: stack.enter_context(
@@ -111,6 +117,24 @@ class Attachment:
         stack.enter_context(liveliness.declare_subscriber(alive, self._take_alive, history=True))
         stack.enter_context(session.declare_queryable(keys.control(self._run, "*"), self._take_query))
         stack.enter_context(liveliness.declare_token(keys.emulator_alive(self._run)))
+
+    def _open_units(self, session: zenoh.Session, control: zenoh.CongestionControl) -> None:
+        """Declare the keys of the backbone, if there is one; those of units on hosts are their hosts' to declare.
+
+        It comes before `tx` of nodes: who has been heard there can put a message here.
+        """
+        units = () if self._options.access.hosts else self._options.access.units
+        self._unit_rx = {
+            unit: self._stack.enter_context(
+                session.declare_publisher(
+                    keys.backbone_rx(self._run, unit), congestion_control=control, express=True
+                )
+            )
+            for unit in units
+        }
+        if units:
+            tx = keys.backbone_tx(self._run, "*")
+            self._stack.enter_context(session.declare_subscriber(tx, self._take_backbone))
 
     def _open_hosts(self, session: zenoh.Session) -> None:
         """Declare the keys of hosts, if there are any. A host that cannot be reached is closed after a while."""
@@ -136,6 +160,9 @@ class Attachment:
     def _take_tx(self, sample: zenoh.Sample) -> None:
         self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
 
+    def _take_backbone(self, sample: zenoh.Sample) -> None:
+        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
+
     def _take_alive(self, sample: zenoh.Sample) -> None:
         self._on_alive(keys.node_of(str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
@@ -153,11 +180,21 @@ class Attachment:
         return node in self._node_ids
 
     def send(self, node: str, message: wire.EmulatorMessage) -> None:
-        """Say something to a node."""
+        """Say something to a node, having put the messages of units in it on their keys."""
+        if isinstance(message, wire.Grant | wire.Batch) and message.messages:
+            message, contents = backbone_keys.split_grant(message)
+            for unit, content in contents:
+                self._put_content(unit, backbone_keys.encode(content))
         if self.to_hosted is not None:
             self.to_hosted(node, message)
         else:
             self._rx[node].put(wire.encode(message))
+
+    def _put_content(self, unit: str, payload: bytes) -> None:
+        if self.to_hosted_unit is not None:
+            self.to_hosted_unit(unit, payload)
+        else:
+            self._unit_rx[unit].put(payload)
 
     def send_host(self, host: str, payload: bytes) -> None:
         """Put an encoded message on the `rx` of a host."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from heapq import heappop, heappush
+from itertools import count
 from typing import NamedTuple
 
 import pyarrow as pa
@@ -19,7 +20,7 @@ from emulator.scenario.random_streams import Draws
 from emulator.scenario.roadside import Backbone
 from emulator.scenario.scenario import Scenario
 from vnet.backbone import UnitAbilities
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport.backbone import MessageRef, SentMessage, WireMessage, sent_in_full
 from vnet.units import NS_PER_MS
 
 
@@ -51,6 +52,8 @@ class BackboneNetwork:
         self._undecided: list[_Sent] = []
         """Heap of the messages of which it is open whether their receivers are up when they arrive."""
         self._rows: list[BackboneRow] = []
+        self._numbers = count()
+        """Numbers of arrivals, of which no two are equal: a process knows them by these."""
 
     def abilities(self, node: str) -> UnitAbilities | None:
         """Return what a unit knows of itself; None for a vehicle."""
@@ -60,10 +63,11 @@ class BackboneNetwork:
         peers = [name for name in self._names if name != node]
         return UnitAbilities(unit.position_m, peers, self._section.max_message_bytes)
 
-    def send(self, time_ns: int, messages: Sequence[SentMessage]) -> None:
-        """Take what units send at `time_ns`. Vehicles have no backbone: what claims to be theirs is dropped."""
-        for message in messages:
-            if message.node in self._names and len(message.payload) <= self._section.max_message_bytes:
+    def send(self, time_ns: int, messages: Sequence[MessageRef]) -> None:
+        """Take what units that are up send at `time_ns`; what claims to be of others is dropped."""
+        for message in sent_in_full(messages):
+            fits = len(message.payload) <= self._section.max_message_bytes
+            if message.node in self._names and fits and self._up[message.node]:
                 self._send(time_ns, self._names.index(message.node), message)
 
     def _send(self, time_ns: int, sender: int, message: SentMessage) -> None:
@@ -93,7 +97,8 @@ class BackboneNetwork:
         while self._unseen and self._unseen[0].arrival_ns <= time_ns:
             sent = heappop(self._unseen)
             receiver, sender = self._names[sent.receiver], self._names[sent.sender]
-            taken.append(WireMessage(receiver, sender, sent.sent_ns, sent.arrival_ns, sent.payload))
+            number = next(self._numbers)
+            taken.append(WireMessage(receiver, number, sender, sent.sent_ns, sent.arrival_ns, sent.payload))
         return taken
 
     def decide(self, time_ns: int) -> None:

@@ -223,7 +223,7 @@ class Emulation:
             unhandled.extend(part.unhandled)
             notes.extend(part.notes)
             self.orders.take(part.deviations)
-            self.backbone.send(time_ns, [message for message in part.messages if self.up[message.node]])
+            self.backbone.send(time_ns, part.messages)
             self.driving.take(time_ns, (action for action in part.actions if self.up[action.node]))
         if frames:
             self._place(time_ns // self.world.period_ns)

@@ -93,6 +93,11 @@ class Membership:
         member = self._members.get(process_id)
         return member is not None and member.nonce == nonce and member.process_id == process_id
 
+    def is_of(self, node: str, nonce: bytes) -> bool:
+        """Return whether the process of a node has this nonce."""
+        member = self._members.get(node)
+        return member is not None and member.nonce == nonce
+
     def nodes_with(self, process_id: str) -> list[str]:
         """Nodes of a process, its id first."""
         others = [

@@ -16,6 +16,7 @@ from emulator.drivers.protocol import check_ownership, wire_packet
 from emulator.radio.engine import Delivery
 from vnet.runtime.news import NewsItem
 from vnet.transport import lateness, wire
+from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.units import NS_PER_S
 
 WORST_PROCESSES = 8
@@ -105,6 +106,11 @@ class RealTime:
         else:
             self._emulation.take_final(self._emulation.duration_ns, [message.traffic])
 
+    def take_messages(self, now_ns: int, messages: Sequence[SentMessage]) -> None:
+        """Take messages of the backbone that have come later than the frames that refer to them."""
+        if now_ns < self._emulation.duration_ns:
+            self._emulation.take(now_ns, [wire.Traffic(messages=messages)])
+
     @property
     def awaited(self) -> frozenset[str]:
         """The processes that have not sent their last message, and are neither dead nor taken by a fault."""
@@ -112,6 +118,11 @@ class RealTime:
 
     def _acknowledge(self, process_id: str, message: wire.Frames) -> None:
         waiting = self._unacknowledged[process_id]
+        if message.unseen:
+            self.gaps += 1
+            news = [item for sent in waiting.values() for item in sent.news if isinstance(item, WireMessage)]
+            unseen = {(ref.node, ref.number) for ref in message.unseen}
+            self._news.repeat(item for item in news if (item.node, item.number) in unseen)
         for first, last in message.missed:
             self.gaps += 1
             for seq in [seq for seq in waiting if first <= seq <= last]:

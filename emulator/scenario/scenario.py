@@ -239,6 +239,11 @@ class Scenario(Section):
         return self.network.driven or Driven()
 
     @property
+    def unit_ids(self) -> tuple[str, ...]:
+        """Ids of the roadside units."""
+        return tuple(unit.name for unit in self.roadside)
+
+    @property
     def healed_s(self) -> float:
         """Time at which all faults have healed, in emulated seconds."""
         return self.run.duration_s - self.run.settle_s

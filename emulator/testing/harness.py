@@ -72,9 +72,10 @@ class RunHarness:
 
     def _live_run(self) -> SteppedRun:
         quiet_zenoh()
-        run = self._emulation.scenario.run
-        groups = split_into_processes(self._emulation.world.node_ids, run.nodes_per_process)
-        return SteppedLiveRun(self._emulation, LiveOptions(Access.create(run.name, groups)))
+        scenario = self._emulation.scenario
+        groups = split_into_processes(self._emulation.world.node_ids, scenario.run.nodes_per_process)
+        access = Access.create(scenario.run.name, groups, units=scenario.unit_ids)
+        return SteppedLiveRun(self._emulation, LiveOptions(access))
 
     # What there is to see.
 

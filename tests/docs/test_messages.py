@@ -19,13 +19,14 @@ from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
 from tests.docs.layouts import Field, Layouts, split
 from tests.support.paths import ROOT
-from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times
+from tests.vnet.transport.test_wire import agent_messages, emulator_messages, names, reports, times, unit_messages
 from vnet.backbone import UnitAbilities
 from vnet.driving import Action
 from vnet.errors import WireError
 from vnet.reports import Report
-from vnet.transport import keys, wire
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport import backbone_keys, keys, wire
+from vnet.transport.backbone import MessageRef
+from vnet.transport.backbone_keys import Arrived, Sent
 from vnet.transport.orders import Deviation, Order
 from vnet.transport.send_results import WireSendResult
 
@@ -33,6 +34,13 @@ PAGE = Layouts()
 OF_AGENTS = {kind.__name__: kind for kind in (wire.Hello, wire.Yield, wire.Frames, wire.Final, wire.StackDump)}
 OF_THE_EMULATOR = {
     kind.__name__: kind for kind in (wire.Welcome, wire.Grant, wire.Batch, wire.StackRequest, wire.Await, wire.End)
+}
+ON_THE_BACKBONE = {"Sent": Sent, "Arrived": Arrived}
+DECODERS = {
+    **dict.fromkeys(OF_AGENTS, wire.decode_tx),
+    **dict.fromkeys(OF_THE_EMULATOR, wire.decode_rx),
+    "Sent": backbone_keys.decode_sent,
+    "Arrived": backbone_keys.decode_arrived,
 }
 PARTS = {
     "Step": wire.Step,
@@ -50,8 +58,7 @@ PARTS = {
     "ClockError": wire.ClockError,
     "BusyRatios": wire.BusyRatios,
     "SendResult": WireSendResult,
-    "SentMessage": SentMessage,
-    "Message": WireMessage,
+    "MessageRef": MessageRef,
     "UnitAbilities": UnitAbilities,
 }
 welcomes = st.builds(
@@ -77,7 +84,7 @@ welcomes = st.builds(
 def test_every_kind_of_message_is_on_the_page() -> None:
     assert set(wire.AgentMessage.__args__) == set(OF_AGENTS.values())
     assert set(wire.EmulatorMessage.__args__) == set(OF_THE_EMULATOR.values())
-    documented = {**OF_AGENTS, **OF_THE_EMULATOR, **PARTS}
+    documented = {**OF_AGENTS, **OF_THE_EMULATOR, **ON_THE_BACKBONE, **PARTS}
     assert PAGE.by_name.keys() - documented.keys() == {"Report", "Scene", "Period", "RunEnd"}
     for name, kind in documented.items():
         assert [field.name for field in PAGE.by_name[name]] == _fields_of(kind), name
@@ -92,7 +99,7 @@ def _fields_of(kind: Any) -> list[str]:
 
 
 @settings(max_examples=100, deadline=None)
-@given(agent_messages | emulator_messages | welcomes)
+@given(agent_messages | emulator_messages | unit_messages | welcomes)
 def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
     kind, *values = msgpack.unpackb(wire.encode(message))
     assert kind == type(message).__name__
@@ -136,9 +143,9 @@ def test_a_plain_reader_decodes_what_observers_get(tmp_path: Path) -> None:
 # An independent writer.
 
 
-@pytest.mark.parametrize("kind", [*OF_AGENTS, *OF_THE_EMULATOR])
+@pytest.mark.parametrize("kind", DECODERS)
 def test_vnet_accepts_what_a_plain_writer_encodes(kind: str) -> None:
-    decode = wire.decode_tx if kind in OF_AGENTS else wire.decode_rx
+    decode: Any = DECODERS[kind]
 
     @settings(max_examples=20, deadline=None)
     @given(PAGE.values(kind))
@@ -172,9 +179,9 @@ def example(kind: str) -> list[Any]:
     return [value(field) for field in PAGE.by_name[kind]]
 
 
-@pytest.mark.parametrize(("kind", "index", "field"), fields({**OF_AGENTS, **OF_THE_EMULATOR}))
+@pytest.mark.parametrize(("kind", "index", "field"), fields(DECODERS))
 def test_vnet_refuses_what_the_page_does_not_allow(kind: str, index: int, field: Field) -> None:
-    decode = wire.decode_tx if kind in OF_AGENTS else wire.decode_rx
+    decode: Any = DECODERS[kind]
     values = example(kind)
     if PAGE.problem_of(kind, values):  # a lateness of nil is one that an example need not have
         values = [
@@ -209,6 +216,7 @@ def test_a_reader_that_is_told_nonsense_says_so() -> None:
 def test_the_keys_are_those_of_the_page() -> None:
     text = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
     made = [make("RUN", "ID") for make in (keys.node_tx, keys.node_rx, keys.node_report, keys.node_alive)]
+    made += [make("RUN", "ID") for make in (keys.backbone_tx, keys.backbone_rx)]
     made += [make("RUN", "NAME") for make in (keys.host_tx, keys.host_rx, keys.host_alive)]
     made += [keys.emulator_alive("RUN"), keys.observe("RUN", "STREAM"), keys.control("RUN", "VERB")]
     assert [key for key in made if f"| `{key}` |" not in text] == []

@@ -14,6 +14,7 @@ from emulator.scenario.faults import KINDS
 from tests.support import maps
 from vnet.reports import Report
 from vnet.transport import lateness, wire
+from vnet.transport.backbone_keys import Sent
 
 OVERRIDE = b"\n--set "
 """Separator between a scenario file and each override in one input of the scenario target."""
@@ -55,6 +56,7 @@ TX: tuple[wire.AgentMessage, ...] = (
     wire.Final(b"n" * 16, TRAFFIC),
     wire.StackDump(b"n" * 16, "File …", 5),
 )
+UNIT_SENT = Sent(b"nonce", 3, "rsu02", b"payload")
 HOST_TX: tuple[messages.FromHost, ...] = (
     messages.HostHello("a", b"n" * 16, 1, "there", "digest", True, None),
     messages.News(

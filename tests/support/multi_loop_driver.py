@@ -14,6 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from msgspec.structs import replace
+
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.lockstep import Lockstep
@@ -26,7 +28,9 @@ from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
 from vnet.runtime.programs import load_programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
-from vnet.transport import wire
+from vnet.transport import backbone_keys, wire
+from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport.backbone_keys import Contents
 
 _folders = TemporaryDirectory(prefix="vnet-apart-")
 atexit.register(_folders.cleanup)
@@ -52,7 +56,7 @@ def scenario_of(faults: Sequence[dict[str, Any]], program: str, vehicles: int = 
         "fault": list(faults),
     }
     for name, section in sections.items():
-        data[name] = {**data.get(name, {}), **section}
+        data[name] = section if isinstance(section, list) else {**data.get(name, {}), **section}
     return Scenario.model_validate(data)
 
 
@@ -92,7 +96,7 @@ def run_apart(scenario: Scenario) -> Emulation:
                     if any(node in actions.start for node in nodes):
                         processes[process_id] = _Process(emulation, nodes)
             for process_id, grant in grants.items():
-                processes[process_id].grants.put(wire.encode(grant))
+                processes[process_id].put_grant(grant)
             for process_id in grants:
                 lockstep.receive(process_id, processes[process_id].take_yield())
             grants = lockstep.step()
@@ -106,8 +110,8 @@ class _Process:
     """One process of nodes, as a thread; see agents/host.py."""
 
     def __init__(self, emulation: Emulation, nodes: Sequence[str]) -> None:
-        self.grants: queue.SimpleQueue[bytes | type[BaseException]] = queue.SimpleQueue()
-        self.yields: queue.SimpleQueue[bytes | BaseException] = queue.SimpleQueue()
+        self.grants: queue.SimpleQueue[list[bytes] | type[BaseException]] = queue.SimpleQueue()
+        self.yields: queue.SimpleQueue[list[bytes] | BaseException] = queue.SimpleQueue()
         encoded = [wire.encode(emulation.welcome(node, b"n")) for node in nodes]
         decoded = [wire.decode_rx(welcome) for welcome in encoded]
         self._welcomes = [message for message in decoded if isinstance(message, wire.Welcome)]
@@ -122,9 +126,19 @@ class _Process:
         message = self.yields.get(timeout=60)
         if isinstance(message, BaseException):
             raise message
-        decoded = wire.decode_tx(message)
+        units = [unit for unit, _ in self._sent]
+        sent: Contents[SentMessage] = Contents()
+        for unit, content in zip(units, message[1:], strict=True):
+            sent.add(backbone_keys.decode_sent(content).message(unit))
+        decoded = wire.decode_tx(message[0])
         assert isinstance(decoded, wire.Yield)
-        return decoded
+        return backbone_keys.join_yield(decoded, sent)
+
+    def put_grant(self, grant: wire.Grant) -> None:
+        """Have the process take a grant, with the messages of its units beside it."""
+        split, contents = backbone_keys.split_grant(grant)
+        self._arrived = [unit for unit, _ in contents]
+        self.grants.put([wire.encode(split), *(backbone_keys.encode(content) for _, content in contents)])
 
     def end(self, killed: bool) -> list[wire.Traffic]:
         """End it from the emulator's side, and wait until it has; returns what it said last, if it could."""
@@ -145,14 +159,19 @@ class _Process:
         item = self.grants.get()
         if isinstance(item, type):
             raise item
-        grant = wire.decode_rx(item)
+        grant = wire.decode_rx(item[0])
         assert isinstance(grant, wire.Grant)
+        arrived: Contents[WireMessage] = Contents()
+        for unit, content in zip(self._arrived, item[1:], strict=True):
+            arrived.add(backbone_keys.decode_arrived(content).message(unit))
+        grant = replace(grant, messages=arrived.split(grant.messages)[0])
         self._seq = grant.seq
         self._host.apply_clock_error(grant.clocks, self._loop)
         return self._ahead.open_window(grant)
 
     def _swap(self, next_timer_ns: int | None) -> int:
-        self.yields.put(wire.encode(self._host.make_yield(b"n", self._seq, next_timer_ns)))
+        message, self._sent = backbone_keys.split_yield(self._host.make_yield(b"n", self._seq, next_timer_ns))
+        self.yields.put([wire.encode(message), *(backbone_keys.encode(content) for _, content in self._sent)])
         return self._next_grant()
 
     def _host_programs(self) -> None:

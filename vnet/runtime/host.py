@@ -37,7 +37,7 @@ from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
-from vnet.transport.backbone import SentMessage
+from vnet.transport.backbone import SentMessage, arrived_in_full
 from vnet.transport.orders import Deviation, Order
 
 if TYPE_CHECKING:  # pdb, which few runs need
@@ -113,7 +113,7 @@ class Host:
 
     def send_message(self, node: str, to: str | None, payload: bytes) -> None:
         """Take a message for the backbone; a node that has ended is silent."""
-        self._enqueue(node, self._outbox.messages, SentMessage(node, to, payload))
+        self._enqueue(node, self._outbox.messages, SentMessage(node, next(self._outbox.numbers), to, payload))
 
     def busy_ratio(self, node: str) -> float | None:
         """Return the channel busy ratio that a node knows now."""
@@ -255,7 +255,7 @@ class Host:
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
         self.busy.add(grant.busy)
-        self.news.add(grant.results, grant.messages)
+        self.news.add(grant.results, arrived_in_full(grant.messages))
         self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 

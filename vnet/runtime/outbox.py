@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 
 from vnet.driving import Action
 from vnet.reports import Report
@@ -23,6 +24,8 @@ class Outbox:
     deviations: list[Deviation] = field(default_factory=list)
     actions: list[Action] = field(default_factory=list)
     messages: list[SentMessage] = field(default_factory=list)
+    numbers: Iterator[int] = field(default_factory=count)
+    """Numbers of messages of the backbone, of which no two are equal."""
 
     @property
     def has_any(self) -> bool:

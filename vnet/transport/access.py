@@ -47,6 +47,7 @@ class Access:
 
     With `tls` the router accepts only TLS, and a user needs its own certificate as well as its password. `hosts`
     are the ids of the processes on each host by its name, all of the run; empty if agents connect to the router.
+    `units` are the nodes that have keys of the backbone.
     """
 
     run: str
@@ -54,6 +55,7 @@ class Access:
     passwords: dict[str, str] = field(repr=False)
     tls: Certificates | None = None
     hosts: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    units: tuple[str, ...] = ()
 
     @classmethod
     def create(
@@ -62,12 +64,14 @@ class Access:
         processes: Sequence[Sequence[str]],
         certify: Callable[[Sequence[str]], Certificates] | None = None,
         hosts: Sequence[str] = (),
+        units: Sequence[str] = (),
     ) -> Access:
         """Draw new passwords for every process and role of a run.
 
         `certify` issues the certificates of all users for a router that accepts only TLS; see
         `certificates.certifier`. With `hosts` (names) the processes are on these, in equal parts in the order of
-        both, and each host has a user in place of its processes. Raise TransportError for what cannot be done.
+        both, and each host has a user in place of its processes. `units` are the nodes that are roadside units.
+        Raise TransportError for what cannot be done.
         """
         shares = _share([nodes[0] for nodes in processes], hosts)
         users = _users(processes, shares)
@@ -77,6 +81,7 @@ class Access:
             {user: secrets.token_urlsafe(24) for user in users},
             None if certify is None else certify(users),
             shares,
+            tuple(units),
         )
 
     def processes_on(self, host: str) -> list[list[str]]:
@@ -116,7 +121,7 @@ class Access:
         if self.hosts:
             roles = [(host_user(host), _host_rules(self.run, host)) for host in self.hosts]
         else:
-            roles = [(node_user(nodes[0]), _node_rules(self.run, nodes)) for nodes in self.processes]
+            roles = [(node_user(nodes[0]), self._process_rules(nodes)) for nodes in self.processes]
         observed = [
             keys.observe(self.run, "**"),
             keys.node_report(self.run, "*"),
@@ -140,6 +145,10 @@ class Access:
             ),
             (EMULATOR, [_rule("emulator", ["ingress", "egress"], EVERYTHING, [f"vnet/{self.run}/**"])]),
         ]
+
+    def _process_rules(self, nodes: Sequence[str]) -> list[Rule]:
+        units = [node for node in nodes if node in self.units]
+        return _node_rules(self.run, nodes) + (_unit_rules(self.run, nodes[0], units) if units else [])
 
     def save(self, folder: Path, listen: str, router_folder: Path) -> None:
         """Write the files for a separate `zenohd` and manually started agents. Raise TransportError on failure.
@@ -177,7 +186,7 @@ class Access:
 
     def _check(self) -> None:
         """Raise ValueError if `create` cannot have made this: rules and the dictionary are written from it."""
-        names = [self.run, *self.hosts, *(node for nodes in self.processes for node in nodes)]
+        names = [self.run, *self.hosts, *self.units, *(node for nodes in self.processes for node in nodes)]
         if not all(map(keys.is_segment, names)) or not all(self.processes):
             raise ValueError
         hosted = sorted(process_id for share in self.hosts.values() for process_id in share)
@@ -296,6 +305,17 @@ def _node_rules(run: str, nodes: Sequence[str]) -> list[Rule]:
         ),
         _rule(f"{process_id}-watch", ["ingress"], WATCH_TOKENS, emulator),
         _rule(f"{process_id}-watched", ["egress"], ["liveliness_token"], emulator),
+    ]
+
+
+def _unit_rules(run: str, process_id: str, units: Sequence[str]) -> list[Rule]:
+    """Rules of a process for the backbone of its roadside units. No other process has any there."""
+    rx = [keys.backbone_rx(run, unit) for unit in units]
+    return [
+        _rule(f"{process_id}-send", ["ingress"], ["put"], [keys.backbone_tx(run, unit) for unit in units]),
+        _rule(f"{process_id}-listen", ["ingress"], SUBSCRIBE, rx),
+        _rule(f"{process_id}-hear", ["egress"], ["put"], rx),
+        _rule(f"{process_id}-matched", ["egress"], SUBSCRIBE, [keys.backbone_tx(run, "*")]),
     ]
 
 

@@ -28,6 +28,16 @@ def node_report(run: str, node: str) -> str:
     return f"vnet/{run}/node/{node}/report"
 
 
+def backbone_tx(run: str, unit: str) -> str:
+    """Key of what a roadside unit sends over the backbone; its process's yields and frames refer to it."""
+    return f"vnet/{run}/backbone/{unit}/tx"
+
+
+def backbone_rx(run: str, unit: str) -> str:
+    """Key of what a roadside unit receives over the backbone; grants and batches refer to it."""
+    return f"vnet/{run}/backbone/{unit}/rx"
+
+
 def node_alive(run: str, node: str) -> str:
     """Key of the liveliness token of a node's process."""
     return f"vnet/{run}/node/{node}/alive"
@@ -69,7 +79,7 @@ def verb_of(key: str) -> str:
 
 
 def node_of(key: str) -> str:
-    """Return the node id in one of the `node/` keys above."""
+    """Return the node id in one of the `node/` or `backbone/` keys above."""
     return key.split("/")[3]
 
 

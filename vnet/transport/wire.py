@@ -20,7 +20,7 @@ from vnet.errors import WireError, printable
 from vnet.node import NOTHING_SENSED, Fix, Reading
 from vnet.radio import Packet
 from vnet.reports import Report
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport.backbone import MessageRef
 from vnet.transport.lateness import LATENESS_BINS
 from vnet.transport.orders import Count, Deviation, Order, TimeNs
 from vnet.transport.send_results import WireSendResult
@@ -142,7 +142,7 @@ class Traffic(msgspec.Struct, frozen=True, array_like=True):
     notes: Sequence[Note] = ()
     deviations: Sequence[Deviation] = ()
     actions: Sequence[Action] = ()
-    messages: Sequence[SentMessage] = ()
+    messages: Sequence[MessageRef] = ()
 
     def __bool__(self) -> bool:
         """Return true if there is anything in it."""
@@ -200,7 +200,10 @@ class Lateness(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Frames(Message, frozen=True):
-    """Real time: traffic since the last message; acknowledges batches up to `received_seq` without `missed`."""
+    """Real time: traffic since the last message; acknowledges batches up to `received_seq` without `missed`.
+
+    `unseen` are messages of the backbone to which batches referred and which had not come on their key by then.
+    """
 
     nonce: bytes
     seq: Count
@@ -209,6 +212,7 @@ class Frames(Message, frozen=True):
     traffic: Traffic
     lateness: Lateness | None = None
     final: bool = False
+    unseen: Sequence[MessageRef] = ()
 
 
 class Final(Message, frozen=True):
@@ -307,7 +311,7 @@ class Grant(Message, frozen=True):
     next_fixes_ns: TimeNs | None = None
     busy: Sequence[BusyRatios] = ()
     results: Sequence[WireSendResult] = ()
-    messages: Sequence[WireMessage] = ()
+    messages: Sequence[MessageRef] = ()
 
 
 class Batch(Message, frozen=True):
@@ -327,7 +331,7 @@ class Batch(Message, frozen=True):
     clocks: Sequence[ClockError] = ()
     busy: Sequence[BusyRatios] = ()
     results: Sequence[WireSendResult] = ()
-    messages: Sequence[WireMessage] = ()
+    messages: Sequence[MessageRef] = ()
 
 
 class StackRequest(Message, frozen=True):
@@ -365,19 +369,19 @@ def encode(message: AgentMessage | EmulatorMessage | Report) -> bytes:
 
 def decode_tx(data: bytes) -> AgentMessage:
     """Decode a message of an agent. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
-    _check_size(data)
-    return _decode(_agent_decoder, data)
+    check_size(data)
+    return decode(_agent_decoder, data)
 
 
 def decode_rx(data: bytes) -> EmulatorMessage:
     """Decode a message of the emulator. Raise WireError for a bad one."""
-    return _decode(_emulator_decoder, data)
+    return decode(_emulator_decoder, data)
 
 
 def decode_report(data: bytes) -> Report:
     """Decode a copy of a report. Raise WireError for a bad one, or one above `LARGEST_MESSAGE_BYTES`."""
-    _check_size(data)
-    return _decode(_report_decoder, data)
+    check_size(data)
+    return decode(_report_decoder, data)
 
 
 def encode_observation(message: dict[str, Any]) -> bytes:
@@ -387,7 +391,7 @@ def encode_observation(message: dict[str, Any]) -> bytes:
 
 def decode_observation(data: bytes) -> dict[str, Any]:
     """Decode a message to observers. Raise WireError for a bad one."""
-    return _decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
+    return decode(msgspec.msgpack.Decoder(dict[str, Any]), data)
 
 
 def is_yield(data: bytes) -> bool:
@@ -413,14 +417,16 @@ def is_packets_only(data: bytes) -> bool:
     return is_batch(data) and data[7:8] == b"\x90"
 
 
-def _decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
+def decode(decoder: msgspec.msgpack.Decoder[_M], data: bytes) -> _M:
+    """Decode a message of one kind. Raise WireError for a bad one."""
     try:
         return decoder.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise WireError(f"{len(data)} bytes are not a message: {printable(str(error), 200)}") from None
 
 
-def _check_size(data: bytes) -> None:
+def check_size(data: bytes) -> None:
+    """Raise WireError for a message above `LARGEST_MESSAGE_BYTES`."""
     # A byte can take 30 when decoded: this bounds the memory that an untrusted sender can make the emulator
     # allocate.
     if len(data) > LARGEST_MESSAGE_BYTES:

@@ -29,13 +29,16 @@ class Down:
         realtime: bool,
         on_tx: Callable[[str, bytes], None],
         on_alive: Callable[[str, bool], None],
+        on_backbone: Callable[[str, bytes], None],
     ) -> None:
         self.access = access
         self._on_tx = on_tx
         self._on_alive = on_alive
+        self._on_backbone = on_backbone
         # As at the emulator's router: in real time one frozen agent must not stall all others.
         self._control = zenoh.CongestionControl.DROP if realtime else zenoh.CongestionControl.BLOCK
         self._rx: dict[str, zenoh.Publisher] = {}
+        self._unit_rx: dict[str, zenoh.Publisher] = {}
         self._emulator_token: zenoh.LivelinessToken | None = None
 
     def open(self, stack: ExitStack) -> None:
@@ -47,6 +50,13 @@ class Down:
             self._rx[node] = stack.enter_context(
                 session.declare_publisher(keys.node_rx(run, node), congestion_control=self._control, express=True)
             )
+        for unit in self.access.units:
+            rx = keys.backbone_rx(run, unit)
+            self._unit_rx[unit] = stack.enter_context(
+                session.declare_publisher(rx, congestion_control=self._control, express=True)
+            )
+        if self.access.units:  # before `tx` of nodes, as at the emulator's router
+            stack.enter_context(session.declare_subscriber(keys.backbone_tx(run, "*"), self._take_backbone))
         stack.enter_context(session.declare_subscriber(keys.node_tx(run, "*"), self._take_tx))
         alive = keys.node_alive(run, "*")
         stack.enter_context(session.liveliness().declare_subscriber(alive, self._take_alive, history=True))
@@ -66,6 +76,14 @@ class Down:
         """Pass a message on to a node; one for a node that is not on this host is dropped."""
         if node in self._rx:
             self._rx[node].put(payload)
+
+    def put_unit(self, unit: str, payload: bytes) -> None:
+        """Pass a message of the backbone on to a unit; one for a unit that is not on this host is dropped."""
+        if unit in self._unit_rx:
+            self._unit_rx[unit].put(payload)
+
+    def _take_backbone(self, sample: zenoh.Sample) -> None:
+        self._on_backbone(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())
 
     def _take_tx(self, sample: zenoh.Sample) -> None:
         self._on_tx(keys.node_of(str(sample.key_expr)), sample.payload.to_bytes())

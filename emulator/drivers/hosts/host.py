@@ -84,10 +84,11 @@ def run_host(
         launcher.disks = folder / "disks"
         stack.callback(launcher.stop, SHUT_DOWN_S)
         down = Down(
-            Access.create(run, welcome.processes),
+            Access.create(run, welcome.processes, units=welcome.units),
             welcome.realtime,
             lambda node, payload: events.put(("tx", node, payload)),
             lambda node, alive: events.put(("alive", node, alive)),
+            lambda unit, payload: events.put(("backbone", unit, payload)),
         )
         stack.enter_context(signals_handled(lambda *_: events.put(("children", "", None)), signal.SIGCHLD))
         try:
@@ -188,6 +189,7 @@ class HostProcess:
         """Messages for which a process owed a yield, and bundles that held any."""
         self._takes: dict[type, Callable[[Any], None]] = {
             messages.ToNode: self._to_node,
+            messages.ToUnit: self._to_unit,
             messages.Start: self._start,
             messages.Kill: self._kill,
             messages.Detach: self._detach,
@@ -219,6 +221,8 @@ class HostProcess:
                 self._take_orders(value)
             case "tx":
                 self._relay.take(node, value)
+            case "backbone":
+                self._relay.take_unit(node, value)
             case "alive":
                 self._relay.add(messages.Token(node, value))
             case "emulator":
@@ -251,6 +255,9 @@ class HostProcess:
         elif order.node in self._launcher.pids:
             self._relay.granted(order.node)
         self._down.put(order.node, order.payload)
+
+    def _to_unit(self, order: messages.ToUnit) -> None:
+        self._down.put_unit(order.node, order.payload)
 
     def _start(self, order: messages.Start) -> None:
         groups = [self._nodes_of[process_id] for process_id in order.process_ids]

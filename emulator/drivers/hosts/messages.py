@@ -35,7 +35,10 @@ class HostHello(Message, frozen=True):
 
 
 class HostWelcome(Message, frozen=True):
-    """Admission of a host, with what it needs to start its agents: the node ids of each process, first."""
+    """Admission of a host, with what it needs to start its agents: the node ids of each process, first.
+
+    `units` are those of its nodes that are roadside units.
+    """
 
     nonce: bytes
     processes: Sequence[Sequence[str]]
@@ -45,6 +48,7 @@ class HostWelcome(Message, frozen=True):
     orphan_timeout_s: float
     duration_ns: int
     files_max_mb: float
+    units: Sequence[str] = ()
 
 
 class HostRefusal(Message, frozen=True):
@@ -63,6 +67,13 @@ class ToNode(Message, frozen=True):
     node: str
     payload: bytes
     awaited: bool
+
+
+class ToUnit(Message, frozen=True):
+    """A message on the `rx` of the backbone of a unit."""
+
+    node: str
+    payload: bytes
 
 
 class Start(Message, frozen=True):
@@ -115,7 +126,7 @@ class Leave(Message, frozen=True):
     """The run is over, and all has been handed in."""
 
 
-Order = ToNode | Start | Kill | Detach | Signal | Look | Patience | HandIn | Leave
+Order = ToNode | ToUnit | Start | Kill | Detach | Signal | Look | Patience | HandIn | Leave
 
 
 class Orders(Message, frozen=True):
@@ -130,6 +141,13 @@ class Orders(Message, frozen=True):
 
 class FromNode(Message, frozen=True):
     """A message that came on the `tx` of a node."""
+
+    node: str
+    payload: bytes
+
+
+class FromUnit(Message, frozen=True):
+    """A message that came on the `tx` of the backbone of a unit."""
 
     node: str
     payload: bytes
@@ -191,7 +209,7 @@ class HandedIn(Message, frozen=True):
     """All has been handed in."""
 
 
-Item = FromNode | Token | Ended | LogTail | Part | LeftOut | Figures | HandingIn | HandedIn
+Item = FromNode | FromUnit | Token | Ended | LogTail | Part | LeftOut | Figures | HandingIn | HandedIn
 
 
 class News(Message, frozen=True):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from emulator.drivers.hosts.messages import FromNode, Item
+from emulator.drivers.hosts.messages import FromNode, FromUnit, Item
 from vnet.transport import wire
 
 FULL_BYTES = 8 * 2**20
@@ -44,6 +44,11 @@ class Relay:
             self._awaited.discard(node)
         else:
             self._is_urgent = True
+
+    def take_unit(self, unit: str, payload: bytes) -> None:
+        """Take a message of a unit on its key of the backbone: it waits for the yield that refers to it."""
+        self._items.append(FromUnit(unit, payload))
+        self._size_bytes += len(payload)
 
     def add(self, item: Item) -> None:
         """Take news of the host itself, which goes at once."""

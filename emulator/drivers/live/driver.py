@@ -15,6 +15,10 @@ from emulator.drivers.live.inbox import Inbox
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.supervisor import Supervisor
 from emulator.drivers.live.waiting import ChangeSignal
+from emulator.drivers.protocol import check_ownership
+from vnet.transport import wire
+from vnet.transport.backbone import MessageRef, SentMessage
+from vnet.transport.backbone_keys import Contents
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,9 @@ class Driver(ABC):
         self._send = parts.attachment.send
         parts.supervisor.begin(processes)
         parts.inbox.handlers[self.message_type] = self.take
+        self._sent: Contents[SentMessage] = Contents()
+        """Messages that units have put on the backbone, and to which nothing has referred yet."""
+        parts.inbox.on_sent = self.take_sent
 
     @property
     @abstractmethod
@@ -61,6 +68,20 @@ class Driver(ABC):
     @abstractmethod
     def take(self, process_id: str, message: Any) -> None:
         """Take a message of a process. Raises ProtocolError to refuse it."""
+
+    @abstractmethod
+    def take_sent(self, message: SentMessage) -> None:
+        """Take what a unit has put on its key of the backbone; its process's messages say when it was sent."""
+
+    def _check_refs(self, process_id: str, refs: Sequence[MessageRef]) -> None:
+        """Raise ProtocolError if a process refers to what others have sent."""
+        if refs:
+            check_ownership(self._parts.members.nodes_with(process_id), wire.Traffic(messages=refs))
+
+    def _forget_sent(self, process_ids: Sequence[str]) -> None:
+        """Forget what earlier processes of these names have put on the backbone."""
+        for process_id in process_ids:
+            self._sent.drop(self._parts.members.nodes_with(process_id))
 
     @abstractmethod
     async def run(self) -> None:
@@ -78,6 +99,7 @@ class Driver(ABC):
             if not killed:
                 await self._await_final(process_id, actions.time_ns)
         begun = list(dict.fromkeys(map(process_of, actions.start)))
+        self._forget_sent(begun)
         self._supervisor.begin_again(begun)
         await self._await_returned(begun)
         self._supervisor.pause({process_of(node) for node in actions.paused})

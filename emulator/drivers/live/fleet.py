@@ -96,6 +96,7 @@ class Fleet:
         self.cpu_ns: Counter[str] = Counter()
         """CPU time of the agents' processes in ns, once it has been handed in."""
         self.on_message: Callable[[str, bytes], None] = lambda node, payload: None
+        self.on_backbone: Callable[[str, bytes], None] = lambda unit, payload: None
         self.on_token: Callable[[str, bool], None] = lambda node, alive: None
         self.on_ended: Callable[[str, Exit], None] = lambda process_id, how: None
         self.on_lost: Callable[[Sequence[str], str], None] = lambda process_ids, how: None
@@ -169,6 +170,10 @@ class Fleet:
         if isinstance(message, wire.Await):
             self._order(host, messages.Patience(message.within_s))
         self._order(host, messages.ToNode(node, wire.encode(message), isinstance(message, wire.Grant)))
+
+    def send_content(self, unit: str, payload: bytes) -> None:
+        """Put an encoded message on a unit's key of the backbone."""
+        self._order(self._host_of[unit], messages.ToUnit(unit, payload))
 
     def _order(self, host: _Host, order: Order) -> None:
         if host.nonce is None or host.is_gone:
@@ -244,6 +249,7 @@ class Fleet:
             orphan_timeout_s=run.orphan_timeout_s,
             duration_ns=self._duration_ns,
             files_max_mb=run.files_max_mb,
+            units=[node for node in host.nodes if node in self._access.units],
         )
 
     def _refusal(self, host: _Host, hello: HostHello) -> str | None:
@@ -262,6 +268,9 @@ class Fleet:
             case messages.FromNode(node, payload):
                 self._check_node(host, node)
                 self.on_message(node, payload)
+            case messages.FromUnit(node, payload):
+                self._check_node(host, node)
+                self.on_backbone(node, payload)
             case messages.Token(node, alive):
                 self._check_node(host, node)
                 self.on_token(node, alive)

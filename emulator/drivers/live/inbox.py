@@ -19,6 +19,8 @@ from emulator.drivers.protocol import ProtocolError
 from emulator.records.run_folder import RunFolder
 from vnet.errors import WireError
 from vnet.transport import keys, wire
+from vnet.transport.backbone import SentMessage
+from vnet.transport.backbone_keys import decode_sent
 
 Handler = Callable[[str, Any], None]
 """Takes a message of one type from a node. Raises ProtocolError to refuse it."""
@@ -33,9 +35,9 @@ class Refusals:
         self._time_ns = time_ns
         self._counts: Counter[str] = Counter()
 
-    def add(self, node: str, reason: str) -> None:
-        """Count a refused message of `node`."""
-        key = keys.node_tx(self._run, node)
+    def add(self, node: str, reason: str, on_backbone: bool = False) -> None:
+        """Count a refused message of `node`, on its `tx` or that of its backbone."""
+        key = keys.backbone_tx(self._run, node) if on_backbone else keys.node_tx(self._run, node)
         if key not in self._counts:
             self._folder.event(self._time_ns(), "refused", node, key=key, reason=reason)
         self._counts[key] += 1
@@ -49,9 +51,10 @@ class Refusals:
 class Inbox:
     """Hands what Zenoh's threads `put_…` to its handlers, on the loop on which it was made.
 
-    `handlers` is the table of message types: a part of the run adds the type that it takes. What hosts say goes to
-    `on_host_…`, which unbundles it and calls `take_message` and `take_token`. Of `connected` are the
-    nodes that hold a connection; `stacks` are the answers to stack requests, by process.
+    `handlers` is the table of message types: a part of the run adds the type that it takes. `on_sent` takes what
+    units put on the keys of the backbone. What hosts say goes to `on_host_…`, which unbundles it and calls
+    `take_message`, `take_backbone` and `take_token`. Of `connected` are the nodes that hold a connection; `stacks`
+    are the answers to stack requests, by process.
     """
 
     def __init__(
@@ -74,6 +77,7 @@ class Inbox:
         self.on_host_message: Callable[[str, bytes], None] = lambda host, payload: None
         self.on_host_token: Callable[[str, bool], None] = lambda host, alive: None
         self.handlers: dict[type, Handler] = {wire.StackDump: self._take_stack, wire.Final: _ignore}
+        self.on_sent: Callable[[SentMessage], None] = lambda message: None
         self.connected: set[str] = set()
         self.stacks: dict[str, wire.StackDump] = {}
 
@@ -82,6 +86,10 @@ class Inbox:
     def put_message(self, node: str, payload: bytes) -> None:
         """Enqueue an encoded message of a node."""
         self._put(self.take_message, node, payload)
+
+    def put_backbone(self, unit: str, payload: bytes) -> None:
+        """Enqueue what a unit has put on its key of the backbone."""
+        self._put(self.take_backbone, unit, payload)
 
     def put_token(self, node: str, alive: bool) -> None:
         """Enqueue that the connection of a node has appeared or is gone."""
@@ -136,6 +144,16 @@ class Inbox:
             handler(node, message)
         except (WireError, ProtocolError) as error:
             self._refusals.add(node, str(error))
+
+    def take_backbone(self, unit: str, payload: bytes) -> None:
+        """Take what a unit has put on its key of the backbone."""
+        try:
+            sent = decode_sent(payload)
+            if not self._members.is_of(unit, sent.nonce):
+                raise ProtocolError("a message without the nonce of its process")
+            self.on_sent(sent.message(unit))
+        except (WireError, ProtocolError) as error:
+            self._refusals.add(unit, str(error), on_backbone=True)
 
     def take_token(self, node: str, alive: bool) -> None:
         """Take note that the connection of a node has appeared or is gone."""

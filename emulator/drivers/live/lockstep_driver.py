@@ -15,7 +15,10 @@ from emulator.drivers.live.supervisor import DEATH_GRACE_S, ProcessState
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.protocol import check_ownership
+from vnet.counted import counted
 from vnet.transport import wire
+from vnet.transport.backbone import SentMessage
+from vnet.transport.backbone_keys import join_yield, refs_of
 
 FINAL_WAIT_S = 1.0
 """Seconds for which the last message of a process that a fault ends is awaited."""
@@ -48,6 +51,8 @@ class LockstepDriver(Driver):
         self._finals: dict[str, wire.Traffic] = {}
         self._reached_ns: dict[str, int] = {}
         self._completed = False
+        self._incomplete: dict[str, wire.Yield] = {}
+        """Yields that refer to messages of the backbone that have not come."""
         parts.inbox.handlers[wire.Final] = self._take_final
 
     @property
@@ -61,10 +66,24 @@ class LockstepDriver(Driver):
         return self._lockstep.decided_ns
 
     def take(self, process_id: str, message: wire.Yield) -> None:
-        """Take a yield."""
+        """Take a yield, once the messages of the backbone have come to which it refers."""
+        self._incomplete.pop(process_id, None)
+        if refs := refs_of(message):
+            self._check_refs(process_id, refs)
+            if self._sent.missing(refs):
+                self._incomplete[process_id] = message
+                return
+            message = join_yield(message, self._sent)
         self._lockstep.receive(process_id, message)
         if not self._lockstep.owed:
             self._changes.set()
+
+    def take_sent(self, message: SentMessage) -> None:
+        """Take what a unit has put on the backbone, and the yield that has waited for it."""
+        self._sent.add(message)
+        process_id = self._parts.members.process_of(message.node)
+        if process_id in self._incomplete and process_id in self._lockstep.owed:
+            self.take(process_id, self._incomplete[process_id])
 
     async def run(self) -> None:
         """Grant and await yields, window by window."""
@@ -166,7 +185,16 @@ class LockstepDriver(Driver):
                 self.time_ns,
                 "stalled",
                 process_id,
-                error=f"no yield within {timeout_s:g} s of wall clock; {parts.members.describe(process_id)}",
+                error=f"{self._lacking(process_id)} within {timeout_s:g} s of wall clock; "
+                f"{parts.members.describe(process_id)}",
                 where=(dump.text if dump else "") or parts.agents.log_tail(process_id),
             )
         raise Stalled
+
+    def _lacking(self, process_id: str) -> str:
+        """Return what has not come of a process."""
+        if process_id not in self._incomplete:
+            return "no yield"
+        missing = self._sent.missing(refs_of(self._incomplete[process_id]))
+        messages = f"{counted(len(missing), 'message')} of {missing[0].node} on the backbone"
+        return f"yield {self._incomplete[process_id].seq} without {messages}, to which it refers,"

@@ -6,10 +6,13 @@ import asyncio
 import time
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.supervisor import ProcessState
 from emulator.drivers.realtime import RealTime
 from vnet.transport import wire
+from vnet.transport.backbone import MessageRef, SentMessage
 
 
 class RealTimeDriver(Driver):
@@ -21,6 +24,8 @@ class RealTimeDriver(Driver):
         super().__init__(parts, processes)
         self._realtime = RealTime(parts.emulation, processes)
         self._origin_ns = time.monotonic_ns()
+        self._late: set[MessageRef] = set()
+        """Messages of the backbone to which frames have referred and that have not come."""
         parts.supervisor.on_death = self._take_deaths
 
     @property
@@ -33,8 +38,27 @@ class RealTimeDriver(Driver):
 
     def take(self, process_id: str, message: wire.Frames) -> None:
         """Take frames and acknowledgements."""
+        if refs := message.traffic.messages:
+            self._check_refs(process_id, refs)
+            here, missing = self._sent.split(refs)
+            self._late.update(missing)
+            message = replace(message, traffic=replace(message.traffic, messages=here))
         self._realtime.receive(self.time_ns, process_id, message)
         self._changes.set()
+
+    def take_sent(self, message: SentMessage) -> None:
+        """Take what a unit has put on the backbone; it is sent when frames refer to it, or now if they have."""
+        self._sent.add(message)
+        ref = MessageRef(message.node, message.number)
+        if ref in self._late:
+            self._late.discard(ref)
+            self._realtime.take_messages(self.time_ns, self._sent.split([ref])[0])
+            self._changes.set()
+
+    def _forget_sent(self, process_ids: Sequence[str]) -> None:
+        super()._forget_sent(process_ids)
+        process_of = self._parts.members.process_of
+        self._late = {ref for ref in self._late if process_of(ref.node) not in process_ids}
 
     def _take_deaths(self) -> None:
         for process_id, details in self._supervisor.take_deaths().items():
@@ -68,6 +92,7 @@ class RealTimeDriver(Driver):
         """Wait for the last acknowledgements, and decide what nobody has acknowledged."""
         while self._is_final_missing() and await self._changes.wait(deadline_s - time.monotonic()):
             pass
+        self._realtime.gaps += len(self._late)
         self._realtime.finish()
         await self._supervisor.all_ended()
 

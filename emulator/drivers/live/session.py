@@ -143,6 +143,7 @@ class LiveSession:
             self._inbox.put_query,
             self._inbox.put_host_message,
             self._inbox.put_host_token,
+            self._inbox.put_backbone,
         )
         self._fleet = self._make_fleet() if options.access.hosts else None
         agents = self._fleet or launcher
@@ -187,9 +188,10 @@ class LiveSession:
             lambda: self._supervisor.reconnecting,
             self._changes,
         )
-        attachment.to_hosted = fleet.send
+        attachment.to_hosted, attachment.to_hosted_unit = fleet.send, fleet.send_content
         inbox.on_host_message, inbox.on_host_token = fleet.take, fleet.take_token
         fleet.on_message, fleet.on_token = inbox.take_message, inbox.take_token
+        fleet.on_backbone = inbox.take_backbone
         return fleet
 
     @property

@@ -49,7 +49,7 @@ def test_messages_keep_their_order_and_none_is_early_or_forgotten(
     network = BackboneNetwork(scenario(backbone=section), dict.fromkeys(NAMES, True))
     meant = 0
     for number, (time_ns, node, to) in enumerate(sorted(sent, key=lambda each: each[0])):
-        network.send(time_ns, [SentMessage(node, to, b"%d" % number)])
+        network.send(time_ns, [SentMessage(node, number, to, b"%d" % number)])
         meant += 2 if to is None else to != node
     arrived = network.take(10**12)
     network.decide(10**12)
@@ -70,7 +70,7 @@ def test_a_message_meets_the_same_fate_whatever_others_send() -> None:
     def fates(*others: str) -> list[Any]:
         network = BackboneNetwork(scenario(backbone=section), dict.fromkeys(NAMES, True))
         for time_ns in range(0, 10**9, 10**7):
-            network.send(time_ns, [SentMessage(node, None, b"x") for node in (*others, "rsu02")])
+            network.send(time_ns, [SentMessage(node, 0, None, b"x") for node in (*others, "rsu02")])
         network.decide(10**12)
         table = network.table()
         assert table is not None
@@ -116,7 +116,7 @@ def test_only_units_have_a_backbone() -> None:
     assert network.abilities("v01") is None
     abilities = network.abilities("rsu02")
     assert abilities is not None and tuple(abilities.peers) == ("rsu01", "rsu03")
-    network.send(0, [SentMessage("v01", None, b"x"), SentMessage("rsu01", None, b"x" * 65_001)])
+    network.send(0, [SentMessage("v01", 0, None, b"x"), SentMessage("rsu01", 1, None, b"x" * 65_001)])
     assert network.next_ns() is None
 
 

@@ -11,7 +11,7 @@ from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.transport import wire
-from vnet.transport.backbone import SentMessage
+from vnet.transport.backbone import MessageRef, SentMessage, arrived_in_full
 
 IDS = ["v01", "v02", "v03", "v04"]
 MS = 1_000_000
@@ -48,14 +48,20 @@ def test_a_message_of_the_backbone_in_a_batch_that_was_missed_goes_out_again() -
     plan = Scenario.model_validate({"run": {"pacing": "realtime"}, "network": {"vehicles": 1}, "roadside": units})
     realtime = RealTime(emulation_of(plan), [["v01"], ["rsu01"], ["rsu02"]])
     realtime.start(0)
-    traffic = wire.Traffic(messages=[SentMessage("rsu01", None, b"x")])
+    traffic = wire.Traffic(messages=[SentMessage("rsu01", 0, None, b"x")])
     realtime.receive(10 * MS, "rsu01", wire.Frames(b"n", 0, 1, [], traffic))
     batch = realtime.due(20 * MS)["rsu02"]
-    (message,) = batch.messages
+    (message,) = arrived_in_full(batch.messages)
     assert (message.sender, message.payload, message.time_ns) == ("rsu01", b"x", 15 * MS)
     missed = [(batch.seq, batch.seq)]
     realtime.receive(30 * MS, "rsu02", wire.Frames(b"n", 0, batch.seq + 1, missed, wire.Traffic()))
-    assert realtime.due(31 * MS)["rsu02"].messages == [message]
+    repeated = realtime.due(31 * MS)["rsu02"]
+    assert repeated.messages == [message]
+    unseen = [MessageRef("rsu02", message.number)]
+    answer = wire.Frames(b"n", 1, repeated.seq + 1, [], wire.Traffic(), unseen=unseen)
+    realtime.receive(40 * MS, "rsu02", answer)
+    assert realtime.due(41 * MS)["rsu02"].messages == [message]
+    assert realtime.gaps == 2
 
 
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:

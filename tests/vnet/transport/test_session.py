@@ -1,6 +1,7 @@
 """An embedded router and a client of it, on a port that the system chooses."""
 
 import os
+import queue
 import socket
 import subprocess
 import sys
@@ -29,6 +30,33 @@ def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.Monke
                 client.put(key, bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
             sizes = [len(subscriber.recv().payload) for _ in range(2)]
     assert sizes == [2**20 - 1000, 7], "the session goes on without the one in between"
+
+
+@pytest.mark.parametrize(("user", "may"), [("v01", False), ("v02", False), ("rsu01", True)])
+def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool) -> None:
+    """A vehicle has none, whether it comes with its own credentials (v01) or with those of another one (v02)."""
+    access = Access.create("r", [["v01"], ["v02", "v03"], ["rsu01", "v04"]], units=["rsu01"])
+    tx, rx = keys.backbone_tx("r", "rsu01"), keys.backbone_rx("r", "rsu01")
+    own_tx, own_rx = keys.node_tx("r", user), keys.node_rx("r", user)
+    heard: queue.SimpleQueue[str] = queue.SimpleQueue()
+    got: queue.SimpleQueue[str] = queue.SimpleQueue()
+    with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
+        router.declare_subscriber("vnet/r/**", lambda sample: heard.put(str(sample.key_expr)))
+        with open_client(router_endpoint(router), access.credentials(node_user(user)), LEASE_MS) as client:
+            for key in (rx, tx, "vnet/r/backbone/**", own_rx):
+                client.declare_subscriber(
+                    key, lambda sample: got.put(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+                )
+            for key in (tx, rx, keys.backbone_tx("r", "v01"), keys.backbone_rx("r", user), own_tx):
+                client.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+            puts = [tx] * may + [own_tx]
+            assert [heard.get(timeout=60) for _ in puts] == puts
+            for key in (tx, rx, own_rx):
+                router.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
+            came = [got.get(timeout=60)]
+            while own_rx not in came:
+                came.append(got.get(timeout=60))
+            assert set(came) == {own_rx, *[rx] * may}
 
 
 def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:

@@ -10,7 +10,8 @@ from vnet.errors import WireError
 from vnet.node import Fix
 from vnet.reports import Report
 from vnet.transport import lateness, wire
-from vnet.transport.backbone import SentMessage, WireMessage
+from vnet.transport.backbone import MessageRef
+from vnet.transport.backbone_keys import Arrived, Sent
 from vnet.transport.orders import Deviation
 from vnet.transport.send_results import WireSendResult
 
@@ -53,8 +54,11 @@ notes = st.builds(
     names,
     st.dictionaries(names, st.booleans() | times | reals | names, max_size=2),
 )
-sent_messages = st.builds(SentMessage, names, st.none() | names, st.binary(max_size=16))
-messages = st.lists(st.builds(WireMessage, names, names, times, times, st.binary(max_size=16)), max_size=2)
+refs = st.lists(st.builds(MessageRef, names, times), max_size=2)
+unit_messages = st.one_of(
+    st.builds(Sent, st.binary(max_size=16), times, st.none() | names, st.binary(max_size=16)),
+    st.builds(Arrived, times, names, times, times, st.binary(max_size=16)),
+)
 deviations = st.builds(Deviation, names, times, times, times, names, names)
 traffic = st.builds(
     wire.Traffic,
@@ -65,7 +69,7 @@ traffic = st.builds(
     st.lists(notes, max_size=2),
     st.lists(deviations, max_size=2),
     st.lists(actions, max_size=2),
-    st.lists(sent_messages, max_size=2),
+    refs,
 )
 steps = st.builds(wire.Step, times, traffic)
 histograms = st.lists(times, min_size=lateness.LATENESS_BINS, max_size=lateness.LATENESS_BINS)
@@ -85,6 +89,7 @@ agent_messages = st.one_of(
         traffic,
         st.none() | st.builds(wire.Lateness, histograms),
         st.booleans(),
+        refs,
     ),
     st.builds(wire.Final, st.binary(), traffic),
     st.builds(wire.StackDump, st.binary(), names, st.none() | times),
@@ -103,7 +108,7 @@ emulator_messages = st.one_of(
         st.none() | times,
         busy,
         results,
-        messages,
+        refs,
     ),
     st.builds(
         wire.Batch,
@@ -116,7 +121,7 @@ emulator_messages = st.one_of(
         clocks,
         busy,
         results,
-        messages,
+        refs,
     ),
     st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.StackRequest()),

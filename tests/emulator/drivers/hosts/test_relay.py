@@ -1,7 +1,7 @@
 """The bundles of a host: yields wait for each other, and nothing else waits."""
 
 from emulator.drivers.hosts import relay
-from emulator.drivers.hosts.messages import FromNode, Token
+from emulator.drivers.hosts.messages import FromNode, FromUnit, Token
 from emulator.drivers.hosts.relay import Relay
 from vnet.transport import wire
 
@@ -24,6 +24,17 @@ def test_the_yields_of_a_barrier_are_one_bundle() -> None:
     host.take("v03", YIELD)
     assert host.take_bundle() == [FromNode(node, YIELD) for node in ("v02", "v01", "v03")]
     assert host.take_bundle() == []
+
+
+def test_what_a_unit_sends_over_the_backbone_goes_with_the_yield_that_refers_to_it() -> None:
+    host = granted("v01", "rsu01")
+    host.take_unit("rsu01", b"message")
+    host.take("rsu01", YIELD)
+    assert host.take_bundle() == []
+    host.take("v01", YIELD)
+    assert host.take_bundle() == [FromUnit("rsu01", b"message"), FromNode("rsu01", YIELD), FromNode("v01", YIELD)]
+    host.take_unit("rsu01", b"late")
+    assert host.take_bundle() == [FromUnit("rsu01", b"late")]
 
 
 def test_who_ends_owes_nothing() -> None:

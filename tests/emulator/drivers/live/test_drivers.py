@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.inbox import Inbox, Refusals
@@ -13,7 +14,9 @@ from emulator.drivers.live.realtime_driver import RealTimeDriver
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.waiting import Stalled
 from tests.emulator.drivers.live.fakes import IDS, Stage, hello, in_virtual_time
-from vnet.transport import wire
+from vnet.transport import backbone_keys, wire
+from vnet.transport.backbone import MessageRef, SentMessage
+from vnet.transport.backbone_keys import Sent
 
 MS = 1_000_000
 RUN = {"duration_s": 0.6, "settle_s": 0.1, "stall_timeout_s": 1.0, "join_timeout_s": 1.0}
@@ -264,6 +267,83 @@ def test_a_message_of_the_other_pacing_is_refused(monkeypatch: pytest.MonkeyPatc
     in_virtual_time(run(), monkeypatch)
 
 
+UNITS: dict[str, Any] = {
+    "network": {"vehicles": 2},
+    "roadside": [{"id": node, "position_m": [0.0, 0.0]} for node in ("v03", "v04")],
+}
+
+
+def outcomes(play: Play) -> list[tuple[int, str, str]]:
+    play.stage.emulation.backbone.decide(10**12)
+    table = play.stage.emulation.backbone.table()
+    assert table is not None
+    return [(row["sent_ns"], row["sender"], row["outcome"]) for row in table.to_pylist()]
+
+
+@pytest.mark.parametrize("first", ["message", "yield"])
+def test_a_yield_waits_for_the_messages_of_the_backbone_to_which_it_refers(
+    first: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if node != "v03" or not isinstance(message, wire.Grant):
+                return yields(node, message)
+            sent = SentMessage("v03", message.seq, None, b"x")
+            step = wire.Step(message.time_ns, wire.Traffic(messages=[sent]))
+            whole = wire.Yield(b"1", message.seq, message.time_ns + 100 * MS, (), (), [step], 1)
+            said, contents = backbone_keys.split_yield(whole)
+            puts: list[tuple[Callable[[str, bytes], None], str, bytes]]
+            puts = [(play.inbox.put_message, "v03", wire.encode(said))]
+            puts += [(play.inbox.put_backbone, unit, backbone_keys.encode(each)) for unit, each in contents]
+            for put, name, payload in reversed(puts) if first == "message" else puts:
+                put(name, payload)
+            return None
+
+        play = Play(LockstepDriver, answer, **UNITS)
+        await play.driver.run()
+        assert outcomes(play) == [(time_ns, "v03", "delivered") for time_ns in range(0, 600 * MS, 100 * MS)]
+        assert play.stage.events("stalled", "refused") == []
+
+    in_virtual_time(run(), monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("unit", "nonce", "refused"),
+    [
+        ("v04", b"1", "the process of v03 speaks for v04"),
+        ("v03", b"2", "a message without the nonce"),
+        ("", b"", ""),
+    ],
+)
+def test_a_message_of_the_backbone_that_never_comes_is_named(
+    unit: str, nonce: bytes, refused: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was lost, or it came on the key of another unit, or from another process."""
+
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if node != "v03" or not isinstance(message, wire.Grant):
+                return yields(node, message)
+            if unit:
+                play.inbox.put_backbone(unit, backbone_keys.encode(Sent(nonce, 7, None, b"x")))
+            if unit == "v04":
+                other = wire.Step(message.time_ns, wire.Traffic(messages=[MessageRef(unit, 7)]))
+                play.inbox.put_message("v03", wire.encode(wire.Yield(b"1", message.seq, None, (), (), [other], 1)))
+            step = wire.Step(message.time_ns, wire.Traffic(messages=[MessageRef("v03", 7)]))
+            return wire.Yield(b"1", message.seq, None, (), (), [step], 1)
+
+        play = Play(LockstepDriver, answer, **UNITS)
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+        expected = "yield 0 without 1 message of v03 on the backbone, to which it refers, within 1 s"
+        assert stalled.node == "v03" and stalled.details["error"].startswith(expected)
+        reasons = [e.details["reason"] for e in play.stage.emulation.folder.events if e.kind == "refused"]
+        assert [reason.startswith(refused) for reason in reasons] == [True] * bool(refused)
+
+    in_virtual_time(run(), monkeypatch)
+
+
 # Real time, on a clock that only the test moves.
 
 
@@ -351,5 +431,29 @@ def test_in_real_time_processes_that_end_when_they_are_told_to_have_not_died_how
         await play.driver.finish((before_ns + wire.HEAD_START_NS) / 1e9 + 5.0)
         assert play.stage.events("died") == []
         assert play.driver.time_ns - before_ns == 2000 * MS, "it waits for v04, and for nobody else"
+
+    in_virtual_time(run(), monkeypatch)
+
+
+def test_in_real_time_a_message_of_the_backbone_may_come_after_its_frames_and_one_that_never_does_is_a_gap(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            said = frames(node, message)
+            if node != "v03" or not isinstance(said, wire.Frames):
+                return said
+            refs = [MessageRef("v03", said.seq), MessageRef("v03", 1000)] if said.seq < 2 else []
+            play.inbox.put_message("v03", wire.encode(replace(said, traffic=wire.Traffic(messages=refs))))
+            if said.seq < 2:
+                play.inbox.put_backbone("v03", backbone_keys.encode(Sent(b"1", said.seq, "v04", b"x")))
+            return None
+
+        play = Play(RealTimeDriver, answer, **UNITS)
+        await play.driver.run()
+        await play.driver.finish(0.0)
+        assert [outcome for _, _, outcome in outcomes(play)] == ["delivered"] * 2
+        (gap,) = [event for event in play.stage.emulation.folder.events if event.kind == "transport_gap"]
+        assert gap.details["count"] == 1
 
     in_virtual_time(run(), monkeypatch)
