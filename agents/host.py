@@ -36,6 +36,10 @@ if TYPE_CHECKING:
 LEASE_MS = 60_000
 """Long, because a starved machine must not look like a dead one; a closed connection is seen at once."""
 
+UNSEEN_NS = 1_000_000_000
+"""Nanoseconds after which a message of the backbone that has not come is asked for again: each key has a thread of
+Zenoh's, so it may come a little later than the batch that refers to it."""
+
 
 def run_agent(
     endpoint: str,
@@ -165,8 +169,8 @@ class _RealTimeAgent:
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
         self._lateness = [0] * lateness.LATENESS_BINS
-        self._unseen: list[MessageRef] = []
-        """Messages of the backbone to which a batch has referred and that have not come."""
+        self._unseen: dict[MessageRef, int] = {}
+        """Messages of the backbone that have not come, and when (monotonic ns) a batch has referred to them."""
         self._orphan_timer: asyncio.TimerHandle | None = None
 
     def _now_ns(self) -> int:
@@ -263,14 +267,23 @@ class _RealTimeAgent:
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._host.mail.deliver_news(batch.results)
         if batch.messages:
-            self._unseen += batch.messages
+            self._unseen.update(dict.fromkeys(batch.messages, arrived_ns))
             self._deliver_messages()
 
     def _deliver_messages(self) -> None:
-        """Deliver those messages of the backbone that batches have referred to and that have come."""
+        """Deliver those messages of the backbone to which batches have referred and that have come."""
         if self._attachment.units is not None and self._unseen:
-            arrived, self._unseen = self._attachment.units.take(self._unseen)
+            arrived, missing = self._attachment.units.take(list(self._unseen))
+            self._unseen = {ref: self._unseen[ref] for ref in missing}
             self._host.mail.deliver_news(arrived)
+
+    def _take_overdue(self) -> list[MessageRef]:
+        """Return references to messages that have not come for `UNSEEN_NS`, and await them no longer."""
+        now_ns = time.monotonic_ns()
+        overdue = [ref for ref, since_ns in self._unseen.items() if now_ns - since_ns >= UNSEEN_NS]
+        for ref in overdue:
+            del self._unseen[ref]
+        return overdue
 
     def _schedule_flush(self) -> None:
         if not self._flush_pending:
@@ -289,10 +302,9 @@ class _RealTimeAgent:
                 traffic,
                 wire.Lateness(self._lateness),
                 final,
-                self._unseen,
+                self._take_overdue(),
             )
         )
-        self._unseen = []
         self._seq += 1
         self._missed = []
         self._attachment.publish(traffic)

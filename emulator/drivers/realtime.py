@@ -19,6 +19,8 @@ from vnet.transport import lateness, wire
 from vnet.transport.backbone import SentMessage, WireMessage
 from vnet.units import NS_PER_S
 
+KEPT_NS = 10 * NS_PER_S
+"""Nanoseconds for which messages of the backbone are kept for processes that have not seen them."""
 WORST_PROCESSES = 8
 """Number of processes, those with the most late deliveries, that an event names."""
 WORST_SECONDS = 20
@@ -59,6 +61,8 @@ class RealTime:
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
         self._news = NewsFeed(emulation)
+        self._shown: dict[tuple[str, int], WireMessage] = {}
+        """Messages of the backbone that went out within `KEPT_NS`, by unit and number: they may have to again."""
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
         self._affected: set[str] = set()
         self._next_period = 0
@@ -120,9 +124,9 @@ class RealTime:
         waiting = self._unacknowledged[process_id]
         if message.unseen:
             self.gaps += 1
-            news = [item for sent in waiting.values() for item in sent.news if isinstance(item, WireMessage)]
-            unseen = {(ref.node, ref.number) for ref in message.unseen}
-            self._news.repeat(item for item in news if (item.node, item.number) in unseen)
+            unseen = [self._shown.get((ref.node, ref.number)) for ref in message.unseen]
+            own = self._nodes[process_id]
+            self._news.repeat(item for item in unseen if item is not None and item.node in own)
         for first, last in message.missed:
             self.gaps += 1
             for seq in [seq for seq in waiting if first <= seq <= last]:
@@ -216,6 +220,10 @@ class RealTime:
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
         results, messages = self._news.take(self._nodes[process_id])
+        for message in messages:
+            self._shown[message.node, message.number] = message
+        while self._shown and (first := next(iter(self._shown.values()))).time_ns < self._collected_ns - KEPT_NS:
+            del self._shown[first.node, first.number]
         self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages])
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages)
 

@@ -41,8 +41,9 @@ def write(path: Path, **changes: Any) -> str:
 
 
 def test_on_two_hosts_the_run_is_that_of_one_process(vnet: Vnet, tmp_path: Path) -> None:
-    """With a restart on one of them, a pause on the other, and a restart of the emulator's router."""
-    scenario = write(tmp_path / "hosts.toml")
+    """With a restart on one of them, a pause and roadside units on the other, and a restart of the router."""
+    units = [{"position_m": [0.0, 0.0], "entry": "tests.support.roadside_programs:counts"}] * 2
+    scenario = write(tmp_path / "hosts.toml", roadside=units)
     there, here = vnet("run", scenario, "--hosts", "2"), vnet("simulate", scenario)
     assert there.status == here.status == 0, there.stdout + there.stderr
     assert there.fingerprint == here.fingerprint
@@ -50,6 +51,7 @@ def test_on_two_hosts_the_run_is_that_of_one_process(vnet: Vnet, tmp_path: Path)
     assert [event for event in there.events if event["kind"] in kinds] == [
         event for event in here.events if event["kind"] in kinds
     ]
+    assert (there.folder / "backbone.parquet").read_bytes() == (here.folder / "backbone.parquet").read_bytes()
     for file in ("logs/v02.log", "files/v02/starts.txt", "files/v05/starts.txt"):
         assert (there.folder / file).read_text() == (here.folder / file).read_text(), file
     assert (there.folder / "files/v02/starts.txt").read_text() == "2"

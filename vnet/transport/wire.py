@@ -202,7 +202,7 @@ class Lateness(msgspec.Struct, frozen=True, array_like=True):
 class Frames(Message, frozen=True):
     """Real time: traffic since the last message; acknowledges batches up to `received_seq` without `missed`.
 
-    `unseen` are messages of the backbone to which batches referred and which had not come on their key by then.
+    `unseen` are messages of the backbone to which batches have referred and that have not come within a second.
     """
 
     nonce: bytes

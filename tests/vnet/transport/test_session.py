@@ -45,7 +45,9 @@ def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool
         with open_client(router_endpoint(router), access.credentials(node_user(user)), LEASE_MS) as client:
             for key in (rx, tx, "vnet/r/backbone/**", own_rx):
                 client.declare_subscriber(
-                    key, lambda sample: got.put(str(sample.key_expr)), allowed_origin=zenoh.Locality.REMOTE
+                    key,
+                    zenoh.handlers.Callback(lambda sample: got.put(str(sample.key_expr)), indirect=False),
+                    allowed_origin=zenoh.Locality.REMOTE,
                 )
             for key in (tx, rx, keys.backbone_tx("r", "v01"), keys.backbone_rx("r", user), own_tx):
                 client.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
