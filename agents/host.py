@@ -28,6 +28,7 @@ from vnet.transport import lateness, wire
 from vnet.transport.backbone import MessageRef
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.send_results import WireSendResult
 from vnet.transport.session import open_client
 
 if TYPE_CHECKING:
@@ -169,6 +170,8 @@ class _RealTimeAgent:
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
         self._lateness = [0] * lateness.LATENESS_BINS
+        self._sends: dict[tuple[str, int], int] = {}
+        """Frames to single vehicles without a result, by node and number, and the `seq` with which they went."""
         self._unseen: dict[MessageRef, int] = {}
         """Messages of the backbone that have not come, and when (monotonic ns) a batch has referred to them."""
         self._orphan_timer: asyncio.TimerHandle | None = None
@@ -265,7 +268,7 @@ class _RealTimeAgent:
         for packet in () if batch.held else batch.packets:
             self._lateness[lateness.lateness_bin(now_ns - packet.received_ns)] += 1
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
-        self._host.mail.deliver_news(batch.results)
+        self._take_results(batch)
         if batch.messages:
             self._unseen.update(dict.fromkeys(batch.messages, arrived_ns))
             self._deliver_messages()
@@ -276,6 +279,17 @@ class _RealTimeAgent:
             arrived, missing = self._attachment.units.take(list(self._unseen))
             self._unseen = {ref: self._unseen[ref] for ref in missing}
             self._host.mail.deliver_news(arrived)
+
+    def _take_results(self, batch: wire.Batch) -> None:
+        """Deliver results of frames to single vehicles; those of frames that were lost on their way have failed."""
+        lost = [
+            WireSendResult(node, number, self._now_ns(), False, 0)
+            for (node, number), seq in self._sends.items()
+            if any(first <= seq <= last for first, last in batch.lost)
+        ]
+        for result in (results := [*batch.results, *lost]):
+            self._sends.pop((result.node, result.number), None)
+        self._host.mail.deliver_news(results)
 
     def _take_overdue(self) -> list[MessageRef]:
         """Return references to messages that have not come for `UNSEEN_NS`, and await them no longer."""
@@ -293,6 +307,7 @@ class _RealTimeAgent:
     def _flush(self, final: bool = False) -> None:
         self._flush_pending = False
         traffic = self._host.take_traffic()
+        self._sends.update(((each.node, each.number), self._seq) for each in traffic.frames if each.to is not None)
         self._attachment.say(
             wire.Frames(
                 self._attachment.nonce,

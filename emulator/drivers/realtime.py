@@ -32,6 +32,7 @@ class _Sent(NamedTuple):
 
     deliveries: list[Delivery]
     news: list[NewsItem]
+    lost: list[tuple[int, int]]
 
 
 class RealTime:
@@ -64,6 +65,8 @@ class RealTime:
         self._shown: dict[tuple[str, int], WireMessage] = {}
         """Messages of the backbone that went out within `KEPT_NS`, by unit and number: they may have to again."""
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
+        self._lost: dict[str, list[tuple[int, int]]] = {process_id: [] for process_id in self._nodes}
+        """First and last of the ranges of frames that have not come, and of which their process is to know."""
         self._affected: set[str] = set()
         self._next_period = 0
         self._origin_ns = 0
@@ -94,8 +97,11 @@ class RealTime:
     def receive(self, now_ns: int, process_id: str, message: wire.Frames) -> None:
         """Take a process's traffic and acknowledgements. Raises ProtocolError if it speaks for others."""
         check_ownership(self._nodes[process_id], message.traffic)
-        if message.seq != self._frames_seq[process_id]:
+        expected = self._frames_seq[process_id]
+        if message.seq != expected:
             self.gaps += 1
+        if message.seq > expected:
+            self._lost[process_id].append((expected, message.seq - 1))
         self._frames_seq[process_id] = message.seq + 1
         self._acknowledge(process_id, message)
         if message.lateness is not None:
@@ -133,6 +139,7 @@ class RealTime:
                 missed = waiting.pop(seq)
                 self._lose(missed.deliveries)
                 self._news.repeat(missed.news)
+                self._lost[process_id] += missed.lost
         for seq in [seq for seq in waiting if seq < message.received_seq]:
             del waiting[seq]
 
@@ -158,6 +165,7 @@ class RealTime:
                 or process_id in self._fixes
                 or process_id in informed
                 or self._clocks[process_id]
+                or self._lost[process_id]
             )
         }
 
@@ -188,6 +196,7 @@ class RealTime:
         """Take a process that was started again and is ready; returns the batch that starts it."""
         self._emulation.come_back(self._nodes[process_id], now_ns)
         self._batch_seq[process_id] = self._frames_seq[process_id] = 0
+        self._lost[process_id] = []
         self._unacknowledged[process_id].clear()
         self._present.add(process_id)
         self._awaited.add(process_id)
@@ -216,6 +225,7 @@ class RealTime:
         node_ids = self._emulation.world.node_ids
         packets = [wire_packet(node_ids[delivery.receiver], delivery.packet) for delivery in deliveries]
         clocks, self._clocks[process_id] = self._clocks[process_id], []
+        lost, self._lost[process_id] = self._lost[process_id], []
         held = process_id in self._was_paused
         self._was_paused.discard(process_id)
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
@@ -224,8 +234,8 @@ class RealTime:
             self._shown[message.node, message.number] = message
         while self._shown and (first := next(iter(self._shown.values()))).time_ns < self._collected_ns - KEPT_NS:
             del self._shown[first.node, first.number]
-        self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages])
-        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages)
+        self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages], lost)
+        return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages, lost)
 
     def died(self, now_ns: int, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from now on."""

@@ -80,5 +80,15 @@ def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
         agent._wake(result)
         assert agent._wake_pending
         assert await sending == (True, 2)
+        sending = asyncio.create_task(agent._host.nodes["v01"].radio.send("v02", b"x"))
+        await asyncio.sleep(0)
+        agent._flush()
+        *_, frames = [message for message in said if isinstance(message, wire.Frames) and message.traffic.frames]
+        attached.inbox.put((wire.encode(wire.Batch([], 1, [], lost=[(frames.seq + 1, frames.seq + 9)])), 0))
+        agent._drain()
+        assert not sending.done()
+        attached.inbox.put((wire.encode(wire.Batch([], 2, [], lost=[(frames.seq, frames.seq)])), 0))
+        agent._drain()
+        assert await sending == (False, 0)
 
     asyncio.run(awaits_a_result())

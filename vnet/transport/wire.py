@@ -319,7 +319,7 @@ class Batch(Message, frozen=True):
 
     The emulated time `start_ns` is at `origin_ns` + `start_ns` on the monotonic clock of the machine whose boot the
     welcome names; on other machines it is the arrival of batch 0. `held` is true if packets waited for a paused
-    process, so that they do not count as late.
+    process, so that they do not count as late. `lost` are ranges of `Frames` that have never come.
     """
 
     fixes: Sequence[WireFix]
@@ -332,6 +332,7 @@ class Batch(Message, frozen=True):
     busy: Sequence[BusyRatios] = ()
     results: Sequence[WireSendResult] = ()
     messages: Sequence[MessageRef] = ()
+    lost: Sequence[tuple[Count, Count]] = ()
 
 
 class StackRequest(Message, frozen=True):

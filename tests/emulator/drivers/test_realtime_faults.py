@@ -64,6 +64,20 @@ def test_a_message_of_the_backbone_in_a_batch_that_was_missed_goes_out_again() -
     assert realtime.gaps == 2
 
 
+def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() -> None:
+    plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"})
+    realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
+    realtime.start(0)
+    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 3, 1, [], wire.Traffic()))
+    batch = realtime.due(11 * MS)["v01"]
+    assert batch.lost == [(0, 2)]
+    assert "v01" not in realtime.due(12 * MS)
+    missed = [(batch.seq, batch.seq)]
+    realtime.receive(20 * MS, "v01", wire.Frames(b"n", 4, batch.seq + 1, missed, wire.Traffic()))
+    assert realtime.due(21 * MS)["v01"].lost == [(0, 2)]
+    assert "v01" not in realtime.due(22 * MS)
+
+
 def clocks(batches: dict[str, wire.Batch], node: str = "v02") -> list[tuple[int, float]]:
     return [(c.offset_ns, c.rate) for c in batches[node].clocks] if node in batches else []
 

@@ -40,13 +40,17 @@ def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool
     own_tx, own_rx = keys.node_tx("r", user), keys.node_rx("r", user)
     heard: queue.SimpleQueue[str] = queue.SimpleQueue()
     got: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def take(sample: zenoh.Sample) -> None:
+        got.put(str(sample.key_expr))
+
     with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
         router.declare_subscriber("vnet/r/**", lambda sample: heard.put(str(sample.key_expr)))
         with open_client(router_endpoint(router), access.credentials(node_user(user)), LEASE_MS) as client:
             for key in (rx, tx, "vnet/r/backbone/**", own_rx):
                 client.declare_subscriber(
                     key,
-                    zenoh.handlers.Callback(lambda sample: got.put(str(sample.key_expr)), indirect=False),
+                    zenoh.handlers.Callback(take, indirect=False),  # in one order for all keys
                     allowed_origin=zenoh.Locality.REMOTE,
                 )
             for key in (tx, rx, keys.backbone_tx("r", "v01"), keys.backbone_rx("r", user), own_tx):

@@ -122,6 +122,7 @@ emulator_messages = st.one_of(
         busy,
         results,
         refs,
+        st.lists(st.tuples(times, times), max_size=2),
     ),
     st.builds(wire.Await, st.floats(0, 60)),
     st.just(wire.StackRequest()),
