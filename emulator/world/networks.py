@@ -153,30 +153,36 @@ class _Town:
 
     Vehicles move within their district. The cost is the L1 distance between the sorted degrees and the target, plus
     `SPLIT_COST` if a district is not connected.
+
+    Positions are numbers of Python, and a vehicle's links are the bits of one: a call of numpy would take longer
+    than the few that a move changes.
     """
 
     SPLIT_COST = 8.0
 
     def __init__(self, rng: np.random.Generator, vehicles: int) -> None:
         self._rng = rng
-        self._target = _target_degrees(vehicles)
+        self._target: list[int] = _target_degrees(vehicles).tolist()
         self._components = _COMPONENTS.get(vehicles, (vehicles,))
         district = np.repeat(np.arange(len(self._components)), self._components)
         side_m = TOWN_SIDE_M * np.sqrt(np.array(self._components) / 50)
         left_m = np.concatenate([[0.0], np.cumsum(side_m[:-1] + 1.1 * REFERENCE_RANGE_M)])
-        self._low_m = np.column_stack([left_m, np.zeros(len(side_m))])[district]
-        self._high_m = self._low_m + side_m[district, None]
-        middle_m = (self._low_m + self._high_m) / 2
-        drawn = rng.normal(middle_m, (self._high_m - self._low_m) / 4)
-        self.position_m = np.clip(drawn, self._low_m, self._high_m)
-        offset = self.position_m[:, None] - self.position_m[None]
-        self.linked = np.hypot(offset[..., 0], offset[..., 1]) <= REFERENCE_RANGE_M
-        np.fill_diagonal(self.linked, False)
-        self._degree = self.linked.sum(axis=0)
-        self.cost = self._cost(self._degree)
+        low_m = np.column_stack([left_m, np.zeros(len(side_m))])[district]
+        high_m = low_m + side_m[district, None]
+        middle_m = (low_m + high_m) / 2
+        drawn = rng.normal(middle_m, (high_m - low_m) / 4)
+        position_m = np.clip(drawn, low_m, high_m)
+        offset = position_m[:, None] - position_m[None]
+        linked = np.hypot(offset[..., 0], offset[..., 1]) <= REFERENCE_RANGE_M
+        np.fill_diagonal(linked, False)
+        self._position_m: list[tuple[float, float]] = [(x_m, y_m) for x_m, y_m in position_m.tolist()]
+        self._bounds_m: list[list[float]] = np.column_stack([low_m, high_m]).tolist()
+        self._links = [sum(1 << other for other in np.flatnonzero(row).tolist()) for row in linked]
+        self._degree = [links.bit_count() for links in self._links]
+        self.cost = self._cost()
 
-    def _cost(self, degree: NDArray[np.intp]) -> float:
-        cost = float(np.abs(np.sort(degree) - self._target).sum())
+    def _cost(self) -> float:
+        cost = sum(abs(degree - target) for degree, target in zip(sorted(self._degree), self._target, strict=True))
         if cost <= self.SPLIT_COST and self._is_split():
             return cost + self.SPLIT_COST
         return cost
@@ -185,50 +191,66 @@ class _Town:
         """Return true if a district is not connected; districts lie too far apart to merge."""
         first = 0
         for size in self._components:
-            reached = np.zeros(len(self.linked), dtype=bool)
-            reached[first] = True
-            count = 1
-            while True:
-                reached |= self.linked[reached].any(axis=0)
-                if reached.sum() == count:
-                    break
-                count = int(reached.sum())
-            if count != size:
+            reached = found = 1 << first
+            while found:
+                vehicle = found.bit_length() - 1
+                new = self._links[vehicle] & ~reached
+                reached |= new
+                found = found ^ 1 << vehicle | new
+            if reached.bit_count() != size:
                 return True
             first += size
         return False
 
     def anneal(self) -> Array:
         """Move single vehicles by the Metropolis rule until the cost is least; return the best positions (N, 2)."""
-        best_m, best_cost = self.position_m.copy(), self.cost
+        best_m, best_cost = self._position_m.copy(), self.cost
+        least_cost = sum(self._target) % 2  # the sum of all degrees is even
         for move in range(_ANNEALING_MOVES):
-            if best_cost == self._target.sum() % 2:  # the sum of all degrees is even
+            if best_cost == least_cost:
                 break
             temperature = 1.5 * (1 - move / _ANNEALING_MOVES) ** 2
             self._try_move(temperature)
             if self.cost < best_cost:
-                best_m, best_cost = self.position_m.copy(), self.cost
-        return best_m
+                best_m, best_cost = self._position_m.copy(), self.cost
+        return np.array(best_m)
 
     def _try_move(self, temperature: float) -> None:
         rng = self._rng
-        vehicle = int(rng.integers(len(self.position_m)))
+        vehicle = int(rng.integers(len(self._position_m)))
         step_m = REFERENCE_RANGE_M * (0.1, 0.4, 1.2)[int(rng.integers(3))]
-        new_m = self.position_m[vehicle] + step_m * rng.normal(size=2)
+        (x_m, y_m), (east, north) = self._position_m[vehicle], rng.normal(size=2).tolist()
         random_draw = rng.random()
-        if np.any(new_m < self._low_m[vehicle]) or np.any(new_m > self._high_m[vehicle]):
+        new_m = x_m + step_m * east, y_m + step_m * north
+        low_x_m, low_y_m, high_x_m, high_y_m = self._bounds_m[vehicle]
+        if not (low_x_m <= new_m[0] <= high_x_m and low_y_m <= new_m[1] <= high_y_m):
             return
-        old_m, old_links = self.position_m[vehicle].copy(), self.linked[vehicle].copy()
-        offset = self.position_m - new_m
-        links = np.einsum("ij,ij->i", offset, offset) <= REFERENCE_RANGE_M**2
-        links[vehicle] = False
-        degree = self._degree + links - old_links.astype(np.intp)
-        degree[vehicle] = links.sum()
-        self.position_m[vehicle] = new_m
-        self.linked[vehicle] = self.linked[:, vehicle] = links
-        cost = self._cost(degree)
-        if cost > self.cost and random_draw >= math.exp((self.cost - cost) / max(temperature, 1e-9)):
-            self.position_m[vehicle] = old_m
-            self.linked[vehicle] = self.linked[:, vehicle] = old_links
-        else:
-            self.cost, self._degree = cost, degree
+        old_links, links = self._links[vehicle], self._links_at(vehicle, *new_m)
+        if links != old_links:
+            self._link(vehicle, links)
+            cost = self._cost()
+            if cost > self.cost and random_draw >= math.exp((self.cost - cost) / max(temperature, 1e-9)):
+                self._link(vehicle, old_links)
+                return
+            self.cost = cost
+        self._position_m[vehicle] = new_m
+
+    def _links_at(self, vehicle: int, x_m: float, y_m: float) -> int:
+        """Return the links that a vehicle has at a position."""
+        links, bit, most_m2 = 0, 1, REFERENCE_RANGE_M**2
+        for other_x_m, other_y_m in self._position_m:
+            east_m, north_m = other_x_m - x_m, other_y_m - y_m
+            if east_m * east_m + north_m * north_m <= most_m2:
+                links |= bit
+            bit <<= 1
+        return links & ~(1 << vehicle)
+
+    def _link(self, vehicle: int, links: int) -> None:
+        """Give a vehicle these links, and no others."""
+        changed = self._links[vehicle] ^ links
+        self._links[vehicle], self._degree[vehicle] = links, links.bit_count()
+        while changed:
+            other = changed.bit_length() - 1
+            changed ^= 1 << other
+            self._links[other] ^= 1 << vehicle
+            self._degree[other] = self._links[other].bit_count()

@@ -1,5 +1,6 @@
 """Networks: the generated ones are like the published ones, and a wrong file is told by its line."""
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,15 @@ def test_the_same_seed_gives_the_same_network_and_another_one_does_not(layout: s
     assert np.array_equal(one.heading_rad, same.heading_rad)
     assert not np.array_equal(one.position_m, other.position_m)
     assert not np.array_equal(one.heading_rad, other.heading_rad)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "seed", "digest"),
+    [(6, 3, "dd06c87e6a727bf5"), (12, 5, "5fe373fcc8d4d990"), (24, 0, "3a766a8fbb5bafd2")],
+)
+def test_networks_are_those_of_earlier_versions_bit_for_bit(vehicles: int, seed: int, digest: str) -> None:
+    position_m = generate_network("urban", vehicles, seed).position_m
+    assert hashlib.sha256(position_m.tobytes()).hexdigest()[:16] == digest
 
 
 @pytest.mark.parametrize("vehicles", [1, 2, 3, 10, 12, 70, 300])
