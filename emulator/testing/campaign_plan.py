@@ -43,6 +43,8 @@ class Plan:
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     note: str = ""
     """Change of the scenario that the campaign has made by itself, in one line; "" if none."""
+    constraints: ScheduleConstraints | None = None
+    """Those of every run's schedule: vehicles have the same names whatever the seed. None without faults."""
 
     @classmethod
     def of(cls, scenario: Scenario, faults: str, runs: int, seed: int, **options: Any) -> Plan:
@@ -55,23 +57,24 @@ class Plan:
         own = [fault for fault in scenario.fault if isinstance(fault, OwnRule)]
         plain, note = make_scenario(scenario, {"run.pacing": "lockstep", "faults": own}), ""
         kinds = () if faults == NONE else known_kinds(None if faults == RANDOM else faults.split(","))
+        constraints = None
         if kinds:
             plain, note = _with_time_for_faults(plain)
-            ScheduleConstraints.of(plain)
+            constraints = ScheduleConstraints.of(plain)
         search_programs_in(plain.program.folders)
         load_program(plain.program.entry)
         load_checks(plain.program)
         load_rules(plain.fault, plain.program)
         plain = with_order_steps(plain)
-        return cls(plain, runs, seed, kinds, note=note, **options)
+        return cls(plain, runs, seed, kinds, note=note, constraints=constraints, **options)
 
     def draw(self, number: int) -> Scenario:
         """Run `number`: a network, a seed and one to four faults, if there are to be any."""
         seed = (self.seed + number) % SEEDS
         scenario = with_seed(self.scenario, seed)
-        if not self.kinds:
+        if self.constraints is None:
             return scenario
-        choose, constraints = _Random(seed), ScheduleConstraints.of(scenario)
+        choose, constraints = _Random(seed), self.constraints
         weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
         faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
         return make_scenario(scenario, {"faults": [*scenario.fault, *faults]})

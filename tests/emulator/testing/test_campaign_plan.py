@@ -49,6 +49,12 @@ def test_without_faults_the_runs_differ_by_their_seeds() -> None:
     assert Plan.of(scenario(2.0, 0.5), "none", 1, seed=1).draw(0).fault == ()
 
 
+def test_a_plan_leaves_the_networks_of_its_runs_to_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = Plan.of(scenario(2.0, 0.5), "random", 2, seed=7)
+    monkeypatch.setattr("emulator.testing.schedules.build_world", None)
+    assert [len(plan.draw(number).fault) > 1 for number in range(2)] == [True, True]
+
+
 def test_a_run_too_short_for_faults_is_refused() -> None:
     with pytest.raises(ScenarioError, match=r"run.duration_s - run.settle_s = 0.05: leaves no time for faults"):
         Plan.of(scenario(0.1, 0.1), "random", 1, seed=1)
