@@ -28,7 +28,7 @@ def diff(
 ) -> None:
     """Show where two runs part: decision, frame, reception, event or value, and what had happened before.
 
-    Status 0 in any case.
+    Status 0: the runs agree; 1: they part; 2: error.
     """
     with one_line_errors():
         ours, theirs = RecordedRun.open(run), RecordedRun.open(other)
@@ -44,6 +44,7 @@ def diff(
             console.print(f"{first.node} until then:", highlight=False)
             for line in told:
                 console.print(Text(f"  {line}"))
+        raise typer.Exit(1)
 
 
 def _table(found: list[Parting], ours: str, theirs: str) -> Table:
