@@ -92,11 +92,12 @@ class SenderFaults:
         self._sent[node].append(_Sent(time_ns, seq, original.payload, choices))
         for planned in acting:
             if isinstance(planned.fault, StaleMessages) and (old := self._from(node, time_ns, planned.fault.age_s)):
-                original = Outgoing(old.payload, seq, choices, cause=planned.number)
+                again = old.choices._replace(ticket=choices.ticket)
+                original = Outgoing(old.payload, seq, again, cause=planned.number)
         further: dict[int, list[bytes]] = {}
         for planned in acting:
             if isinstance(planned.fault, CustomSender) and not original.dropped:
-                sent = self._ask(planned, time_ns, node, Outgoing(original.payload, seq, choices))
+                sent = self._ask(planned, time_ns, node, Outgoing(original.payload, seq, original.choices))
                 further[planned.number] = sent[1:]
                 if not sent:
                     original = replace(original, cause=planned.number, dropped=True)

@@ -224,6 +224,8 @@ class SharedMedium(Protocol):
 def address_all(frames: Sequence[Frame], receptions: Receptions, mac: SharedMedium) -> None:
     """Note who could read frames where others act on it, and what becomes of those to single vehicles."""
     for index, frame in enumerate(frames):
+        if frame.ticket and (not frame.attempt or frame.sender_outcome != Outcome.pending):
+            mac.unicasts.leave(frame)  # it is over, or an older one was broadcast in its place
         if not (frame.attempt or mac.has_eifs):
             continue
         outcome, cause = receptions.outcome[index], receptions.cause[index]
@@ -232,4 +234,3 @@ def address_all(frames: Sequence[Frame], receptions: Receptions, mac: SharedMedi
             address(frame, outcome, mac.medium.locked(frame), cause, is_up)
         elif frame.attempt:
             outcome[np.arange(len(outcome)) != frame.to] = Outcome.out_of_range.value
-            mac.unicasts.leave(frame)

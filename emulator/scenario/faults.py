@@ -367,7 +367,7 @@ class StaleMessages(SenderFault):
 
     kind: Literal["StaleMessages"]
     age_s: Annotated[float, Drawn(1, 30, per=10)] = Field(1.0, gt=0, le=60)
-    """Age of the old frame: the newest one that is at least this old."""
+    """Age of the old frame: the newest one at least this old. It keeps its addressee, power and bit rate."""
 
 
 class DoS(SenderFault):

@@ -170,6 +170,24 @@ def test_a_replayed_frame_has_the_addressee_power_and_rate_of_the_old_one() -> N
     assert {packet.receiver for packet in air.delivered if not packet.packet.payload[0] % 3} == {1}
 
 
+def test_a_stale_frame_has_the_addressee_power_and_rate_of_the_old_one_and_its_sender_is_told() -> None:
+    """Each is the frame before the last: of those sent in turn as above, whose senders await some of them."""
+    air = FaultyEngine([fault("StaleMessages", nodes={"ids": ["v0"]}, age_s=0.1)], count=3, **PHYSICAL)
+    kinds = [SendOptions(to="v1"), None, SendOptions(19.0, 9.0)]
+    for period in range(9):
+        kind = kinds[period % 3]
+        options = SendOptions(to=kind.to, number=period) if kind and kind.to else kind
+        air.send(period * PERIOD_NS, 0, bytes([period]) * 20, options=options)
+    stale = [row for row in air.rows() if row["cause"] and row["attempt"] < 2]
+    assert len({row["seq"] for row in stale}) == 8
+    for row in stale:
+        kind = kinds[(row["seq"] - 1) % 3]
+        assert bool(row["attempt"]) == ((row["seq"] - 1) % 3 == 0)
+        assert (row["gain_db"], row["bitrate_mbps"]) == ((-1, 9) if kind and kind.power_dbm else (0, 6))
+    results = [(result.number, result.delivered, result.attempts) for result in air.engine.take_results(10**12)]
+    assert results == [(0, True, 1), (3, False, 0), (6, False, 0)], "those to v1 were broadcast, all but the first"
+
+
 def test_a_frame_to_nobody_leaves_no_columns_for_its_choices() -> None:
     subject = engine(line(0, 50), **PHYSICAL)
     subject.transmit(0, 0, [b"x", b"y"], {0: SendOptions(5.0, 12.0, to="v9")})
