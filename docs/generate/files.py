@@ -266,6 +266,7 @@ VERDICT = {
     "deviations, and where a given tape was left",
     "vehicles": "how many",
     "frames_by_outcome": "pairs of frame and receiver by [outcome](#outcomes), copies included",
+    "packet_delivery_ratio": "[of broadcasts](../export.md#radio-figures), copies left out; null without any",
     "figures": "means of some metrics, after the first fifth of the run",
     "roadside_units": "number of roadside units",
     "backbone": "where there are roadside units: number of messages and receivers by outcome; else empty",

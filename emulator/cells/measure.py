@@ -34,13 +34,12 @@ def judged_figures(verdict: Mapping[str, Any]) -> dict[str, Any]:
     and rows are left out.
     """
     frames = verdict["frames_by_outcome"]
-    attempted = sum(count for outcome, count in frames.items() if outcome != "out_of_range")
     row = {
         "verdict": verdict["verdict"],
         "failed": ", ".join(check["name"] for check in verdict["checks"] if check["verdict"] == "invalid"),
         "vehicles": verdict["vehicles"],
         "emulated_s": verdict["emulated_s"],
-        "packet_delivery_ratio": frames.get("delivered", 0) / attempted if attempted else None,
+        "packet_delivery_ratio": verdict["packet_delivery_ratio"],
         **{f"frames_{outcome}": count for outcome, count in frames.items()},
         **verdict["figures"],
         "trace_sha256": verdict["trace_sha256"],

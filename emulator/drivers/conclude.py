@@ -29,6 +29,7 @@ from emulator.records.costs import run_cost
 from emulator.records.driven_table import driving_figures
 from emulator.records.metrics import summarize
 from emulator.records.node_files import collect
+from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import reported_figures
 from emulator.records.run import Run
@@ -121,6 +122,7 @@ def conclude(
         "vehicles": len(emulation.world.node_ids) - len(emulation.scenario.roadside),
         "roadside_units": len(emulation.scenario.roadside),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
+        "packet_delivery_ratio": delivery_ratio(recorded),
         "figures": summarize(emulation.metrics.rows),
         "driving": driving_figures(recorded.driven, recorded.events),
         "backbone": backbone_figures(recorded.backbone),

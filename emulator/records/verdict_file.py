@@ -39,6 +39,7 @@ class Record:
     real_time_factor: float | None = None
     start_up_s: float | None = None
     metrics_sha256: str = ""
+    packet_delivery_ratio: float | None = None
     reported: dict[str, ReportedFigure] = field(default_factory=dict)
     driving: dict[str, float | None] = field(default_factory=dict)
     backbone: dict[str, int] = field(default_factory=dict)
@@ -57,7 +58,7 @@ class Record:
         return sum(count for outcome, count in self.frames_by_outcome.items() if outcome != "out_of_range")
 
     def share_of(self, outcome: str) -> float | None:
-        """Share of the attempted receptions with this outcome; None without any."""
+        """Share of the attempted receptions with this outcome, copies and retries included; None without any."""
         return self.frames_by_outcome.get(outcome, 0) / self.in_range if self.in_range else None
 
 
@@ -67,11 +68,14 @@ _RECORD = TypeAdapter(Record)
 def read_record(path: Path) -> Record:
     """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
     try:
-        record = _RECORD.validate_python(json.loads(read_bounded(path, LARGEST_BYTES)))
+        data = json.loads(read_bounded(path, LARGEST_BYTES))
+        record = _RECORD.validate_python(data)
     except ValidationError as error:
         raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None
     except (ValueError, RecursionError) as error:
         raise VnetError(f"{path}: not JSON: {error}") from None
+    if "packet_delivery_ratio" not in data:  # of an earlier vnet, which counted all receptions
+        record = replace(record, packet_delivery_ratio=record.share_of("delivered"))
     return replace(
         record,
         checks=[replace(check, name=_new_name(check.name)) for check in record.checks],

@@ -80,10 +80,14 @@ class Comparison:
 
     @cached_property
     def figures(self) -> list[Row]:
-        """Key figures with B − A; lengths in metres."""
+        """Key figures with B − A; lengths in metres, ratios in percent."""
         ours, theirs = (shown_figures(record.figures) for record in self.records)
         titles = [title for title in KEY_FIGURES.values() if title in ours or title in theirs]
         rows = [_difference(f"{title} (m)", ours.get(title), theirs.get(title), ".3f") for title in titles]
+        ratios = [record.packet_delivery_ratio for record in self.records]
+        if any(ratio is not None for ratio in ratios):
+            percent = [None if ratio is None else 100 * ratio for ratio in ratios]
+            rows.append(_difference("packet delivery ratio (%)", percent[0], percent[1], ".2f"))
         times = [(record.emulated_s, record.wall_s) for record in self.records]
         rows.append(_difference("emulated time (s)", times[0][0], times[1][0], ".1f"))
         return [*rows, _difference("wall-clock time (s)", times[0][1], times[1][1], ".1f")]

@@ -165,7 +165,7 @@ def _figure(name: str, record: Record) -> Number:
 
 
 def _delivered(record: Record) -> Number:
-    share = record.share_of("delivered")
+    share = record.packet_delivery_ratio
     return _number(None if share is None else 100 * share, ".2f")
 
 

@@ -75,7 +75,7 @@ def report_page(source: Source) -> str:
         checks=_checks(record) if record else [],
         problems=[check for check in _checks(record) if check["verdict"] is not Verdict.VALID] if record else [],
         not_applicable=record.judgement.not_applicable if record else {},
-        key_figures=_key_figures(source, record) if record else {},
+        key_figures=key_figures(record) if record else {},
         has_errors=bool(record and shown_figures(record.figures)),
         reported=_reported(record) if record else None,
         charts=draw(source),
@@ -187,8 +187,9 @@ def _one_line(value: Any) -> Any:
 def key_figures(record: Record) -> dict[str, str]:
     """Return the figures that sum up a run, by title."""
     found = {title: f"{value:.3f} m" for title, value in shown_figures(record.figures).items()}
-    if (delivered := record.share_of("delivered")) is not None:
+    if (delivered := record.packet_delivery_ratio) is not None:
         found["packet delivery ratio"] = f"{delivered:.2%}"
+    if record.in_range:
         found["attempted receptions"] = f"{record.in_range:,}"
     if record.driving:
         found["collisions"] = f"{record.driving.get('collisions') or 0:g}"
@@ -200,19 +201,6 @@ def key_figures(record: Record) -> dict[str, str]:
         found["real-time factor"] = f"{record.real_time_factor:.2f}"
     if record.start_up_s:
         found["start of the processes"] = f"{record.start_up_s:.1f} s"
-    return found
-
-
-def _key_figures(source: Source, record: Record) -> dict[str, str]:
-    """The key figures; a run that sent to single vehicles has the packet delivery ratio of its broadcasts."""
-    found = key_figures(record)
-    attempt = maybe(lambda: source.recorded.attempt)
-    radio = maybe(lambda: source.radio)
-    if attempt is None or radio is None or not (attempt > 0).any():
-        return found
-    found.pop("packet delivery ratio", None)
-    if (delivered := radio.totals["delivery_ratio"]) is not None:
-        found = {"packet delivery ratio": f"{delivered:.2%}", **found}
     return found
 
 

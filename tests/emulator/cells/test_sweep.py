@@ -11,12 +11,13 @@ from typer.testing import CliRunner
 
 import emulator
 from emulator.cells import sweep as subject
-from emulator.cells.cells import Cell, CellResult, compute
+from emulator.cells.cells import Cell, compute
 from emulator.cells.measure import WALL_CLOCK, judged_figures
 from emulator.cells.sweep import SweepPlan, parse_shard
 from emulator.cli.sweep import sweep as command
 from emulator.report.sweep_page import Mean, figures_of, heading, mean_of, sweep_page
 from emulator.scenario.source import scenario_of
+from tests.support.cells import compute_here
 from tests.support.cli import command_app
 from vnet.errors import VnetError
 
@@ -35,16 +36,7 @@ def plan(vary: dict[str, list[Any]] = VARY, seeds: range = range(1, 3), **change
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Cell]:
     """Run cells here; returns those that were run."""
-    ran: list[Cell] = []
-
-    def each(jobs: list[Cell], *_: object) -> Any:
-        for cell in jobs:
-            ran.append(cell)
-            result: CellResult = compute(cell)
-            yield cell, result
-
-    monkeypatch.setattr("emulator.cells.cells.each_done", each)
-    return ran
+    return compute_here(monkeypatch)
 
 
 def test_the_cells_are_all_combinations_with_every_seed() -> None:
@@ -205,9 +197,8 @@ def test_numbers_of_own_checks_are_columns() -> None:
         {"name": "own:warned", "verdict": "invalid", "figures": figures},
         {"name": "conservation", "verdict": "valid", "figures": {"frames": 10}},
     ]
-    verdict: dict[str, Any] = dict.fromkeys(
-        ("verdict", "vehicles", "emulated_s", "trace_sha256", "metrics_sha256", "wall_s", "real_time_factor")
-    )
+    names = ("verdict", "vehicles", "emulated_s", "trace_sha256", "metrics_sha256", "wall_s", "real_time_factor")
+    verdict: dict[str, Any] = dict.fromkeys([*names, "packet_delivery_ratio"])
     row = judged_figures(verdict | {"checks": checks, "frames_by_outcome": {}, "figures": {}, "reported": {}})
     assert {name: value for name, value in row.items() if "." in name} == {
         "own:warned.slowest_s": 0.2,

@@ -285,7 +285,7 @@ def test_the_index_lists_broken_and_half_written_runs_and_latest_once(beacon: Pa
     assert "no verdict.json: it is still going on" in page.text
     assert "./beacon-1/report.html" in page.references and "./half-1/" in page.references
     assert not list(runs.glob(".*.part"))
-    share = RecordedRun.open(beacon).record.share_of("delivered")
+    share = RecordedRun.open(beacon).record.packet_delivery_ratio
     assert share is not None and f"{100 * share:.2f}" in page.text
 
 

@@ -1,5 +1,6 @@
 """Reports of runs that send frames to single vehicles: packet delivery ratios are those of broadcasts."""
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -8,11 +9,14 @@ import numpy as np
 import pytest
 
 import emulator
+from emulator.cells.measure import judged_figures
 from emulator.radio.outcomes import Outcome
 from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.unicast_figures import unicast_figures
 from emulator.report import radio_figures
+from emulator.report.comparison import Comparison
+from emulator.report.index import index_page
 from emulator.report.network_figures import links
 from emulator.report.radio import radio_section
 from emulator.report.source import Source
@@ -58,6 +62,12 @@ def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> No
     assert section.totals["frames to one vehicle"] == str(unicast_figures(whole))
     page = re.sub(r"<[^>]*>|\s+", " ", report_page(source))
     assert f"{ratio:.2%}" in page, "key figures and the section agree"
+    assert whole.record.packet_delivery_ratio == ratio != whole.record.share_of("delivered")
+    assert f"{100 * ratio:.2f}" in index_page(run.parent)
+    shown = next(row for row in Comparison.of(run, run).figures if row["figure"] == "packet delivery ratio (%)")
+    assert shown["A"] == f"{100 * ratio:.2f}" and shown["B − A"] == "+0.00"
+    verdict = json.loads((run / "verdict.json").read_text())
+    assert judged_figures(verdict)["packet_delivery_ratio"] == ratio, "a row of a sweep has it, too"
 
 
 def test_a_run_without_broadcasts_has_its_frames_to_one_vehicle(tmp_path: Path) -> None:
