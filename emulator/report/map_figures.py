@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -11,6 +12,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
@@ -34,6 +36,8 @@ MOST_ROADS, MOST_LINKS, MOST_TRAJECTORIES = 8000, 3000, 400
 """Road segments, links and trajectories that are drawn: more would make a page of many megabytes."""
 MOST_NAMED = 30
 """Vehicles up to which each has its name beside it."""
+NAME_PX = (6.0, 12.0)
+"""Width of a letter of a name at most, and height of the name."""
 LARGEST_INTEGER = 1e15
 """Bound of numbers up to which classes are of whole numbers: beyond it they are shown with four digits."""
 POINTS_A_TRAJECTORY = 80
@@ -74,10 +78,7 @@ def _network(source: Source) -> Drawing:
         made.axes.plot(*(position_m[-len(units) :] * scale).T, **UNIT)
         text += " Squares: roadside units."
     if len(position_m) <= MOST_NAMED:
-        for node, (x, y) in zip(source.recorded.node_ids, position_m * scale, strict=True):
-            if np.isfinite(x):
-                name = printable(node, 12)
-                made.axes.annotate(name, (x, y), (4, 3), textcoords="offset points", fontsize=9, color=INK)
+        text += _draw_names(made, source.recorded.node_ids, position_m * scale)
     return Drawing(made, text)
 
 
@@ -199,6 +200,23 @@ def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: 
 
 def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE) -> None:
     made.axes.plot(*position.T, color=colour, linestyle="none", marker="o", markersize=5, markeredgewidth=0)
+
+
+def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:
+    """Write each vehicle's name on a side where no other name is; returns what has no room, in words."""
+    taken: list[Bbox] = []
+    there = np.flatnonzero(np.isfinite(position).all(axis=1))
+    for number in there.tolist():
+        name, (x, y) = printable(node_ids[number], 12), made.axes.transData.transform(position[number])
+        width, height = NAME_PX[0] * len(name), NAME_PX[1]
+        for right, up in ((4.0, 1.0), (4.0, -1 - height), (-4 - width, 1.0), (-4 - width, -1 - height)):
+            box = Bbox.from_bounds(x + right, y + up, width, height)
+            if not box.count_overlaps(taken):
+                taken.append(box)
+                look: dict[str, Any] = {"fontsize": 9, "color": INK, "va": "bottom"}
+                made.axes.annotate(name, position[number], (right, up), textcoords="offset points", **look)
+                break
+    return " Names without room are left out." if len(taken) < len(there) else ""
 
 
 def _draw_links(made: Canvas, source: Source, scale: float) -> str:

@@ -100,7 +100,7 @@ def main() -> None:
         axes.set_ylabel(label)
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
-    both[0].legend()
+    figure.legend(*both[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)  # no point is below it
     figure.savefig(options.picture, dpi=110, metadata={"Software": None})
 
 

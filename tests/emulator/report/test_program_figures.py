@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
-from emulator.pages.canvas import BLUE
+from emulator.pages.canvas import BLUE, canvas
 from emulator.records.run_folder import RunFolder
 from emulator.report.drawing import Line, draw_charts, time_figure
-from emulator.report.map_figures import classes, map_charts
+from emulator.report.map_figures import _draw_names, classes, map_charts
 from emulator.report.program_figures import points, program_charts, usual_periods
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario
@@ -78,6 +79,18 @@ def test_vehicles_that_report_in_turns_have_one_curve() -> None:
     at_s, _ = points(np.arange(12.0), value.max(axis=1, initial=-1.0, where=np.isfinite(value)), 4.0)
     assert np.isfinite(at_s).all()
     assert usual_periods(value[:4]) == 1.0, "nobody reports twice"
+
+
+def test_names_on_a_map_do_not_overlap() -> None:
+    made = canvas("east (m)", "north (m)")
+    made.axes.set(xlim=(0, 100), ylim=(0, 50))
+    position = np.random.default_rng(1).uniform(0, 50, (30, 2))
+    told = _draw_names(made, [f"vehicle-{number}" for number in range(30)], position)
+    renderer = FigureCanvasAgg(made.figure).get_renderer()
+    boxes = [text.get_window_extent(renderer) for text in made.axes.texts]
+    assert not any(box.count_overlaps(boxes[:number]) for number, box in enumerate(boxes))
+    assert 10 < len(boxes) < 30 and told == " Names without room are left out."
+    assert _draw_names(canvas("x", "y"), ["a", "b"], np.array([[0.2, 0.5], [np.nan, 0.5]])) == ""
 
 
 def test_vehicles_are_coloured_by_values_that_differ(source: Source) -> None:
