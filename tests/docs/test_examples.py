@@ -25,11 +25,12 @@ def last_reports(
     links: list[list[int]],
     faults: Sequence[dict[str, Any]] = (),
     options: dict[str, Any] | None = None,
+    duration_s: float = 2.0,
 ) -> dict[str, Report]:
     """The last report of each vehicle of a network with these links, of which none loses a frame."""
     scenario = Scenario.model_validate(
         {
-            "run": {"duration_s": 2.0, "settle_s": 0.5},
+            "run": {"duration_s": duration_s, "settle_s": 0.5},
             "network": {"vehicles": len(links)},
             "radio": {"loss": 0.0, "links": links},
             "program": {
@@ -62,7 +63,7 @@ def test_a_vehicle_without_links_is_not_warned(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_first_of_a_hundred_vehicles_warns_by_default(tmp_path: Path) -> None:
     links = [[int(abs(a - b) == 1) for b in range(100)] for a in range(100)]
-    reports = last_reports(tmp_path / "run", links, options={})
+    reports = last_reports(tmp_path / "run", links, options={}, duration_s=0.6)
     assert [node for node in sorted(reports) if reports[node].values.get("hops") == 0] == ["v001"]
 
 

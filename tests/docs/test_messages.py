@@ -98,7 +98,7 @@ def _fields_of(kind: Any) -> list[str]:
 # An independent reader.
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(agent_messages | emulator_messages | unit_messages | welcomes)
 def test_a_plain_reader_decodes_what_vnet_encodes(message: Any) -> None:
     kind, *values = msgpack.unpackb(wire.encode(message))

@@ -103,14 +103,14 @@ def command_in(parent: Path) -> Vnet:
             plain += PATIENT
         words = [command, scenario, "--out", str(folder), *plain, *options]
         if command == "simulate" and APART.isdisjoint(options):
-            return Finished(*_in_this_process(words), folder)
+            return Finished(*in_this_process(words), folder)
         done = subprocess.run([*VNET, *words], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
         return Finished(done.returncode, done.stdout, done.stderr, folder)
 
     return run
 
 
-def _in_this_process(words: Sequence[str]) -> tuple[int, str, str]:
+def in_this_process(words: Sequence[str]) -> tuple[int, str, str]:
     """A command's exit status, and what it writes on stdout and stderr."""
     out, error, path = io.StringIO(), io.StringIO(), list(sys.path)
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error), contextlib.chdir(ROOT):

@@ -2,7 +2,6 @@
 
 import json
 import signal
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,8 +10,7 @@ from typing import Any
 import pytest
 
 from emulator.drivers.control import CONTROL_FILE, OPERATOR_FILE, ask
-from tests.support.paths import ROOT
-from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet
+from tests.system.conftest import TIMEOUT_S, Finished, Vnet, in_this_process
 from tests.system.test_failures import long_run
 from vnet.errors import VnetError
 from vnet.transport import keys
@@ -29,25 +27,22 @@ def ask_until(folder: Path, wanted: Callable[[dict[str, Any]], bool]) -> dict[st
     return status
 
 
-def command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*VNET, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S)
-
-
 def test_faults_are_injected_listed_and_healed_while_the_run_is_on(tmp_path: Path, vnet: Vnet) -> None:
     folder = tmp_path / "run"
     with long_run(folder) as process:
         assert [(folder / name).stat().st_mode & 0o077 for name in (CONTROL_FILE, OPERATOR_FILE)] == [0, 0]
-        told = command("fault", "inject", "kill", "--for", "2", "--set", "nodes.count=1", "--run", str(folder))
-        assert told.returncode == 0, told.stderr
-        assert "kill-0" in told.stdout
+        kill = ["kill", "--for", "2", "--set", "nodes.count=1"]
+        status, told, error = in_this_process(["fault", "inject", *kill, "--run", str(folder)])
+        assert status == 0, error
+        assert "kill-0" in told
         assert ask(folder, "inject", LOSS)["fault"] == "loss-1"
         ask_until(folder, lambda status: [f["state"] for f in status["faults"]] == ["ended", "acting"])
         assert ask(folder, "heal", "loss-1") == {"healed": ["loss-1"]}
         ask_until(folder, lambda status: status["faults"][1]["state"] == "ended")
         assert ask(folder, "heal", "loss-1") == {"healed": ["loss-1"]}, "healing twice is harmless"
-        listed = command("fault", "list", "--run", str(folder))
-        assert [name in listed.stdout for name in ("kill-0", "loss-1")] == [True, True]
-        assert " 3 up\n" in command("status", "--run", str(folder)).stdout
+        _, listed, _ = in_this_process(["fault", "list", "--run", str(folder)])
+        assert [name in listed for name in ("kill-0", "loss-1")] == [True, True]
+        assert " 3 up\n" in in_this_process(["status", "--run", str(folder)])[1]
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=TIMEOUT_S)
     assert not (folder / CONTROL_FILE).exists()
@@ -106,6 +101,5 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_where_no_run_is_going_on_a_command_says_so(tmp_path: Path) -> None:
     with pytest.raises(VnetError, match="no run is going on there"):
         ask(tmp_path, "status")
-    told = command("fault", "list", "--run", str(tmp_path))
-    assert (told.returncode, told.stdout) == (2, "")
-    assert told.stderr == f"vnet: {tmp_path}: no run is going on there ({CONTROL_FILE} is missing)\n"
+    told = in_this_process(["fault", "list", "--run", str(tmp_path)])
+    assert told == (2, "", f"vnet: {tmp_path}: no run is going on there ({CONTROL_FILE} is missing)\n")

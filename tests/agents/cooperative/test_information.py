@@ -97,8 +97,8 @@ def test_vehicles_agree_on_the_common_error() -> None:
 def test_hardly_any_honest_prior_is_dropped() -> None:
     """On a ring neighbours know of different others, so that some are off for long, and right."""
     network = Network(12, reach=2)
-    network.run(150)
-    assert sum(e.rejected["prior"] + e.rejected["banned"] for e in network.estimators) < 0.001 * 150 * 48  # frames
+    network.run(80)
+    assert sum(e.rejected["prior"] + e.rejected["banned"] for e in network.estimators) < 0.001 * 80 * 48  # frames
 
 
 def test_alone_a_vehicle_knows_less() -> None:

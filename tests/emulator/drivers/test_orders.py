@@ -34,7 +34,7 @@ def taped(scenario: Scenario, run: Emulation, folder: Path) -> Scenario:
 
 
 @pytest.mark.slow
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(scenario=scenarios(), kind=st.sampled_from(["shuffle", "pct"]), seed=st.integers(0, 1000))
 def test_an_order_is_the_same_in_any_division_into_processes_and_from_its_tape(
     scenario: Scenario, kind: str, seed: int, tmp_path_factory: pytest.TempPathFactory
@@ -51,7 +51,7 @@ def test_an_order_is_the_same_in_any_division_into_processes_and_from_its_tape(
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(scenario=scenarios())
 def test_an_empty_tape_is_fifo(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> None:
     """All decisions are made, each as FIFO makes it, whatever vehicles do with executors, timers and mail."""

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from emulator.cli.commands import app
 from emulator.experiments import city
 from tests.emulator.world.maps.test_city_map import driving
+from tests.support.cells import compute_here
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +51,7 @@ def files(tmp_path: Path) -> Path:
 def test_every_mechanism_drives_once_and_leaves_a_table_and_pictures(
     files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    compute_here(monkeypatch)
     monkeypatch.setattr(city, "MECHANISMS", {name: city.MECHANISMS[name] for name in ("optimized", "none")})
     text = run_small(monkeypatch, files)
     for name in ("centralized", "optimized", "none", "raw fixes"):

@@ -25,6 +25,7 @@ from emulator.experiments.consensus import (
     silent_vehicles,
     study_network,
 )
+from tests.support.cells import compute_here
 from vnet.cmm.linear_model import convergence_factor
 from vnet.errors import VnetError
 
@@ -143,6 +144,7 @@ def test_rounds_to_a_level_count_to_where_it_stays_below() -> None:
 
 
 def test_a_study_leaves_a_table_its_numbers_and_a_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compute_here(monkeypatch)
     monkeypatch.setattr(subject, "has_cvxpy", lambda: False)
     monkeypatch.setattr(subject, "LOSSES", (0.0, 0.3))
     monkeypatch.setattr(subject, "LATENCIES_MS", (150.0,))

@@ -85,7 +85,7 @@ options = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=40))
 def test_however_time_is_cut_the_same_happens(
     seed: int, sends: list[Send], radio: dict[str, Any], stops: list[int]
@@ -117,7 +117,7 @@ QUIET: dict[str, Any] = {"access_jitter_ms": 0.0, "loss": 0.0, "queue_frames": 6
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(seeds, crowds, options, st.lists(st.integers(0, 8 * MS), max_size=20), villains, spans, spans)
 @example(
     seed=1,

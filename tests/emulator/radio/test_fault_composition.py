@@ -52,7 +52,7 @@ def test_with_everything_at_once_each_reception_has_one_outcome_and_all_are_coun
 
 
 @pytest.mark.slow
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_one_more_fault_changes_no_reception_it_does_not_touch(seed: int, data: st.DataObject) -> None:
     """Outcomes, arrivals and bytes of all other pairs stay the same; only the numbers of copies may shift."""
@@ -63,7 +63,7 @@ def test_one_more_fault_changes_no_reception_it_does_not_touch(seed: int, data: 
     extra = fault(kind, 0.5, 4.0, senders={"ids": ["v1"]}, receivers={"ids": ["v2"]}, **more)
     one, other = FaultyEngine(some, seed=seed, loss=0.2), FaultyEngine([*some, extra], seed=seed, loss=0.2)
     for air in (one, other):
-        air.chat(70)
+        air.chat(60)
     before, after = (
         Counter(tuple(v for k, v in row.items() if k != "copy") for row in air.rows() if link(row) != ("v1", "v2"))
         for air in (one, other)
@@ -92,7 +92,7 @@ def test_copies_of_one_fault_do_not_depend_on_how_many_another_made() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(st.integers(0, 1000), st.lists(st.sampled_from(EVERYTHING), max_size=5))
 def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, faults: list[dict[str, Any]]) -> None:
     fixed = [f | {"nodes": {"ids": ["v1", "v3"]}} if "nodes" in f else f for f in faults]
@@ -101,14 +101,14 @@ def test_one_more_vehicle_out_of_range_changes_no_draws_of_others(seed: int, fau
     one, other = FaultyEngine(fixed, seed=seed, loss=0.2), FaultyEngine(fixed, count=6, seed=seed, loss=0.2)
     other.engine.set_positions(np.array([[100.0 * n, 0.0] for n in range(5)] + [[1e7, 0.0]]))
     for air in (one, other):
-        for period in range(60):
+        for period in range(50):
             for node in range(5):
                 air.send(period * PERIOD_NS, node, bytes([node, period]) * 10)
     assert one.rows() == other.rows()
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 1000), st.data())
 def test_after_all_have_ended_the_engine_is_as_one_that_never_had_faults(seed: int, data: st.DataObject) -> None:
     """Any faults, in any order of ending, healed early, twice, or before they begin."""

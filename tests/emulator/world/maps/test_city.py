@@ -164,7 +164,7 @@ def test_more_than_memory_holds_is_refused(city: Roads) -> None:
 
 def test_a_run_through_the_city(tmp_path: Path) -> None:
     """Its programs have the map, and find the error that they share."""
-    scenario = load_scenario(ROOT / "scenarios" / "city.toml", ["run.duration_s=12", "network.vehicles=15"])
+    scenario = load_scenario(ROOT / "scenarios" / "city.toml", ["run.duration_s=8", "network.vehicles=10"])
     folder = RunFolder.create(tmp_path / "run", scenario)
     world = build_world(scenario)
     assert isinstance(world.lane_map, RoadMap)
