@@ -35,6 +35,7 @@ CHECKS = {
     "wakes": "each Yield waits for a timer, the radio or a fix, or its program has ended",
     "own_node": "frames, reports, endings and waiting nodes are the agent's own",
     "payload": "no frame exceeds max_payload",
+    "sends": "each frame to a single vehicle has a number of its own",
     "numbers": "reports hold finite numbers",
     "report_time": "reports bear the time that the vehicle's clock shows",
     "frames_seq": "Frames are numbered 0, 1, 2, …",

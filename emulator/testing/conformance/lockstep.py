@@ -9,6 +9,7 @@ from emulator.scenario.lookahead import least_latency_ns
 from emulator.testing.conformance.joining import absence, ask_stack, orphan
 from emulator.testing.conformance.scene import QUIET_S, Scene, SceneOverError
 from vnet.transport import wire
+from vnet.transport.send_results import WireSendResult
 from vnet.units import NS_PER_S
 
 DURATION_NS = NS_PER_S
@@ -35,6 +36,7 @@ class Barrier:
         self._window_ns = least_latency_ns(scene.scenario.radio)
         self._count = 0
         self._answer: wire.Yield | None = None
+        self._results: list[WireSendResult] = []
 
     def run(self, until_ns: int, clock_error_at_ns: int | None = None) -> None:
         """Grant the first instant, and a window from each instant before `until_ns` that the agent waits for."""
@@ -52,6 +54,7 @@ class Barrier:
         due_ns = [answer.next_timer_ns]
         due_ns += [self._next_fix * self.scene.world.period_ns] if answer.waiting_gnss else []
         due_ns += [self._next_packet_ns()] if answer.waiting_radio else []
+        due_ns += [result.time_ns for result in self._results]
         return min((time_ns for time_ns in due_ns if time_ns is not None), default=None)
 
     def _next_packet_ns(self) -> int:
@@ -70,7 +73,8 @@ class Barrier:
         while self._next_fix * scene.world.period_ns <= self.now_ns:
             fixes.append(scene.fix(self._next_fix))
             self._next_fix += 1
-        grant = wire.Grant(self.seq, self.now_ns, end_ns, packets, fixes, clocks or [])
+        results, self._results = self._results, []
+        grant = wire.Grant(self.seq, self.now_ns, end_ns, packets, fixes, clocks or [], results=results)
         scene.bench.say(grant)
         answer, said = scene.await_message(wire.Yield, "yields", scene.patience_s)
         if answer.seq != self.seq:
@@ -81,6 +85,7 @@ class Barrier:
         if answer.next_timer_ns is not None and answer.next_timer_ns < end_ns:
             raise SceneOverError
         self._answer = answer
+        self._results = scene.inspection.take_results(end_ns)
         return answer
 
     def check_quiet(self) -> None:

@@ -74,7 +74,8 @@ class Clock:
             self._late_ns = due_ns - received_ns
         packets = [scene.packet(self._seq, received_ns - 1_000_000, received_ns)] if received_ns > 0 else []
         if not skipped:
-            scene.bench.say(wire.Batch([scene.fix(self._next_fix)], self._seq, packets, held=held))
+            results = scene.inspection.take_results(due_ns)
+            scene.bench.say(wire.Batch([scene.fix(self._next_fix)], self._seq, packets, held=held, results=results))
             self._timed += 0 if held else len(packets)
         elif self._missed and self._missed[-1][1] == self._seq - 1:
             self._missed[-1] = (self._missed[-1][0], self._seq)

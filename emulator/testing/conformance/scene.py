@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal, TypeVar
 
+from emulator.radio.dot11p import abilities_of
 from emulator.scenario.scenario import Scenario
 from emulator.testing.conformance.bench import Bench, Said
 from emulator.testing.conformance.findings import Findings, counted
@@ -116,6 +117,7 @@ class Scene:
     def start(self) -> wire.Hello:
         """Start the agent and wait for its first hello."""
         self.bench.start_agent()
+        self.inspection.begin()
         self.findings.expect("starts", "hello", "version", "nonce")
         start_up_s = max(self.patience_s, START_UP_S)
         hello, said = self.await_message(wire.Hello, "hello", start_up_s, stays="starts")
@@ -157,6 +159,7 @@ class Scene:
         """The welcome of the scenario's first vehicle."""
         node = self.bench.node
         program = self.scenario.program.of(node)
+        abilities = abilities_of(self.scenario.radio)
         return wire.Welcome(
             node=node,
             nonce=nonce,
@@ -173,6 +176,9 @@ class Scene:
             boot_id=wire.boot_id() if boot_id is None else boot_id,
             runs=runs,
             version=wire.VERSION,
+            max_power_dbm=abilities.max_power_dbm,
+            rates_mbps=abilities.rates_mbps,
+            acknowledges=abilities.acknowledges,
         )
 
     def end(self) -> None:

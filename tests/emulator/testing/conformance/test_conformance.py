@@ -16,6 +16,7 @@ from emulator.testing.conformance import joining, lockstep, realtime
 from emulator.testing.conformance import scene as scene_module
 from emulator.testing.conformance.bench import Said
 from emulator.testing.conformance.findings import CHECKS, Findings, decoding_problem, described
+from emulator.testing.conformance.inspection import Inspection
 from emulator.testing.conformance.play import SCENES, Conformance
 from emulator.testing.conformance.scene import Scene, SceneOverError
 from tests.support.paths import ROOT
@@ -66,6 +67,22 @@ def test_an_agent_without_a_mistake_passes_every_check() -> None:
         played = list(pool.map(lambda first: play(VNET_AGENT, *names[first::AT_ONCE]), range(AT_ONCE)))
     assert [found.failed for found in played] == [{}] * AT_ONCE
     assert {name for found in played for name in found.made} == CHECKS.keys()
+
+
+def test_a_program_that_awaits_the_results_of_its_sends_is_told_them() -> None:
+    data = {"radio": {"mac": {}}, "program": {"entry": "tests.support.exchange_programs:ends_with_results"}}
+    scenes = ["lockstep", "realtime"]
+    found = Conformance(VNET_AGENT, Scenario.model_validate(data), scenes, patience_s=LONG_S).play()
+    assert [scene for scene, came in found.failed.pop("stays") if came.startswith("exit status 17")] == scenes
+    assert found.failed == {}
+
+
+def test_two_frames_to_single_vehicles_with_one_number_are_found() -> None:
+    findings, frame = Findings(), wire.Frame("v01", b"", to="v02", number=3)
+    inspection = Inspection(findings, "v01", 100)
+    inspection.inspect_frames(wire.Frames(b"n", 0, 0, [], wire.Traffic([frame, frame])), b"", 0)
+    ((_, came),) = findings.failed["sends"]
+    assert came.startswith("a second frame with number 3")
 
 
 def test_an_agent_passes_over_tls() -> None:
