@@ -86,7 +86,7 @@ def test_names_on_a_map_do_not_overlap() -> None:
     made.axes.set(xlim=(0, 100), ylim=(0, 50))
     position = np.random.default_rng(1).uniform(0, 50, (30, 2))
     told = _draw_names(made, [f"vehicle-{number}" for number in range(30)], position)
-    renderer = FigureCanvasAgg(made.figure).get_renderer()
+    renderer = FigureCanvasAgg(made.figure).get_renderer()  # type: ignore[no-untyped-call]
     boxes = [text.get_window_extent(renderer) for text in made.axes.texts]
     assert not any(box.count_overlaps(boxes[:number]) for number, box in enumerate(boxes))
     assert 10 < len(boxes) < 30 and told == " Names without room are left out."
