@@ -12,6 +12,7 @@ from docs.generate.markdown import page as whole_page
 from emulator.radio.outcomes import Outcome
 from emulator.radio.trace import Trace
 from emulator.records.backbone_table import BACKBONE
+from emulator.records.background_table import BACKGROUND
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
@@ -39,6 +40,8 @@ FOLDER = {
     "busy.parquet": "[a row for each vehicle and 100 ms](#busyparquet): how busy the medium was that they share",
     "driven.parquet": "[a row for each control instant and vehicle](#drivenparquet), where programs drive",
     "backbone.parquet": "[a row for each message and receiver](#backboneparquet), where there are roadside units",
+    "background.parquet": "[a row for each period and vehicle without a program](#backgroundparquet), with "
+    "[SUMO in the loop](../how-to/sumo-in-the-loop.md)",
     "metrics.parquet": "[a row for each period](#metricsparquet): errors and deviation",
     "payloads.parquet": "[a row for each frame](#payloadsparquet), with `run.keep_payloads`",
     "tape.jsonl": "where [the order of events](../orders.md) was not FIFO, with `run.order` or `run.tape`",
@@ -142,6 +145,12 @@ DRIVEN = {
     "speed_m_s": "truth: its speed",
     "acceleration_m_s2": "truth: its acceleration",
     "command_m_s2": "the acceleration that it was told from this instant on, within its limits; NaN if SUMO drives",
+}
+IN_BACKGROUND = {
+    "time_ns": "the start of the period",
+    "vehicle": "its id in SUMO",
+    "x_m": "truth: east of the middle of its front bumper",
+    "y_m": "truth: north of it",
 }
 ON_BACKBONE = {
     "sent_ns": "when it was sent",
@@ -301,6 +310,7 @@ def page() -> str:
     parts += ["## `busy.parquet`", columns(busy_table(np.zeros((1, 1)), ["v01"]).schema, BUSY)]
     parts += ["## `driven.parquet`", columns(driven_table(Log(), ["v01"]).schema, DRIVEN)]
     parts += ["## `backbone.parquet`", columns(BACKBONE, ON_BACKBONE)]
+    parts += ["## `background.parquet`", "No hash depends on it.", columns(BACKGROUND, IN_BACKGROUND)]
     parts += [
         "## `metrics.parquet`",
         docstring(PeriodFigures),

@@ -36,6 +36,7 @@ from emulator.records.run import Run
 from emulator.records.run_folder import (
     AGAIN,
     BACKBONE_FILE,
+    BACKGROUND_FILE,
     BUSY_FILE,
     DRIVEN_FILE,
     FORMAT,
@@ -75,6 +76,7 @@ def gather(emulation: Emulation, wall_s: float) -> RecordedRun:
         busy=_busy(emulation),
         driven=emulation.driving.table(),
         backbone=emulation.backbone.table(),
+        background=emulation.driving.background(),
         world=RecordedWorld.of(emulation.world),
     )
 
@@ -151,6 +153,7 @@ def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
         BUSY_FILE: recorded.busy,
         DRIVEN_FILE: recorded.driven,
         BACKBONE_FILE: recorded.backbone,
+        BACKGROUND_FILE: recorded.background,
     }
     for name, table in tables.items():
         if table is not None:

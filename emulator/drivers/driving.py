@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 
 import pyarrow as pa
 
+from emulator.records.background_table import background_table
 from emulator.records.driven_table import driven_table
 from emulator.records.run_folder import RunFolder
 from emulator.world.driven.stepped import SteppedWorld
@@ -41,6 +42,10 @@ class Driving:
     def table(self) -> pa.Table | None:
         """Return what vehicles did at each control instant; None where programs do not drive."""
         return None if self._world is None else driven_table(self._world.vehicles.finished_log(), self._node_ids)
+
+    def background(self) -> pa.Table | None:
+        """Return where vehicles without programs were; None where there are none."""
+        return None if self._world is None else background_table(self._world.background)
 
     def take(self, time_ns: int, actions: Iterable[Action]) -> None:
         """Take what programs of vehicles that are up ask for at `time_ns`."""

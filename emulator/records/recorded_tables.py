@@ -54,6 +54,8 @@ class RecordedTables:
     """driven.parquet, where programs drive."""
     backbone: pa.Table | None = None
     """backbone.parquet, where there are roadside units."""
+    background: pa.Table | None = None
+    """background.parquet, where SUMO is stepped with the run."""
 
     # Nodes and where they are.
 

@@ -144,6 +144,11 @@ class Run:
         return self._recorded.backbone
 
     @property
+    def background(self) -> pa.Table | None:
+        """Table of vehicles without programs: a row for each period and vehicle; None where there are none."""
+        return self._recorded.background
+
+    @property
     def metrics(self) -> pa.Table:
         """Table of periods: a row for each period, with errors and counts over all vehicles."""
         return self._recorded.metrics

@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from emulator.radio.trace import ACKNOWLEDGED, Trace
 from emulator.records.backbone_table import BACKBONE
+from emulator.records.background_table import BACKGROUND
 from emulator.records.busy import busy_table
 from emulator.records.driven_table import driven_table
 from emulator.records.metrics import METRICS
@@ -29,6 +30,7 @@ from emulator.records.recorded_world import RecordedWorld
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import (
     BACKBONE_FILE,
+    BACKGROUND_FILE,
     BUSY_FILE,
     DRIVEN_FILE,
     EVENTS_FILE,
@@ -70,6 +72,7 @@ TABLES: dict[str, pa.Schema] = {
     BUSY_FILE: busy_table(np.zeros((1, 1)), ["v01"]).schema,
     DRIVEN_FILE: driven_table(Log(), ["v01"]).schema,
     BACKBONE_FILE: BACKBONE,
+    BACKGROUND_FILE: BACKGROUND,
 }
 """The tables, with the columns that they must have."""
 Columns = Mapping[str, Collection[str]]
@@ -172,6 +175,11 @@ class RunFiles:
     def backbone(self) -> pa.Table | None:
         """A row for each message of a roadside unit and receiver; None where there is no unit."""
         return self._table(BACKBONE_FILE) if self.scenario.roadside else None
+
+    @cached_property
+    def background(self) -> pa.Table | None:
+        """A row for each period and vehicle without a program; None where SUMO is not stepped with the run."""
+        return self._table(BACKGROUND_FILE) if (self.folder / BACKGROUND_FILE).is_file() else None
 
     @cached_property
     def payloads(self) -> KeptPayloads | None:

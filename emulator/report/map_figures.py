@@ -16,6 +16,7 @@ from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
+from emulator.records.background_table import last_positions
 from emulator.records.reported import figure_text, is_text
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
@@ -73,6 +74,9 @@ def _network(source: Source) -> Drawing:
     else:
         shown = _draw_links(made, source, scale)
         text = f"{_ground(source)} Lines: {shown}; points: vehicles."
+    if (background := source.recorded.background) is not None:
+        _draw_background(made, last_positions(background) * scale)
+        text += " Small grey points: vehicles without programs, where they were last."
     _draw_vehicles(made, position_m * scale)
     if units := source.scenario.roadside:
         made.axes.plot(*(position_m[-len(units) :] * scale).T, **UNIT)
@@ -200,6 +204,10 @@ def _draw_lines(made: Canvas, lines: Array, colour: str, opacity: float, width: 
 
 def _draw_vehicles(made: Canvas, position: Array, colour: str = BLUE) -> None:
     made.axes.plot(*position.T, color=colour, linestyle="none", marker="o", markersize=5, markeredgewidth=0)
+
+
+def _draw_background(made: Canvas, position: Array) -> None:
+    made.axes.plot(*position.T, color=GREY, linestyle="none", marker="o", markersize=2, markeredgewidth=0)
 
 
 def _draw_names(made: Canvas, node_ids: Sequence[str], position: Array) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from emulator.scenario.random_streams import stream
 from emulator.scenario.scenario import Scenario
+from emulator.world.driven.background import Background
 from emulator.world.driven.vehicles import Happening, Log
 from emulator.world.projection import Frame
 from emulator.world.receivers import MotionSensors
@@ -71,6 +72,8 @@ class SteppedWorld(World):
     vehicles: SteppedVehicles
     versions: Mapping[str, str] = MappingProxyType({})
     """Versions of programs that move the vehicles, by name, for the run's verdict."""
+    background: Background | None = None
+    """Vehicles without programs, where there are any."""
 
     def __init__(
         self,

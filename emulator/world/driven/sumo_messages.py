@@ -89,7 +89,8 @@ class Collision(msgspec.Struct, array_like=True):
 class State(msgspec.Struct, tag=True):
     """State of the watched vehicles after a step: `values` are doubles, `COLUMNS` of each vehicle in turn.
 
-    `refused` are numbers of vehicles that have no lane to change to, `vehicles` counts all that SUMO has.
+    `refused` are numbers of vehicles that have no lane to change to, `vehicles` counts all that SUMO has, `others`
+    are the ids of those that are not watched, and `other_m` their positions, x and y of each in turn.
     """
 
     values: bytes
@@ -98,6 +99,8 @@ class State(msgspec.Struct, tag=True):
     lights: dict[str, str]
     refused: list[int]
     vehicles: int
+    others: list[str]
+    other_m: bytes
 
 
 class Failure(msgspec.Struct, tag=True):

@@ -151,7 +151,9 @@ class Simulation:
             for each in sumo.simulation.getCollisions()
         ]
         lights = {name: sumo.trafficlight.getRedYellowGreenState(name) for name in self._lights}
-        return State(values.tobytes(), entered, collisions, lights, refused, len(there))
+        others = sorted(there.difference(self._vehicles))
+        other_m = array("d", (each for name in others for each in sumo.vehicle.getPosition(name)))
+        return State(values.tobytes(), entered, collisions, lights, refused, len(there), others, other_m.tobytes())
 
     def _properties(self, number: int, name: str) -> Vehicle:
         vehicle = self._sumo.vehicle

@@ -21,7 +21,8 @@ class SumoVehicles:
 
     `sumo_ids` are the vehicles' ids in SUMO, `range_m` that of their ranging, if they have any. A command holds
     from the first control instant at or after it until the next one, or until it is given back. `lights` is the
-    state of each traffic light at `now_ns`, if these are `with_lights`; `in_all` counts SUMO's vehicles.
+    state of each traffic light at `now_ns`, if these are `with_lights`; `in_all` counts SUMO's vehicles, `others`
+    are the ids of those without a program, and `other_m` (k, 2) their positions.
     """
 
     def __init__(
@@ -134,6 +135,7 @@ class SumoVehicles:
             self._properties[:, vehicle.number] = limits
         self._command[np.isnan(self.speed)] = np.nan
         self.lights, self.in_all = state.lights, state.vehicles
+        self.others, self.other_m = state.others, np.frombuffer(state.other_m).reshape(-1, 2)
 
     def _collisions(self, state: State) -> list[Happening]:
         """Return the collisions with vehicles that have a program, each pair of vehicles the first time."""

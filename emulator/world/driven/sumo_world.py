@@ -10,6 +10,7 @@ from emulator.scenario.driven import control_step_ns
 from emulator.scenario.node_ids import node_id
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.sumo_loop import Sumo
+from emulator.world.driven.background import Background
 from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.sumo_client import require_libsumo
 from emulator.world.driven.sumo_messages import Begun
@@ -30,6 +31,7 @@ class SumoWorld(SteppedWorld):
     """A world whose `vehicles` drive in SUMO, the rest of whose traffic has no radio and no program."""
 
     vehicles: SumoVehicles
+    background: Background
 
     def __init__(self, scenario: Scenario) -> None:
         path, sumo = scenario.network.path, scenario.network.sumo or Sumo()
@@ -43,6 +45,7 @@ class SumoWorld(SteppedWorld):
         self.versions = {"sumo": begun.version}
         self._corners_m = np.array(begun.boundary_m)
         self._lights_of: dict[int, dict[str, str]] = {}  # by period
+        self.background = Background()
         lanes, frame, notes = _lanes(scenario, begun)
         super().__init__(scenario, tuple(map(node_id, sumo_ids)), lanes, notes, frame)
         self._see_lights = frozenset(sumo.lights_to)
@@ -87,6 +90,7 @@ class SumoWorld(SteppedWorld):
     def _fill(self, period: int) -> None:
         super()._fill(period)
         self._lights_of[period] = self.vehicles.lights
+        self.background.add(self.vehicles.now_ns, self.vehicles.others, self.vehicles.other_m)
 
 
 def _lanes(scenario: Scenario, begun: Begun) -> tuple[LaneMap | RoadMap, Frame | None, tuple[str, ...]]:

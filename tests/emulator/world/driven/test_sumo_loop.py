@@ -8,14 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 import pytest
 from numpy.testing import assert_allclose
 
 import emulator
 from emulator.checks.judge import check_run
 from emulator.drivers.emulation import Emulation
+from emulator.records.background_table import last_positions
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import Verdict
+from emulator.report.drawing import draw_charts
+from emulator.report.map_figures import map_charts
+from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
 from emulator.world.driven.sumo_world import SumoWorld
 from emulator.world.world import build_world
@@ -92,6 +97,20 @@ def test_programs_drive_their_vehicles_and_the_others_react(tmp_path: Path) -> N
     assert lights[0] == {"a": "rG", "b#1": "rG"}
     assert "traffic_lights" not in seen["behind"][0][2]
     assert (tmp_path / "closed").read_text() == "closed", "SUMO may write its files"
+
+
+def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
+    """`behind` and `late` have none; `late` comes after a second."""
+    run = simulated(tmp_path, write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
+    table = RecordedRun.open(tmp_path / "run").background
+    assert table is not None and table.equals(run.background)
+    first = table.slice(0, 1).to_pylist()[0]
+    assert first == {"time_ns": 0, "vehicle": "behind", "x_m": 30.0, "y_m": 5.0}
+    of_late = table.filter(pc.equal(table["vehicle"].cast("string"), "late"))
+    assert of_late["time_ns"].to_pylist() == list(range(10**9, 3 * 10**9, 10**8)), "one row a period"
+    (drawing, *_), _ = draw_charts(map_charts(Source(tmp_path / "run")))
+    assert "vehicles without programs, where they were last" in drawing.caption
+    assert last_positions(table).shape == (2, 2)
 
 
 def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
