@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+import numpy as np
 import pyarrow as pa
 
 from emulator.records.background_table import background_table
@@ -13,6 +14,7 @@ from emulator.world.driven.stepped import SteppedWorld
 from emulator.world.driven.vehicles import Happening
 from emulator.world.world import World
 from vnet.driving import Action
+from vnet.types import Array
 
 
 class Driving:
@@ -46,6 +48,11 @@ class Driving:
     def background(self) -> pa.Table | None:
         """Return where vehicles without programs were; None where there are none."""
         return None if self._world is None else background_table(self._world.background)
+
+    def background_m(self, period: int) -> Array:
+        """Return the positions (k, 2) of vehicles without programs at the start of a period."""
+        background = None if self._world is None else self._world.background
+        return np.zeros((0, 2)) if background is None else background.position_m[period]
 
     def take(self, time_ns: int, actions: Iterable[Action]) -> None:
         """Take what programs of vehicles that are up ask for at `time_ns`."""

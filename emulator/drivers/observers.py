@@ -60,6 +60,7 @@ class Messages:
             [planned.label for planned in emulation.faults.faults if planned.acts_between(start_ns, end_ns)],
             self._events(),
             mean_busy(emulation.engine.busy_ratios(end_ns), len(emulation.number), start_ns, end_ns),
+            emulation.driving.background_m(view.instant.period),
         )
 
     def end(self) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from emulator.world.driven.background import Background
 from vnet.types import Array
@@ -36,7 +35,10 @@ def background_table(background: Background | None) -> pa.Table | None:
     return pa.table(columns, BACKGROUND)
 
 
-def last_positions(table: pa.Table) -> Array:
-    """Return the positions (k, 2) of the vehicles that were there last."""
-    last = table.filter(pc.equal(table["time_ns"], pc.max(table["time_ns"]))) if len(table) else table
-    return np.column_stack([last["x_m"].to_numpy(), last["y_m"].to_numpy()])
+def positions_by_time(table: pa.Table | None) -> dict[int, Array]:
+    """Return the positions (k, 2) of the vehicles by each time in ns at which there were any."""
+    if table is None or not len(table):
+        return {}
+    time_ns, position_m = table["time_ns"].to_numpy(), np.column_stack([table["x_m"], table["y_m"]])
+    first = np.flatnonzero(np.diff(time_ns, prepend=-1))
+    return dict(zip(time_ns[first].tolist(), np.split(position_m, first[1:]), strict=True))

@@ -16,7 +16,7 @@ from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from emulator.pages.canvas import BLUE, GREY, INK, ORANGE, SKY, Canvas, canvas, legend
-from emulator.records.background_table import last_positions
+from emulator.records.background_table import positions_by_time
 from emulator.records.reported import figure_text, is_text
 from emulator.report.drawing import Drawing
 from emulator.report.program_figures import Drawers, label_of
@@ -74,8 +74,8 @@ def _network(source: Source) -> Drawing:
     else:
         shown = _draw_links(made, source, scale)
         text = f"{_ground(source)} Lines: {shown}; points: vehicles."
-    if (background := source.recorded.background) is not None:
-        _draw_background(made, last_positions(background) * scale)
+    if background := positions_by_time(source.recorded.background):
+        _draw_background(made, background[max(background)] * scale)
         text += " Small grey points: vehicles without programs, where they were last."
     _draw_vehicles(made, position_m * scale)
     if units := source.scenario.roadside:

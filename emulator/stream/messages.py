@@ -155,12 +155,14 @@ def period_message(
     faults: Sequence[str],
     events: Iterable[Event],
     busy_ratio: Array,
+    background_m: ArrayLike = (),
 ) -> dict[str, Any]:
     """Return the message of the period [instant.time_ns, end_ns).
 
     Truth, fixes, reports, `figures`, labels of the `faults` that act in it, `events` since the last message, `up`
     (uint8, n) at its end, `busy_ratio` (n), the channel busy ratios (NaN without `[radio.mac]`), and the outcomes
     of frames. `rows` of the trace must include all that were sent or decided in the period, and may include others.
+    `background_m` (k, 2) are positions of vehicles without programs.
     """
     return {
         "period": instant.period,
@@ -183,6 +185,7 @@ def period_message(
         "events": list(map(event_message, events)),
         "busy_ratio": pack(busy_ratio),
         **_frames(rows, instant.time_ns, end_ns, len(node_ids)),
+        "background_m": pack(background_m),
     }
 
 

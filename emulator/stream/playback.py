@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from emulator.records.background_table import positions_by_time
 from emulator.records.busy import busy_windows, mean_busy
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -61,7 +62,7 @@ class _Playback:
         node_ids, period_ns = self.run.world.node_ids, self.run.scenario.period_ns
         told = self._events_and_positions()
         down = _Down(told)
-        states = self.states.periods()
+        states, background = self.states.periods(), positions_by_time(self.run.background)
         for figures, happened in zip(self.figures, events, strict=False):
             if (state := next(states, None)) is None:
                 raise self._misfit("fewer")
@@ -71,8 +72,8 @@ class _Playback:
             rows = self.trace.until(end_ns)
             instant, beliefs = state
             busy = mean_busy(self.busy, len(node_ids), start_ns, end_ns)
-            message = period_message(node_ids, instant, end_ns, beliefs, figures, rows, up, faults, happened, busy)
-            yield "period", message
+            frames = rows, up, faults, happened, busy, background.get(start_ns, ())
+            yield "period", period_message(node_ids, instant, end_ns, beliefs, figures, *frames)
         if next(states, None) is not None:
             raise self._misfit("more")
 

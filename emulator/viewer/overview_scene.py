@@ -98,6 +98,9 @@ class OverviewScene:
             names = [unit["id"] for unit in units]
             canvas.point_style("map/roadside", ORANGE, 7.0, names, show_labels=True, order=29.0)
             canvas.points("map/roadside", [unit["position_m"] for unit in units], static=True)
+        self._has_background = has_background(scene)
+        if self._has_background:
+            canvas.point_style("map/background", GREY, 1.5, order=-20.0)
         draw_scale(canvas, point if len(point) else unpack(scene["area_m"], 2))
         draw_legend(canvas, scene)
         canvas.rings("common", COMMON_RINGS_M)
@@ -142,6 +145,8 @@ class OverviewScene:
         halves = np.stack([position[sender], (position[sender] + position[receiver]) / 2], axis=1)
         canvas.strips("map/links", halves, outcome_colours(state))
         canvas.points("map/true", position)
+        if self._has_background:
+            canvas.points("map/background", period.points("background_m"))
         canvas.points("map/fix", period.points("fix_m"))
         canvas.points("map/estimate", period.points("estimate_m"))
 
@@ -249,6 +254,8 @@ def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
     vehicles = [("true position", SKY), ("estimate", BLUE), ("raw fix", GREY), ("vehicle down", RED)]
     if "roadside" in tomllib.loads(scene["scenario"]):
         vehicles.append(("roadside unit", ORANGE))
+    if has_background(scene):
+        vehicles.append(("small: without program", GREY))
     never = impossible(scene)
     links = [(one.title, colour) for one, colour in OUTCOME_COLOURS.items() if one not in never]
     for entity, items, row in (("vehicles", vehicles, 0.0), ("links", links, -1.0)):
@@ -257,6 +264,11 @@ def draw_legend(canvas: Canvas, scene: Mapping[str, Any]) -> None:
         colours = [list(colour) for _, colour in items]
         canvas.point_style(f"legend/{entity}", colours, 5.0, [label for label, _ in items], show_labels=True)
         canvas.points(f"legend/{entity}", place, static=True)
+
+
+def has_background(scene: Mapping[str, Any]) -> bool:
+    """Return whether there are vehicles without programs."""
+    return bool(tomllib.loads(scene["scenario"])["network"].get("step"))
 
 
 def impossible(scene: Mapping[str, Any]) -> set[Outcome]:

@@ -14,17 +14,26 @@ from numpy.testing import assert_allclose
 
 import emulator
 from emulator.checks.judge import check_run
+from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
-from emulator.records.background_table import last_positions
+from emulator.drivers.observers import Messages
+from emulator.drivers.simulate import simulate
+from emulator.records.background_table import BACKGROUND, positions_by_time
 from emulator.records.recorded_run import RecordedRun
+from emulator.records.run_folder import RunFolder
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts
 from emulator.report.source import Source
 from emulator.scenario.scenario import Scenario, load_scenario, scenario_from
+from emulator.stream.messages import unpack
+from emulator.stream.playback import messages
+from emulator.viewer.recorder import Recorder
+from emulator.viewer.sinks import Sinks
 from emulator.world.driven.sumo_world import SumoWorld
 from emulator.world.world import build_world
 from tests.support.multi_loop_driver import run_apart, run_together
+from tests.support.recordings import read_back
 from tests.support.sumo import install_fake, write_scenario
 from vnet import Node
 from vnet.errors import ScenarioError, VnetError
@@ -99,18 +108,32 @@ def test_programs_drive_their_vehicles_and_the_others_react(tmp_path: Path) -> N
     assert (tmp_path / "closed").read_text() == "closed", "SUMO may write its files"
 
 
+@pytest.mark.slow
 def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
     """`behind` and `late` have none; `late` comes after a second."""
-    run = simulated(tmp_path, write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
+    scenario = Scenario.model_validate(write_scenario(tmp_path, network={"sumo": {"nodes": ["lead#1"]}}))
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(tmp_path / "run", scenario))
+    live, told = Messages(emulation), list[dict[str, Any]]()
+    emulation.watch(lambda view: told.append(live.period(view)))
+    conclude(emulation, simulate(emulation)[0], "simulate")
     table = RecordedRun.open(tmp_path / "run").background
-    assert table is not None and table.equals(run.background)
+    assert table is not None and table.schema == BACKGROUND
     first = table.slice(0, 1).to_pylist()[0]
     assert first == {"time_ns": 0, "vehicle": "behind", "x_m": 30.0, "y_m": 5.0}
     of_late = table.filter(pc.equal(table["vehicle"].cast("string"), "late"))
     assert of_late["time_ns"].to_pylist() == list(range(10**9, 3 * 10**9, 10**8)), "one row a period"
     (drawing, *_), _ = draw_charts(map_charts(Source(tmp_path / "run")))
     assert "vehicles without programs, where they were last" in drawing.caption
-    assert last_positions(table).shape == (2, 2)
+    assert [len(each) for each in positions_by_time(table).values()] == [1] * 10 + [2] * 20
+    played = list(messages(tmp_path / "run"))
+    watched = [message for stream, message in played if stream == "period"]
+    assert [len(unpack(message["background_m"], 2)) for message in watched] == [1] * 10 + [2] * 20
+    assert [message["background_m"] for message in told] == [message["background_m"] for message in watched]
+    with Recorder(Sinks(save=tmp_path / "recording.rrd"), "sumo") as recorder:
+        for stream, message in played:
+            recorder.take(stream, message)
+    drawn = read_back(tmp_path / "recording.rrd")["/map/background"]
+    assert_allclose(drawn.array("Points2D:positions", 0.0), [[30.0, -5.0]], err_msg="north is up")
 
 
 def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
