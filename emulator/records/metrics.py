@@ -25,6 +25,10 @@ from vnet.reports import Report, Value
 
 ROWS_A_PIECE = 2048
 """Largest number of states kept as Python numbers, except for the rest of a period."""
+TRUTH = ("period", "time_ns", "node", "position_m", "heading_rad", "fix_m", "common_error_m")
+"""Columns of the states that reports have no part in."""
+REPORTED = tuple(name for name in STATES.names if name not in TRUTH)
+"""The other columns of `STATES`."""
 
 
 class Metrics:
@@ -39,9 +43,12 @@ class Metrics:
         self._waiting: list[Period] = []
         """Periods whose reports are the last of `_states`, and whose figures nobody has asked for yet."""
         self._recorded = 0
-        self._states: dict[str, list[Any]] = {name: [] for name in STATES.names}
+        self._instants: list[Instant] = []
+        """Truth of the periods whose reports are in `_states`."""
+        self._states: dict[str, list[Any]] = {name: [] for name in REPORTED}
         self._values = ValueColumns()
         self._packed: list[pa.Table] = []
+        self._table: pa.Table | None = None
 
     @property
     def rows(self) -> list[PeriodFigures]:
@@ -67,20 +74,15 @@ class Metrics:
         """Compute the figures of the periods that wait: many at once cost little more than one."""
         if not self._waiting:
             return
-        first = len(self._states["period"]) - len(self._waiting) * len(self._node_ids)
+        first = (len(self._instants) - len(self._waiting)) * len(self._node_ids)
         reported = {name: vectors(self._states[name][first:], size) for name, size in VECTORS.items()}
         self._rows += figures_of(self._waiting, reported)
         self._waiting = []
 
     def _store(self, instant: Instant, last: dict[str, Report]) -> None:
         states, count = self._states, len(self._node_ids)
-        states["period"] += [instant.period] * count
-        states["time_ns"] += [instant.time_ns] * count
-        states["node"] += self._node_ids
-        states["position_m"] += instant.position_m.tolist()
-        states["heading_rad"] += instant.heading_rad.tolist()
-        states["fix_m"] += instant.fix_m.tolist()
-        states["common_error_m"] += [instant.common_error_m.tolist()] * count
+        self._instants.append(instant)
+        self._table = None
         reports = [last.get(node) for node in self._node_ids]
         states["estimate_m"] += [None if report is None else report.estimate_m for report in reports]
         states["covariance_m2"] += [None if report is None else report.covariance_m2 for report in reports]
@@ -90,7 +92,7 @@ class Metrics:
         first_row = self._recorded * count
         states["values"] += [self._other_values(row, each) for row, each in enumerate(values, first_row)]
         self._recorded += 1
-        if len(states["period"]) >= ROWS_A_PIECE:
+        if len(self._instants) * count >= ROWS_A_PIECE:
             self._pack()
 
     def _other_values(self, row: int, values: Mapping[str, Value]) -> list[tuple[str, list[float]]]:
@@ -108,13 +110,17 @@ class Metrics:
     def _pack(self) -> None:
         """Put the rows so far into a table: as Python's numbers they take up many times the room."""
         self._compute()
-        self._packed.append(pa.table(self._states, schema=STATES))
-        self._states = {name: [] for name in STATES.names}
+        if self._instants:
+            self._packed.append(pa.table({**_truth(self._instants, self._node_ids), **self._states}, schema=STATES))
+        self._instants, self._states = [], {name: [] for name in REPORTED}
 
     def states_table(self) -> pa.Table:
         """A row for each node and period; the columns of `STATES`, then those of reported values."""
-        self._pack()
-        return self._values.add_to(pa.concat_tables(self._packed).unify_dictionaries())
+        if self._table is None:
+            self._pack()
+            packed = pa.concat_tables(self._packed) if self._packed else STATES.empty_table()
+            self._table = self._values.add_to(packed.unify_dictionaries())
+        return self._table
 
     def metrics_table(self) -> pa.Table:
         """A row for each period; columns are the fields of `PeriodFigures`."""
@@ -123,6 +129,25 @@ class Metrics:
     def sha256(self) -> str:
         """A hash of the metrics' content, bit by bit."""
         return hashlib.sha256(repr(self.rows).encode()).hexdigest()
+
+
+def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa.Array]:
+    """Return the columns of the states that reports have no part in."""
+    count, periods = len(node_ids), len(instants)
+    node = pa.array(np.tile(np.arange(count, dtype=np.int32), periods))
+    common_m = np.array([instant.common_error_m for instant in instants])
+    points = {
+        "position_m": np.concatenate([instant.position_m for instant in instants]),
+        "fix_m": np.concatenate([instant.fix_m for instant in instants]),
+        "common_error_m": np.repeat(common_m, count, axis=0),
+    }
+    return {
+        "period": pa.array(np.repeat(np.array([instant.period for instant in instants], np.int32), count)),
+        "time_ns": pa.array(np.repeat(np.array([instant.time_ns for instant in instants], np.int64), count)),
+        "node": pa.DictionaryArray.from_arrays(node, pa.array(node_ids, pa.string())),
+        "heading_rad": pa.array(np.concatenate([instant.heading_rad for instant in instants])),
+        **{name: pa.FixedSizeListArray.from_arrays(array.ravel(), 2) for name, array in points.items()},
+    }
 
 
 _ARROW = {
