@@ -259,18 +259,19 @@ class Engine:
 
     def _book(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Append the receptions in range to the trace, and put the pending ones in flight."""
-        receivers = receptions.receivers()
         for (number, column), flips in receptions.flips.items():
-            frames[number].altered[int(receivers[number, column])] = flipped(frames[number].payload, flips)
+            receiver_number = int(receptions.receivers()[number, column])
+            frames[number].altered[receiver_number] = flipped(frames[number].payload, flips)
         near = receptions.outcome != OUT_OF_RANGE
-        for number, frame in enumerate(frames):
-            if frame.attempt:  # its row stands also if nobody could receive it
-                near[number, frame.to] = True
-        each = np.count_nonzero(near, axis=1)
-        receiver = receivers[near]
-        broadcasts = [number for number, frame in enumerate(frames) if not frame.attempt]
-        near_ones = int(each[broadcasts].sum())
-        self._counts[Outcome.out_of_range] += len(broadcasts) * (len(self._node_ids) - 1) - near_ones
+        addressed = [number for number, frame in enumerate(frames) if frame.attempt]
+        for number in addressed:  # its row stands also if nobody could receive it
+            near[number, frames[number].to] = True
+        each = near.sum(axis=1)
+        column = near.nonzero()[1]
+        receiver = column if receptions.receiver is None else receptions.receiver[near]
+        near_ones = len(receiver) - int(each[addressed].sum())
+        broadcasts = len(frames) - len(addressed)
+        self._counts[Outcome.out_of_range] += broadcasts * (len(self._node_ids) - 1) - near_ones
         self._enter(
             frames, each, receiver, receptions.outcome[near], receptions.arrival_ns[near], receptions.cause[near]
         )
@@ -281,7 +282,8 @@ class Engine:
                 frame = replace(frame, copy=self._next_copy(frame.sender, frame.seq), cause=cause)
                 each, pending = np.array([len(again)]), np.full(len(again), PENDING, np.uint8)
                 arrival_ns = receptions.arrival_ns[number, again] + later_ns
-                self._enter([frame], each, receivers[number, again], pending, arrival_ns, np.int16(cause))
+                receiver = receptions.receivers()[number, again]
+                self._enter([frame], each, receiver, pending, arrival_ns, np.int16(cause))
 
     def _enter(
         self,

@@ -99,10 +99,11 @@ class Deliveries(Sequence[Delivery]):
         return [replace(packet, rssi_dbm=rssi_dbm, snr_db=snr_db) for packet, rssi_dbm, snr_db in powers]
 
     def _order(self) -> NDArray[np.intp]:
-        order = np.argsort(self._table[_ARRIVAL], kind="stable")
-        is_same = np.diff(self._table[_ARRIVAL, order]) == 0
-        tied = np.append(is_same, False) | np.append(False, is_same)
-        if tied[: len(order)].any():
+        order = self._table[_ARRIVAL].argsort(kind="stable")
+        arrival_ns = self._table[_ARRIVAL, order]
+        is_same = arrival_ns[1:] == arrival_ns[:-1]
+        if is_same.any():
+            tied = np.append(is_same, False) | np.append(False, is_same)
             some = order[tied]
             arrival, receiver, row, _ = self._table[:, some]
             rows = self._trace.rows(row)

@@ -79,7 +79,7 @@ class Loss:
     def __call__(self, frames: Sequence[Frame], receptions: Receptions) -> None:
         """Decide `lost`."""
         loss = self._loss if frames[0].topology.loss is None else rows(frames, "loss")
-        if np.any(loss > 0):
+        if loss > 0 if isinstance(loss, float) else (loss > 0).any():
             receptions.decide(frame_draws(self._draws, frames, receptions) < loss, Outcome.lost)
 
 

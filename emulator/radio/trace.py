@@ -171,7 +171,8 @@ class Trace:
         rows["frame"] = np.repeat(np.arange(first_frame, first_frame + len(each)), each)
         rows["receiver"], rows["outcome"], rows["cause"] = receiver, outcome, cause
         rows["cause"] -= NO_CAUSE
-        rows["arrival_ns"] = np.where(np.isin(outcome, (PENDING, Outcome.receiver_down)), arrival_ns, NOT_ARRIVING)
+        arrives = (outcome == PENDING) | (outcome == Outcome.receiver_down)
+        rows["arrival_ns"] = np.where(arrives, arrival_ns, NOT_ARRIVING)
         if powers_db is not None:
             powers = self._powers.add(len(outcome))
             for name, power_db in zip(UNHASHED, powers_db, strict=True):
