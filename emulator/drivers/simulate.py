@@ -129,7 +129,8 @@ class _Simulation:
         self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
         self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
         self._meter = CpuMeter()
-        self.loop.measure(self._meter)
+        if emulation.folder.is_open:  # else nobody asks what programs have cost
+            self.loop.measure(self._meter)
         self.logs = NodeLogs(emulation.folder.logs)
         disks = Disks(emulation.folder.disks)
         debugger = None if debug is None else _debugger(debug, self._quit)

@@ -159,7 +159,8 @@ class RecordedRun(RecordedTables):
 
     def caused_by(self, *kinds: str) -> Mask:
         """Mask of the rows that name a fault of one of these kinds."""
-        return np.isin(self.cause, [planned.number for planned in self.plan if planned.fault.kind in kinds])
+        wanted = [planned.number for planned in self.plan if planned.fault.kind in kinds]
+        return np.isin(self.cause, wanted) if wanted else np.zeros(len(self.cause), dtype=bool)
 
     @cached_property
     def plan(self) -> list[PlannedFault]:

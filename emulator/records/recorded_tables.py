@@ -221,8 +221,18 @@ class RecordedTables:
 
     def outcome_is(self, *names: str) -> Mask:
         """Mask of the rows with one of these outcomes."""
-        mask = pc.is_in(self.trace["outcome"].cast(pa.string()), pa.array(names))
-        return np.asarray(mask.to_numpy(zero_copy_only=False), dtype=bool)
+        code, known = self._outcome
+        return np.asarray(np.array([name in names for name in known])[code], dtype=bool)
+
+    @cached_property
+    def _outcome(self) -> tuple[NDArray[np.intp], list[str | None]]:
+        """The outcome of each row as a code, and the outcomes that the codes stand for."""
+        column = self.trace["outcome"].combine_chunks()
+        if not pa.types.is_dictionary(column.type):
+            column = column.dictionary_encode()
+        names = [*column.dictionary.to_pylist(), None]
+        code = pc.fill_null(column.indices, len(names) - 1) if column.null_count else column.indices
+        return np.asarray(code.to_numpy(), dtype=np.intp), names
 
     @cached_property
     def placed(self) -> Mask:
@@ -267,9 +277,12 @@ class RecordedTables:
     @cached_property
     def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
-        return period, np.array([self.number_of(n) for n in self.states["node"].to_pylist()], dtype=np.intp)
+        node = self.states["node"].combine_chunks().dictionary_encode()
+        names = [*node.dictionary.to_pylist(), *([None] if node.null_count else [])]
+        code = np.array([self.number_of(name) for name in names], dtype=np.intp)
+        return period, code[node.indices.to_numpy()]
 
-    @property
+    @cached_property
     def periods(self) -> int:
         """Number of periods that were kept."""
         return int(self._place[0].max(initial=-1)) + 1
