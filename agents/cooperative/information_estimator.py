@@ -126,7 +126,7 @@ class InformationEstimator:
         self.period_s = period_ns / NS_PER_S
         self.rng = rng
         self._rule = FusionRule(options, rng)
-        self._origins = Origins()
+        self._origins = Origins(self.own.drops_outliers)
         self._frames: dict[str, InformationFrame] = {}
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
@@ -191,8 +191,9 @@ class InformationEstimator:
         table = _joined([packed_numbers(self._prior, self._increment, own), *[f.numbers for f in frames.values()]])
         believed = self._believed(list(frames.values()), own, table)
         if believed is not None:
-            frames = {name: frames[name] for name, good in zip(frames, believed, strict=True) if good}
-            table = table[[True, *believed]]
+            frames = {name: frames[name] for name, share in zip(frames, believed, strict=True) if share}
+            table = table[[True, *map(bool, believed)]]
+            table[1:, 5:10] *= np.array([share for share in believed if share])[:, None]
         heard = list(frames.values())
         priors, means_m, leaning = self._moderated(heard, own, table[:, :5], table[:, 10:12])
         self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
@@ -223,24 +224,25 @@ class InformationEstimator:
         self._frames = {}
         return frames
 
-    def _believed(self, frames: Sequence[InformationFrame], own: Five, table: Array) -> list[bool] | None:
-        """Tell which of the frames (n,) are plausible, None if all are.
+    def _believed(self, frames: Sequence[InformationFrame], own: Five, table: Array) -> list[float] | None:
+        """Return the share of the increment of each frame (n,) that is used, None if all are used in full.
 
-        `own` is the mean and the covariance of the vehicle's own prior, and `table` (1 + n, 15) has what all say.
+        It is 0 for frames that are not plausible. `own` is the mean and the covariance of the vehicle's own prior,
+        and `table` (1 + n, 15) has what all say.
         """
         if not self._options.defence or not frames:
             return None
         x, y, p, q, r = own
         codes, now_s = [frame.code for frame in frames], self._now_ns / NS_PER_S
         near = priors_agree([frame.moments for frame in frames], own)
-        agrees = self._origins.agree(codes, table[1:, 5:10], ((x, y), (p, q, r)), now_s)
-        agrees = unless_most_disagree(agrees)
+        shares = self._origins.shares(codes, table[1:, 5:10], ((x, y), (p, q, r)), now_s)
+        shares = unless_most_disagree(shares)
         self._notice_being_lost(near, table[1:, :5])
-        believed = [is_near and does for is_near, does in zip(near, agrees, strict=True)]
-        if False not in believed:
+        believed = [share if is_near else 0.0 for is_near, share in zip(near, shares, strict=True)]
+        if min(believed) == 1:
             return None
         self._reject("prior", near.count(False))
-        self._reject("increment", near.count(True) - believed.count(True))
+        self._reject("increment", believed.count(0.0) - near.count(False))
         return believed
 
     def _reject(self, reason: str, count: int) -> None:
@@ -254,7 +256,7 @@ class InformationEstimator:
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted >= LOST_PERIODS:
             self._contradicted = 0
-            self._origins = Origins()
+            self._origins = Origins(self.own.drops_outliers)
             self.own.restart(median_belief(priors))
             self._prior, self._increment = as_sent(self.own.prior), _NOTHING
 
@@ -342,10 +344,10 @@ class InformationEstimator:
         mean_m, covariance_m2 = self.own.belief
         (p, q), (_, r) = covariance_m2.tolist()
         belief = mean_m.tolist(), (p, q, r)
-        agrees = self._origins.agree(origins, increments, belief, self._now_ns / NS_PER_S)
-        if False in agrees:
-            self._reject("passed", agrees.count(False))
-            increments = increments[agrees]
+        used = self._origins.shares(origins, increments, belief, self._now_ns / NS_PER_S)
+        if min(used) < 1:
+            self._reject("passed", used.count(0.0))
+            increments = (increments * np.array(used)[:, None])[np.array(used) > 0]
         return scaled_down(increments, self._largest_increment)
 
     # What goes out.

@@ -126,6 +126,8 @@ _OF_PRODUCTS = np.array(
 _OF_INFORMATION = np.array([[1e-4, 0, 1 + 1e-4], [0, 1, 0], [1 + 1e-4, 0, 1e-4]])
 """S = Λ + Λ P Λ (yy, xy, xx) and r rᵀ (xx, −2 xy, yy) as sums of the products and of Λ. A lane says nothing along
 itself: a ten thousandth of the trace is added to S, so that rounding there is not counted."""
+_TINY = 1e-300
+"""Least squared deviation: that of an increment which says nothing is 0."""
 _FLOOR = np.array([[1e-9], [0.0], [1e-9]])
 _ADJUGATE, _SQUARES = np.array([0, 1, 2, 0, 1]), np.array([3, 4, 5, 2, 1])
 _RATIO = np.array([[1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])
@@ -187,11 +189,11 @@ def cut_to(off_m: list[tuple[float, float]], limit_m: float) -> list[tuple[float
     return [(x * part, y * part) for (x, y), part in zip(off_m, share, strict=True)]
 
 
-def unless_most_disagree(agrees: list[bool]) -> list[bool]:
-    """Return all true where most are false: then it is what is believed that is wrong, and not they."""
-    if len(agrees) >= MAJORITY - 1 and 2 * agrees.count(True) < len(agrees):
-        return [True] * len(agrees)
-    return agrees
+def unless_most_disagree(shares: list[float]) -> list[float]:
+    """Return 1 for all where most are less: then it is what is believed that is wrong, and not they."""
+    if len(shares) >= MAJORITY - 1 and 2 * shares.count(1.0) < len(shares):
+        return [1.0] * len(shares)
+    return shares
 
 
 class Sums:
@@ -256,17 +258,23 @@ def _sum_gate(count: float) -> float:
 
 
 class Origins:
-    """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
+    """Decaying sums of the deviations of each origin: of its increments, and of its priors.
 
-    def __init__(self) -> None:
+    drops_outliers: whether increments beyond the gates are dropped, or weighed.
+    """
+
+    def __init__(self, drops_outliers: bool = True) -> None:
+        self._drops_outliers = drops_outliers
         self._increments = Sums()
         self._leans: dict[int, tuple[float, float, float]] = {}  # mean deviation (x, y) and its time
 
-    def agree(self, codes: Sequence[int], increments: Array, belief: Belief, now_s: float) -> list[bool]:
-        """Tell which increments (n, 5) of the origins `codes` agree with the belief (x, P), singly and in sum.
+    def shares(self, codes: Sequence[int], increments: Array, belief: Belief, now_s: float) -> list[float]:
+        """Return the share (n,) of each increment (n, 5) of the origins `codes` that is used.
 
-        An increment that does not is summed up all the same: who has lied is believed again when it has decayed.
-        Each is compared with what was believed when it came: c itself moves by half a metre in the sum's memory.
+        It is 1 within the gates, for the increment by itself and for the origin's sum. Beyond it is 0, or, if
+        outliers are weighed, the gate relative to the squared deviation: an M-estimator whose influence descends.
+        What is beyond is summed up all the same: who has lied is believed again when it has decayed. Each is
+        compared with the belief (x, P) when it came: c itself moves by half a metre in the sum's memory.
         """
         if not codes:
             return []
@@ -278,12 +286,13 @@ class Origins:
         np.add(sums[:10], said[:10, 0], out=said[:10, 1])
         self._increments.store(rows, said[:, 1])
         alone, in_sum = _squared(said[:9].reshape(9, -1)).reshape(2, -1).tolist()
-        agrees = [one < INCREMENT_GATE and many < SUM_GATE for one, many in zip(alone, in_sum, strict=True)]
-        if False in agrees:  # a sum of few may deviate by more
-            counts = (said[9, 1] / weight).tolist()
-            each = zip(alone, in_sum, counts, strict=True)
-            agrees = [one < INCREMENT_GATE and many < _sum_gate(count) for one, many, count in each]
-        return agrees
+        if max(alone) < INCREMENT_GATE and max(in_sum) < SUM_GATE:
+            return [1.0] * len(codes)
+        each = zip(alone, in_sum, (said[9, 1] / weight).tolist(), strict=True)
+        shares = [
+            min(INCREMENT_GATE / max(one, _TINY), _sum_gate(count) / max(many, _TINY)) for one, many, count in each
+        ]
+        return [1.0 if share > 1 else 0.0 if self._drops_outliers else share for share in shares]
 
     def without_lean(
         self, codes: Sequence[int], priors: Sequence[Five], own: Five, middle_m: tuple[float, float], now_s: float

@@ -137,11 +137,23 @@ def test_a_lane_that_says_nothing_along_itself_may_not_move_c_along_it() -> None
 def test_a_small_lie_is_found_in_the_sum_and_forgiven_later() -> None:
     origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
     honest, liar = _information((0.3, 0.0), 2.0), _information((3.0, 0.0), 2.0)
-    believed = [origins.agree([1, 2], np.array([honest, liar]), belief, 0.1 * k) for k in range(50)]
+    believed = [origins.shares([1, 2], np.array([honest, liar]), belief, 0.1 * k) for k in range(50)]
     assert all(good for good, _ in believed)
     assert believed[0][1]  # by itself it is what noise may do
     assert not any(lie for _, lie in believed[10:])
-    assert origins.agree([2], honest[None], belief, 90.0) == [True]
+    assert origins.shares([2], honest[None], belief, 90.0) == [True]
+
+
+def test_outliers_are_weighed_by_how_far_they_are_beyond_the_gates() -> None:
+    """On a map an honest vehicle contradicts for long: it counts less and less, and a liar's pull vanishes."""
+    origins, belief = Origins(drops_outliers=False), ((0.0, 0.0), (0.01, 0.0, 0.01))
+    said = np.array([_information((off_m, 0.0), 2.0) for off_m in (0.2, 0.6, 1.2, 50.0)])
+    for k in range(300):
+        shares = np.array(origins.shares([1, 2, 3, 4], said, belief, 0.1 * k))
+    assert shares[0] == 1
+    assert 0.2 < shares[1] < 1
+    assert shares[2] == pytest.approx(shares[1] / 4, rel=0.01), "the squared deviation is four times as large"
+    assert 0 < shares[3] < 1e-3
 
 
 def test_sums_are_of_what_was_believed_when_it_was_said() -> None:
@@ -151,7 +163,7 @@ def test_sums_are_of_what_was_believed_when_it_was_said() -> None:
         moving_m = np.array([0.01 * k, 0.0])
         increment = Information.of(moving_m, 2.0 * np.eye(2))
         said = np.array([[0.5, 0.0, 0.5, *increment.vector]])
-        assert origins.agree([1], said, (moving_m.tolist(), (0.01, 0.0, 0.01)), 0.1 * k) == [True]
+        assert origins.shares([1], said, (moving_m.tolist(), (0.01, 0.0, 0.01)), 0.1 * k) == [True]
 
 
 @pytest.mark.parametrize(("variance_m2", "limit_m"), [(0.02, 0.02), (2.0, 0.2)])
@@ -189,7 +201,7 @@ def test_only_so_many_origins_are_kept() -> None:
     origins, belief = Origins(), ((0.0, 0.0), (1.0, 0.0, 1.0))
     increment = _information((0.0, 0.0), 1.0)
     for first in range(0, 20_000, 500):
-        origins.agree(list(range(first, first + 500)), np.tile(increment, (500, 1)), belief, first / 100)
+        origins.shares(list(range(first, first + 500)), np.tile(increment, (500, 1)), belief, first / 100)
     assert len(origins._increments) <= 1024
 
 
@@ -235,12 +247,12 @@ def test_of_three_no_majority_can_be_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("agrees", "expected"),
+    ("shares", "expected"),
     [
-        ([True, True, False], [True, True, False]),
-        ([True, False, False], [True, True, True]),
-        ([False, False], [False, False]),
+        ([1.0, 1.0, 0.0], [1.0, 1.0, 0.0]),
+        ([1.0, 0.0, 0.0], [1.0, 1.0, 1.0]),
+        ([0.0, 0.0], [0.0, 0.0]),
     ],
 )
-def test_where_most_disagree_the_belief_is_wrong(agrees: list[bool], expected: list[bool]) -> None:
-    assert unless_most_disagree(agrees) == expected
+def test_where_most_disagree_the_belief_is_wrong(shares: list[float], expected: list[float]) -> None:
+    assert unless_most_disagree(shares) == expected
