@@ -169,8 +169,7 @@ class Engine:
             choices = self._chosen(time_ns, node, options[index]) if index in options else self._default_choices
             if choices is None:
                 continue
-            seq = self._next_seq[node]
-            self._next_seq[node] = seq + 1
+            seq, self._next_seq[node] = self._next_seq[node], self._next_seq[node] + 1
             if self.on_payload is not None:
                 self.on_payload(time_ns, node, seq, payload)
             original = Outgoing(payload, seq, choices)
@@ -304,14 +303,12 @@ class Engine:
             columns.update(zip(CHOSEN, np.array([_CHOICES(frame) for frame in frames]).T, strict=True))
         if self._trace.acknowledges:
             columns["attempt"] = np.array([frame.attempt for frame in frames])
-        digests = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
+        columns["payload_digest"] = np.array([payload_digest(frame.payload) for frame in frames], np.uint64)
         frame_index = np.repeat(np.arange(len(frames)), each)
         powers_db = None
         if self._reception is not None and self._trace.knows_power:
             powers_db = self._reception.powers_db(frames, frame_index, receiver)
-        first = self._trace.append(
-            {"payload_digest": digests, **columns}, each, receiver, outcome, cause, arrival_ns, powers_db
-        )
+        first = self._trace.append(columns, each, receiver, outcome, cause, arrival_ns, powers_db)
         for number, frame in enumerate(frames):
             frame.row = first + int(each[: number + 1].sum()) - 1 if frame.attempt else -1
             for node, payload in frame.altered.items():
@@ -320,6 +317,8 @@ class Engine:
         for kind, number in enumerate(np.bincount(outcome).tolist()):
             if number:
                 self._counts[Outcome(kind)] += number
+        if self._csma is not None and self._trace.acknowledges:
+            self._csma.unicasts.note_duplicates(frames, first, outcome, arrival_ns)
         flying = np.flatnonzero(outcome == PENDING)
         self._in_flight.add(frames, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying])
 
@@ -395,16 +394,22 @@ class Engine:
         return self._in_flight.foresee(time_ns, self._topology.up, self._trace)
 
     def _arrive(self, time_ns: int) -> Deliveries:
+        arrived = self._take_arrivals(time_ns)
+        if self._csma is not None:
+            self._csma.unicasts.miss_duplicates(time_ns, self._topology.up, self._trace, self._counts)
+        return arrived
+
+    def _take_arrivals(self, time_ns: int) -> Deliveries:
         table = self._in_flight.take(time_ns)
         if not table.shape[1]:
             return self._in_flight.deliveries(table, self._trace)
-        receiver, row = table[1], table[2]
-        up = self._topology.up[receiver]
+        row, up = table[2], self._topology.up[table[1]]
         self._trace.decide(row[up], Outcome.delivered)
-        self._trace.decide(row[~up], Outcome.receiver_down)
-        delivered = int(up.sum())
-        self._counts[Outcome.delivered] += delivered
-        self._counts[Outcome.receiver_down] += len(row) - delivered
+        if missed := len(row) - int(up.sum()):
+            self._trace.decide(row[~up], Outcome.receiver_down)
+            self._counts[Outcome.receiver_down] += missed
+            self._in_flight.miss(table[:, ~up])
+        self._counts[Outcome.delivered] += len(row) - missed
         self._counts[Outcome.pending] -= len(row)
         return self._in_flight.deliveries(table[:, up], self._trace)
 

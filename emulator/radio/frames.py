@@ -60,9 +60,10 @@ class Frame:
     on air from `on_air_ns` (NOT_ON_AIR if that is not modelled) to `end_ns`.
 
     `to` is the number of its addressee, or BROADCAST; then it is transmission number `attempt`, from 1 on, and
-    `row` is its row of the trace, and `ticket` names what its program waits for. `was_received` says that an
-    earlier attempt was. `decoded` marks the vehicles (N,) that could read this one, `garbled` those that could not,
-    although they were locked on it. `ack` is its acknowledgement, and `acked` says that its sender received that.
+    `row` is its row of the trace, and `ticket` names what its program waits for. `received_as` is the earlier
+    attempt that was received, and `is_missed` says that an addressee was down when it arrived. `decoded` marks the
+    vehicles (N,) that could read this one, `garbled` those that could not, although they were locked on it. `ack`
+    is its acknowledgement, and `acked` says that its sender received that.
 
     `altered` are the payloads that arrive with other bytes, by receiver. `answers` are those of rules of the user's
     own, by fault, with the columns that they speak of.
@@ -88,7 +89,8 @@ class Frame:
     to: int = BROADCAST
     attempt: int = 0
     row: int = -1
-    was_received: bool = False
+    received_as: Frame | None = None
+    is_missed: bool = False
     ticket: int = 0
     decoded: NDArray[np.bool_] | None = None
     garbled: NDArray[np.bool_] | None = None

@@ -205,6 +205,11 @@ class InFlight:
         self._by_receiver[:], self._compared = NO_ARRIVAL_NS, 0
         return taken
 
+    def miss(self, table: IntArray) -> None:
+        """Note in frames to single vehicles that these receptions, which `take` returned, found nobody."""
+        for number in table[_FRAME].tolist():
+            self._frames[number].is_missed = True
+
     def deliveries(self, table: IntArray, trace: Trace) -> Deliveries:
         """Return the receptions that `take` returned as packets."""
         deliveries = Deliveries(table, self._frames, trace)

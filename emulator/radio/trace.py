@@ -220,6 +220,11 @@ class Trace:
         """Set the outcome of rows."""
         self._receptions.records["outcome"][rows] = outcome.value
 
+    def miss(self, row: int, arrival_ns: int) -> None:
+        """Set the outcome of a row to `receiver_down`, and when it would have arrived."""
+        self._receptions.records["arrival_ns"][row] = arrival_ns
+        self.decide([row], Outcome.receiver_down)
+
     def rows(self, index: NDArray[np.intp] | slice) -> NDArray[np.void]:
         """Return the rows at `index` as records of type `ROW`."""
         receptions = self._receptions.records[index]

@@ -20,6 +20,7 @@ from emulator.radio.frames import BROADCAST, NO_CAUSE, Frame, Receptions
 from emulator.radio.link_faults import ActiveLinkFaults
 from emulator.radio.medium import Medium
 from emulator.radio.outcomes import Outcome
+from emulator.radio.trace import Trace
 from vnet.types import IntArray, Mask
 
 MOST_ATTEMPTS = 7
@@ -91,7 +92,8 @@ def retry_of(frame: Frame, copy: int) -> Frame:
         draw=frame.draw + (1 << _ATTEMPT_BITS),
         attempt=frame.attempt + 1,
         row=-1,
-        was_received=frame.was_received or bool(frame.decoded[frame.to]),
+        received_as=frame.received_as or (frame if frame.decoded[frame.to] else None),
+        is_missed=False,
         decoded=None,
         garbled=None,
         signal=None,
@@ -139,6 +141,8 @@ class Unicasts:
         self._tickets = 0
         self._open: dict[int, tuple[int, int]] = {}
         self._results: list[Result] = []
+        self._duplicates: list[tuple[int, int, int, Frame]] = []
+        """Heap of attempts received once more: arrival time, row, addressee, and the attempt received first."""
         self.counts = {"sent": 0, "delivered": 0, "attempts": 0}
         """Frames to single vehicles whose results are known, those acknowledged, and transmissions."""
 
@@ -171,6 +175,27 @@ class Unicasts:
             self.counts["sent"] += 1
             self.counts["delivered"] += delivered
             self.counts["attempts"] += attempts
+
+    def note_duplicates(
+        self, frames: Sequence[Frame], first_row: int, outcome: NDArray[np.uint8], arrival_ns: IntArray
+    ) -> None:
+        """Note the attempts received once more; outcome and arrival (n,) are those of rows from the first on."""
+        for frame in frames:
+            index = frame.row - first_row
+            if frame.received_as is not None and outcome[index] == Outcome.duplicate:
+                heappush(self._duplicates, (int(arrival_ns[index]), frame.row, frame.to, frame.received_as))
+
+    def miss_duplicates(self, time_ns: int, up: Mask, trace: Trace, counts: dict[Outcome, int]) -> None:
+        """Change attempts that would arrive by `time_ns` to `receiver_down`, where nobody got the one before.
+
+        The addressee is down (`up` (N,)), and was so when the attempt arrived that was received first.
+        """
+        while self._duplicates and self._duplicates[0][0] <= time_ns:
+            arrival_ns, row, to, first = heappop(self._duplicates)
+            if first.is_missed and not up[to]:
+                trace.miss(row, arrival_ns)
+                counts[Outcome.duplicate] -= 1
+                counts[Outcome.receiver_down] += 1
 
     def forget(self, node: int) -> None:
         """Forget what a node that goes down has asked for."""
@@ -208,7 +233,7 @@ def address(
     outcome[others], cause[others] = Outcome.out_of_range.value, NO_CAUSE
     if frame.decoded[frame.to] and not is_up:  # whoever is down acknowledges nothing, and knows nothing again
         frame.decoded[frame.to], outcome[frame.to] = False, Outcome.receiver_down.value
-    elif frame.was_received and frame.decoded[frame.to]:
+    elif frame.decoded[frame.to] and frame.received_as is not None and not frame.received_as.is_missed:
         outcome[frame.to] = Outcome.duplicate.value
 
 

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from emulator.radio.dot11p import AIFSN_AND_CW, MAX_WINDOW, SIFS_NS, SLOT_NS, airtime_ns
 from emulator.radio.engine import Engine
-from emulator.radio.unicast import ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, Result, ack_airtime_ns
+from emulator.radio.frames import BROADCAST, Frame
+from emulator.radio.unicast import ACK_BYTES, ACK_TIMEOUT_NS, EIFS_NS, MOST_ATTEMPTS, Result, ack_airtime_ns
 from tests.support.radio import engine, line
 from vnet.radio import SendOptions
 
@@ -232,3 +233,38 @@ def test_a_vehicle_that_comes_back_between_attempts_receives_the_first_that_find
     assert before and {row["outcome"] for row in before} == {"receiver_down"}
     assert (last["outcome"], last["acked"]) == ("delivered", True)
     assert [result.delivered for result in subject.take_results(10**12)] == [True] and len(arrived) == 1
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_an_attempt_after_one_that_found_nobody_in_the_end_is_no_duplicate(comes_back: bool) -> None:
+    """Its addressee acknowledges it and goes down before it arrives; its sender misses the acknowledgement."""
+    subject = engine(line(0, 50), **PHYSICAL)
+    deaf = subject._csma
+    assert deaf is not None
+    judge = deaf.judge
+
+    def lose_acknowledgements(frame: Frame) -> None:
+        judge(frame)
+        if frame.to == BROADCAST and frame.size_bytes == ACK_BYTES and frame.decoded is not None and is_deaf:
+            frame.decoded[:] = False
+
+    is_deaf = True
+    deaf.judge = lose_acknowledgements
+    subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+    subject.advance(LATENCY_NS)
+    rows = rows_of(subject)
+    assert len(rows) > 1 and {row["outcome"] for row in rows[1:]} == {"duplicate"}
+    subject.set_up(1, False)
+    arrived = list(subject.advance(LATENCY_NS + 1_000_000))
+    if comes_back:
+        subject.set_up(1, True)
+        is_deaf = False
+    arrived += list(subject.advance(1000 * MS))
+    outcomes = [row["outcome"] for row in rows_of(subject)]
+    assert len(arrived) == outcomes.count("delivered") == int(comes_back)
+    if comes_back:
+        assert (outcomes[0], outcomes[-1]) == ("receiver_down", "delivered")
+    else:
+        assert set(outcomes) == {"receiver_down"} and len(outcomes) == MOST_ATTEMPTS
+    counts = {outcome.name: count for outcome, count in subject.counts.items() if count}
+    assert counts == {name: outcomes.count(name) for name in outcomes}
