@@ -124,17 +124,17 @@ def radio_metrics(recorded: RecordedRun, bin_m: float = BIN_M, has_busy: bool = 
 
 def delivery_ratio(recorded: RecordedRun) -> float | None:
     """Packet delivery ratio over all pairs, without the other figures; None without any."""
-    return _mean(recorded.outcome_is("delivered")[_rows_of_pairs(recorded)].astype(float))
+    return _mean(recorded.outcome_is("delivered")[rows_of_pairs(recorded)].astype(float))
 
 
-def _rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
-    """Rows of the trace that are pairs."""
+def rows_of_pairs(recorded: RecordedRun) -> NDArray[np.intp]:
+    """Rows (n,) of the trace that are pairs."""
     original = (recorded.copy == 0) & (recorded.attempt == 0)
     return np.flatnonzero(original & ~recorded.outcome_is("receiver_down"))
 
 
 def _pairs(recorded: RecordedRun, count: int) -> _Pairs:
-    rows = _rows_of_pairs(recorded)
+    rows = rows_of_pairs(recorded)
     link = recorded.sender[rows] * count + recorded.receiver[rows]
     if (np.diff(recorded.sent_ns[rows]) >= 0).all():  # as runs write it; few links are sorted by their bits
         order = np.argsort(link.astype(np.uint16) if count <= 256 else link, kind="stable")

@@ -15,7 +15,7 @@ from emulator.records.verdicts import Verdict
 from emulator.report.comparison import A, B, Comparison, turned
 from emulator.report.drawing import DASHES, Chart, Drawing, Line, draw_charts, time_figure
 from emulator.report.program_figures import MOST_CHARTS, is_number, label_of, mean_over_time
-from emulator.report.radio_figures import bin_width_ns, decided, latencies_ms
+from emulator.report.radio_figures import bin_width_ns, broadcasts, decided, latencies_ms
 from emulator.report.source import NothingToShow, Source
 from vnet.errors import VnetError
 from vnet.units import NS_PER_S, title_of
@@ -145,14 +145,14 @@ def _delivered(comparison: Comparison) -> Drawing:
     width_s = width_ns / NS_PER_S
 
     def ratio(source: Source) -> Any:
-        names, code, decided_ns = decided(source)
+        names, code, decided_ns = decided(broadcasts(source))
         index = decided_ns // width_ns
         total = np.bincount(index)
         good = np.bincount(index, weights=np.array([name == "delivered" for name in names])[code])
         with np.errstate(invalid="ignore"):
             return (np.arange(len(total)) + 0.5) * width_s, 100 * good / total
 
-    caption = f"Share of the attempted receptions that was delivered, in bins of {width_s:.3g} s."
+    caption = f"Share of the broadcasts' attempted receptions that was delivered, in bins of {width_s:.3g} s."
     drawing = _over_time(comparison, ratio, "packet delivery ratio (%)", caption)
     drawing.canvas.axes.set_yscale("linear")
     drawing.canvas.axes.set_ylim(0, 100)

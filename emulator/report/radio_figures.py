@@ -25,6 +25,7 @@ from emulator.pages.canvas import (
 from emulator.pages.palette import PALETTE
 from emulator.radio.medium import WINDOW_NS
 from emulator.radio.outcomes import DRAWN, Outcome
+from emulator.records.radio_metrics import rows_of_pairs
 from emulator.report.drawing import DASHES, TIME, WIDE_RANGE, Drawing, Line, faults_note, time_figure
 from emulator.report.source import Source
 from vnet.errors import VnetError, printable
@@ -45,12 +46,16 @@ def in_range(source: Source) -> pa.Table:
     return trace
 
 
-def decided(source: Source) -> tuple[list[str], NDArray[np.intp], IntArray]:
-    """Return the names of outcomes, and each row's index among them and time of its decision in ns.
+def broadcasts(source: Source) -> pa.Table:
+    """Return the rows of the trace that the packet delivery ratio counts. Raises VnetError without any."""
+    rows = rows_of_pairs(source.recorded)
+    if not len(rows):
+        raise VnetError("no broadcast was sent to anybody in range")
+    return source.recorded.trace.take(rows)
 
-    Raises VnetError without rows.
-    """
-    trace = in_range(source)
+
+def decided(trace: pa.Table) -> tuple[list[str], NDArray[np.intp], IntArray]:
+    """Return the names of outcomes, and each row's index among them and time of its decision in ns."""
     column = trace["outcome"].combine_chunks()
     code = np.asarray(column.indices.to_numpy(), dtype=np.intp)
     left = "left_ns" if "left_ns" in trace.column_names else "sent_ns"
@@ -67,7 +72,7 @@ def bin_width_ns(source: Source) -> int:
 
 def outcomes(source: Source) -> Drawing:
     """Draw the shares of the outcomes against time, stacked."""
-    names, code, decided_ns = decided(source)
+    names, code, decided_ns = decided(in_range(source))
     width_ns = bin_width_ns(source)
     width_s = width_ns / NS_PER_S
     bins = max(1, int(np.ceil(source.end_s / width_s - 1e-9)))

@@ -15,6 +15,7 @@ from emulator.records.radio_metrics import radio_metrics
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.unicast_figures import unicast_figures
 from emulator.report import radio_figures
+from emulator.report.compare_page import _delivered
 from emulator.report.comparison import Comparison
 from emulator.report.index import index_page
 from emulator.report.network_figures import links
@@ -65,6 +66,9 @@ def test_the_report_tells_broadcasts_from_frames_to_one_vehicle(run: Path) -> No
     assert whole.record.packet_delivery_ratio == ratio != whole.record.share_of("delivered")
     assert f"{100 * ratio:.2f}" in index_page(run.parent)
     shown = next(row for row in Comparison.of(run, run).figures if row["figure"] == "packet delivery ratio (%)")
+    (line, *_) = _delivered(Comparison.of(run, run)).canvas.axes.get_lines()
+    drawn = np.asarray(line.get_ydata(), dtype=float)
+    assert np.nanmean(drawn) == pytest.approx(100 * ratio, abs=1e-6), "a broadcast a period, of one link"
     assert shown["A"] == f"{100 * ratio:.2f}" and shown["B − A"] == "+0.00"
     verdict = json.loads((run / "verdict.json").read_text())
     assert judged_figures(verdict)["packet_delivery_ratio"] == ratio, "a row of a sweep has it, too"
