@@ -92,7 +92,7 @@ def damaged(draw: st.DrawFn, target: Target) -> bytes:
 
 @all_targets
 def test_arbitrary_and_damaged_inputs_do_no_harm(target: Target) -> None:
-    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
     @given(st.binary(max_size=200) | damaged(target))
     def harmless(data: bytes) -> None:
         target.try_out(data)

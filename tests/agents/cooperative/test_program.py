@@ -280,7 +280,7 @@ def cooperate(options: Options, seconds: float = 15.0, loss: float = 0.2, seed: 
 
 @pytest.mark.parametrize("consensus", ["ratio", "metropolis", "max-degree"])
 def test_together_they_find_the_common_error_whatever_the_consensus(consensus: Any) -> None:
-    errors = cooperate(Options(particles=100, consensus=consensus))
+    errors = cooperate(Options(particles=100, consensus=consensus), seconds=10.0)
     assert errors.max() < 1.0, "the prior's deviation is 3 m an axis"
 
 
