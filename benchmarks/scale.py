@@ -136,18 +136,27 @@ def cooperative(runs: int) -> str:
 
 
 def simulated_thousand(runs: int) -> str:
-    """Real-time factor of 1000 beacons in one process."""
-    options = [*_vehicles(1000), "--duration", "10"]
-    return f"{median_of(runs, lambda: _factor('simulate', BEACON, *options)):.2g}"
+    """Real-time factors of 1000 beacons in one process, and in one for each core."""
+    return _in_one_and_in_all(runs, [[*_vehicles(1000), "--duration", "10"]])
 
 
 def simulated_cooperative(runs: int) -> str:
-    """Real-time factors of 50, 200 and 1000 cooperative vehicles in one process."""
-    factors = []
-    for count, duration_s in ((50, 20), (200, 10), (1000, 5)):
-        options = [*COOPERATE, *_vehicles(count), "--duration", str(duration_s)]
-        factors.append(median_of(runs, lambda options=options: _factor("simulate", BEACON, *options)))  # type: ignore[misc]
-    return " / ".join(f"{factor:.2g}" for factor in factors)
+    """Real-time factors of 50, 200 and 1000 cooperative vehicles in one process, and in one for each core."""
+    cases = ((50, 20), (200, 10), (1000, 5))
+    return _in_one_and_in_all(
+        runs, [[*COOPERATE, *_vehicles(count), "--duration", str(seconds)] for count, seconds in cases]
+    )
+
+
+def _in_one_and_in_all(runs: int, cases: Sequence[Sequence[str]]) -> str:
+    """Real-time factors of simulations in one process, and in one for each core, in turns."""
+    ways = ("1", "auto")
+    medians: dict[str, list[str]] = {way: [] for way in ways}
+    for case in cases:
+        turns = [[_factor("simulate", BEACON, *case, "--processes", way) for way in ways] for _ in range(runs)]
+        for way, factors in zip(ways, zip(*turns, strict=True), strict=True):
+            medians[way].append(f"{statistics.median(factors):.2g}")
+    return "; ".join(" / ".join(medians[way]) for way in ways)
 
 
 def estimator(runs: int) -> str:
@@ -272,9 +281,14 @@ ROWS: dict[str, Row] = {
     "cooperative": Row(
         "50 cooperative vehicles (`estimates`), live : simulated; live", "1.2; 1.1", "1.6; 1.5", cooperative
     ),
-    "simulated": Row("1000 beacons simulated in one process, real-time factor", "1.5", "2.5", simulated_thousand),
+    "simulated": Row(
+        "1000 beacons simulated in one process; in one for each core, real-time factor",
+        "1.5",
+        "2.5",
+        simulated_thousand,
+    ),
     "simulated_cooperative": Row(
-        "50 / 200 / 1000 cooperative vehicles simulated in one process, real-time factor",
+        "50 / 200 / 1000 cooperative vehicles simulated in one process; in one for each core, real-time factor",
         "4 / 1 / 0.2",
         "6 / 1.5 / 0.3",
         simulated_cooperative,

@@ -30,6 +30,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.process_count import Processes, process_count
 from emulator.drivers.program_check import program_check
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.code_digest import entries_of
@@ -55,14 +56,17 @@ def simulate(
     set: Mapping[str, Any] | None = None,
     checks: Sequence[str] = (),
     out: str | Path | None = None,
+    processes: Processes = 1,
 ) -> Run:
-    """Simulate a scenario in one process, in lockstep, and return the finished run: what `vnet simulate` does.
+    """Simulate a scenario, in lockstep, and return the finished run: what `vnet simulate` does.
 
     `scenario` is a path, the name of a scenario that is shipped ("twelve"; an existing path wins), or a dict with
     the sections of a scenario. What is given besides changes it: `program`, an async function of one argument or
     "module:function" or "file.py"; `seed`; `duration_s`, the emulated length in seconds; `set`, values by
     "section.key"; `checks`, checks of your own as "module:function" or "file.py", after those of the scenario.
     `out` is the folder of the run's files; by default the next free one of runs/NAME-SEED, NAME-SEED-2, ….
+    `processes` run the programs side by side, with the same trace: a number, or "auto" for as many as there are
+    cores.
 
     The same call gives the same trace, from a script, a notebook or a running event loop. A function that other
     processes cannot import (a notebook's, a closure) runs in this process; the verdict's check `replay` says why a
@@ -75,13 +79,13 @@ def simulate(
     folder = None if out is None else Path(out)
     if function is None or is_importable(function):
         if is_fit():
-            path = _interruptible(lambda stop: simulate_into(loaded, folder, stop))
+            path = _interruptible(lambda stop: simulate_into(loaded, folder, stop, processes=processes))
         else:
-            path = call_fitly(Place.here(loaded), simulate_into, loaded, folder)
+            path = call_fitly(Place.here(loaded), simulate_into, loaded, folder, None, "", processes)
         return Run.open(path)
     why = _why_not_warranted(function)
     with given_programs({loaded.program.entry: function}):
-        return Run.open(_interruptible(lambda stop: simulate_into(loaded, folder, stop, why)))
+        return Run.open(_interruptible(lambda stop: simulate_into(loaded, folder, stop, why, processes)))
 
 
 @hinting
@@ -116,16 +120,22 @@ def run(
 
 
 def simulate_into(
-    scenario: Scenario, out: Path | None, stop: threading.Event | None = None, replay: str = ""
+    scenario: Scenario,
+    out: Path | None,
+    stop: threading.Event | None = None,
+    replay: str = "",
+    processes: Processes = 1,
 ) -> Path:
-    """Simulate in this process and judge the run; returns its folder. `replay` says why none is warranted."""
+    """Simulate from this process and judge the run; returns its folder. `replay` says why none is warranted."""
     search_programs_in(scenario.program.folders)
     scenario = with_order_steps(scenario)
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.prepare(out, scenario))
+    world = build_world(scenario)
+    count = process_count(processes, len(world.node_ids))
+    emulation = Emulation(scenario, world, RunFolder.prepare(out, scenario))
     for entry in entries_of(scenario):
         load_program(entry)
     emulation.folder.open(scenario)
-    wall_s, interrupted = run_simulation(emulation, stop=stop)
+    wall_s, interrupted = run_simulation(emulation, stop=stop, processes=count)
     conclude(emulation, wall_s, "simulate", replay)
     if interrupted:
         raise KeyboardInterrupt

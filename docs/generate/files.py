@@ -283,8 +283,8 @@ VERDICT = {
     "reported": "[figures of what programs report](../how-to/own-figures.md), by name: `reports`, `mean`, `p05`, "
     "`p95`, `last`, `is_share`; of a text `text` and its `share`",
     "cost": "[what the run cost](../how-to/fast.md#what-is-slow): `measured` (of each `program`, or of its "
-    "`process`, which stands at its first vehicle), `cpu_s`, `wake_ups` (null in real time), `payload`, and the "
-    "same of up to 100 `vehicles`, the slowest first. The "
+    "`process`, which stands at its first vehicle), `cpu_s`, `wake_ups` (null in real time), `payload`, the "
+    "same of up to 100 `vehicles`, the slowest first, and the number of `processes` of a simulation. The "
     "machine decides `cpu_s`: no hash and no comparison has it",
     "reproduce": "the command that runs it again, from any folder of the machine",
     "versions": "of vnet, Python and numpy, and `arithmetic`: which processors compute the same bits",

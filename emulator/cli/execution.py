@@ -27,6 +27,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
 from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.process_count import process_count
 from emulator.drivers.program_check import program_check
 from emulator.drivers.router import SeparateRouter
 from emulator.drivers.signals import first_interrupt_told, signals_ignored
@@ -92,10 +93,12 @@ def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[
         _run_live(emulation, options, request.asked, request.output)
 
 
-def run_in_this_process(request: Request) -> None:
-    """Run all programs in this process, without Zenoh; exits with the verdict's status."""
+def run_simulated(request: Request, processes: str) -> None:
+    """Run the programs in this process, or in so many others, without Zenoh; exits with the verdict's status."""
     request = request.with_order_steps()
-    emulation = request.prepare(build_world(request.scenario))
+    world = build_world(request.scenario)
+    count = process_count(processes, len(world.node_ids))
+    emulation = request.prepare(world)
     search_programs_in(request.scenario.program.folders)
     for entry in entries_of(request.scenario):
         load_program(entry)
@@ -106,7 +109,8 @@ def run_in_this_process(request: Request) -> None:
             if request.sinks is not None:
                 _record_here(emulation, request.sinks, stack)
             say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
-            wall_s, interrupted = run_simulation(emulation, on_interrupt=say, debug=request.asked.debug)
+            debug = request.asked.debug
+            wall_s, interrupted = run_simulation(emulation, on_interrupt=say, debug=debug, processes=count)
         _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
 
 

@@ -168,6 +168,13 @@ DebugOption = Annotated[
         help="Stop a debugger (pdb) in this vehicle's program, at its first line, or as v03:hello.py:12.",
     ),
 ]
+ProcessesOption = Annotated[
+    str,
+    typer.Option(
+        metavar="N|auto",
+        help="Run the programs in so many processes, side by side; auto: as many as there are cores.",
+    ),
+]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Write report.html into the run's folder at the end.")
 ]

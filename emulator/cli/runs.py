@@ -27,6 +27,7 @@ from emulator.cli.options import (
     OutputOptions,
     Pacing,
     PacingOption,
+    ProcessesOption,
     ProgramOption,
     ProgramOptionsOption,
     QuietOption,
@@ -127,24 +128,27 @@ def simulate(
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
     check_determinism: DeterminismOption = False,
+    processes: ProcessesOption = "1",
     debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,
     quiet: QuietOption = False,
     verbose: VerboseOption = False,
     report: ReportOption = True,
 ) -> None:
-    """Run a scenario in this one process, in lockstep and without Zenoh: the same trace, faster."""
+    """Run a scenario without Zenoh, in lockstep, in this one process or in a few: the same trace, faster."""
     asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         order_asked = OrderOptions(order, order_seed, tape)
         loaded = load(scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, order_asked)
         sinks = choose_sinks(rerun or (), vehicle=rerun_vehicle, live=False)
+        if debug is not None and processes != "1":
+            raise VnetError("--debug and --processes exclude each other")
         asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
         with ended_at_once():
-            from emulator.cli.execution import Request, run_in_this_process
+            from emulator.cli.execution import Request, run_simulated
 
-        run_in_this_process(Request(loaded, scenario, out, sinks, asked, output))
+        run_simulated(Request(loaded, scenario, out, sinks, asked, output), processes)
 
 
 def emulator(

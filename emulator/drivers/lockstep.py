@@ -78,20 +78,19 @@ class Lockstep:
     Use: grants = start(); then, until `step` returns none: do what `take_actions` says, give each grant to its
     process and `receive` its yield (or say that it `died`); when nothing is `owed`, call `step`.
 
-    Processes come and go with faults: `hosts_all` says that one process outlives them (a simulation), and that its
-    driver stops and starts programs within it.
+    Processes come and go with faults, unless they are `permanent` (a simulation) and programs do, within them.
 
     With a `horizon_ns` the run is `held` before anything happens at or after that instant: `step` returns none, and
     goes on when it is called with a later horizon.
     """
 
-    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], hosts_all: bool = False) -> None:
+    def __init__(self, emulation: Emulation, processes: Sequence[Sequence[str]], permanent: bool = False) -> None:
         self._emulation = emulation
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
         self._order = {process_id: order for order, process_id in enumerate(self._groups)}
         self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
         self._processes: dict[str, _Process] = {}
-        self._hosts_all = hosts_all
+        self._permanent = permanent
         self._actions: list[ProcessActions] = []
         self._woken: set[str] = set()
         self._wakes: list[tuple[int, int, int, str]] = []
@@ -116,7 +115,7 @@ class Lockstep:
         self.horizon_ns: int | None = None
         self.held = False
         for nodes in processes:
-            if hosts_all or any(emulation.up[node] for node in nodes):
+            if permanent or any(emulation.up[node] for node in nodes):
                 self._add(nodes[0])
 
     @property
@@ -384,8 +383,9 @@ class Lockstep:
     def _stop(self, node: str) -> None:
         process_id = self._process_of[node]
         self._news.take([node])
-        if self._hosts_all:
+        if self._permanent:
             self._processes[process_id].packets[node].clear()
+            self._woken.add(process_id)  # for what a program does on its way out
         else:
             self._remove(process_id)
 
@@ -411,7 +411,7 @@ class Lockstep:
         grant = wire.Grant(
             process.seq, time_ns, self._end_ns, clocks=clocks, busy=busy, results=results, messages=messages
         )
-        if self._hosts_all:
+        if self._permanent and len(self._groups) == 1:
             self._mail = Mail(packets, fixes)
         else:
             encoded = [wire_packet(node, packet) for node, some in packets.items() for packet in some]

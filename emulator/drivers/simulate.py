@@ -1,16 +1,17 @@
-"""The simulated driver: the same programs and the same engine in one process, without Zenoh.
+"""The simulated driver: the same programs and the same engine on one machine, without Zenoh.
 
-One virtual-time loop hosts all nodes; its yields go straight to the barrier. In lockstep a live run and its
-simulation give the same trace, and a test holds them to it.
+One virtual-time loop hosts all nodes, and its yields go straight to the barrier; or some processes, forked from
+this one, host a part of the nodes each (`forked_programs.py`). In lockstep a live run and its simulation give the
+same trace, and a test holds them to it.
 """
 
 from __future__ import annotations
 
-import asyncio
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -18,28 +19,18 @@ from msgspec.structs import replace
 
 from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.forked_programs import Ended, ForkedPrograms
+from emulator.drivers.hosted_programs import NONCE, Changes, HostedPrograms, RunOverError, Turn
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.program_output import output_kept
+from emulator.drivers.process_count import Processes, process_count, split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
-from emulator.records.node_logs import NodeLogs
-from vnet.node import Node
-from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.debug_target import DebugTarget
-from vnet.runtime.disks import Disks
-from vnet.runtime.host import Host
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_programs
-from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
 
 if TYPE_CHECKING:
     from vnet.runtime.debugger import NodeDebugger
-
-_NONCE = b""
-
-
-class _RunOverError(Exception):
-    """The barrier has granted nothing more."""
 
 
 def simulate(
@@ -48,39 +39,49 @@ def simulate(
     stop: threading.Event | None = None,
     on_interrupt: Callable[[], None] = lambda: None,
     debug: DebugTarget | None = None,
+    processes: Processes = 1,
 ) -> tuple[float, bool]:
-    """Run `emulation` to its end in this process; returns the wall-clock seconds, and whether it was interrupted.
+    """Run `emulation` to its end; returns the wall-clock seconds, and whether it was interrupted.
 
     Ctrl-C ends the run early, with the event `interrupted` and without the window in which it comes; a second one
     ends it wherever it is, for programs that do not yield. Raises ProgramError if the program cannot be loaded.
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
-    a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program.
+    a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program. With `processes` above 1 so
+    many processes run the programs, and not this one; VnetError is raised if one of them ends before its time.
     """
-    simulation = _Simulation(emulation, before_horizon, stop or threading.Event(), debug)
+    node_ids = emulation.world.node_ids
+    groups = split_evenly(node_ids, process_count(processes, len(node_ids)))
+    emulation.costs.processes = len(groups)
+    stop = stop or threading.Event()
+    barrier = _Barrier(emulation, groups, before_horizon, stop)
+    search_programs_in(emulation.scenario.program.folders)
+    apart = len(groups) > 1
+    simulation = _Apart(emulation, barrier, groups) if apart else _Together(emulation, barrier, debug)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
     try:
         with (
-            _ending_between_windows(simulation, on_interrupt),
-            rare_collections(len(emulation.world.node_ids)),
-            output_kept(simulation.owns, simulation.logs),
+            _ending_between_windows(simulation, stop, on_interrupt),
+            rare_collections(len(node_ids)),
         ):
             simulation.run()
     except KeyboardInterrupt:
         interrupted = True
-        emulation.folder.event(simulation.loop.now_ns, "interrupted")
-        emulation.finish(simulation.loop.now_ns)
+        emulation.folder.event(simulation.now_ns, "interrupted")
+        emulation.finish(simulation.now_ns)
     return time.monotonic() - started, interrupted
 
 
 @contextmanager
-def _ending_between_windows(simulation: _Simulation, on_interrupt: Callable[[], None]) -> Iterator[None]:
+def _ending_between_windows(
+    simulation: _Together | _Apart, stop: threading.Event, on_interrupt: Callable[[], None]
+) -> Iterator[None]:
     """Have the first Ctrl-C wait until programs have yielded: in their midst it would leave things half done."""
 
     def ask(number: int, frame: object) -> None:
-        simulation.stop.set()
+        stop.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         tell_from_handler(on_interrupt)
 
@@ -104,113 +105,169 @@ def _debugger(target: DebugTarget, on_quit: Callable[[], None]) -> NodeDebugger:
     return NodeDebugger(target, lambda: signals_handled(signal.default_int_handler, signal.SIGINT), on_quit)
 
 
-class _Simulation:
-    """All nodes on one loop, and the barrier that this loop yields to."""
+class _Barrier:
+    """The barrier of a simulation, which tells each process what comes next. `groups` are their nodes."""
 
     def __init__(
         self,
         emulation: Emulation,
+        groups: Sequence[Sequence[str]],
         before_horizon: Callable[[Lockstep], None] | None,
         stop: threading.Event,
-        debug: DebugTarget | None,
     ) -> None:
-        node_ids = emulation.world.node_ids
-        self._process_of = node_ids[0]
         self._emulation = emulation
-        self._lockstep = Lockstep(emulation, [node_ids], hosts_all=True)
+        self._lockstep = Lockstep(emulation, groups, permanent=True)
         self._before_horizon = before_horizon or (lambda lockstep: None)
-        self._seq = 0
+        self._groups = {nodes[0]: frozenset(nodes) for nodes in groups}
+        self._changes: dict[str, list[Changes]] = {process_id: [] for process_id in self._groups}
+        """Changes of the programs of processes, until these are granted their next window."""
         self.stop = stop
-        self.no_signal_raises: Callable[[], bool] = lambda: False
-        """Tells whether a KeyboardInterrupt can only be the programs' own."""
-        welcomes = [emulation.welcome(node, _NONCE) for node in node_ids]
-        welcomes = [replace(welcome, runs=welcome.runs and emulation.up[welcome.node]) for welcome in welcomes]
-        search_programs_in(emulation.scenario.program.folders)
-        self._programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
-        self.loop = VirtualTimeLoop(self._exchange, emulation.scenario.run.spin_limit)
-        self._meter = CpuMeter()
-        if emulation.folder.is_open:  # else nobody asks what programs have cost
-            self.loop.measure(self._meter)
-        self.logs = NodeLogs(emulation.folder.logs)
-        disks = Disks(emulation.folder.disks)
-        debugger = None if debug is None else _debugger(debug, self._quit)
-        self._host = Host(
-            welcomes, lambda: self.loop.now_ns, on_line=self.logs.write, disks=disks, debugger=debugger
-        )
 
-    def _quit(self) -> None:
-        """End the run wherever the debugger has stopped it."""
-        self.stop.set()
-        raise KeyboardInterrupt
+    @property
+    def now_ns(self) -> int:
+        """Emulated time: the beginning of the window."""
+        return self._lockstep.now_ns
 
-    def owns(self, node: Node) -> bool:
-        """Return whether `node` is one of this simulation, and not an earlier incarnation."""
-        return self._host.nodes.get(node.id) is node
+    def welcomes(self, nodes: Sequence[str]) -> list[wire.Welcome]:
+        """Return the welcomes of the nodes of a process, at the start of the run."""
+        welcomes = [self._emulation.welcome(node, NONCE) for node in nodes]
+        return [replace(each, runs=each.runs and self._emulation.up[each.node]) for each in welcomes]
 
-    def run(self) -> None:
-        """From the first grant to the last."""
-        asyncio.set_event_loop(self.loop)
-        try:
-            self._host.order_events(self.loop)
-            self._host.start(self.loop, self._programs)
-            self._before_horizon(self._lockstep)
-            self.loop.start_at(self._take(self._lockstep.start()))
-            while True:
-                try:
-                    self.loop.run_forever()
-                except SpinError as spin:
-                    self._host.end_spinning(self.loop, spin)
-                except SystemExit as leave:
-                    self._host.end_exited(leave)
-                except KeyboardInterrupt as leave:
-                    if self.stop.is_set() or not self.no_signal_raises():
-                        raise
-                    self._host.end_exited(leave)
-        except _RunOverError:
-            self._close(self._emulation.duration_ns)
-        except KeyboardInterrupt:
-            self._host.forget_interrupt()
-            self._close(self.loop.now_ns)
-            raise
-        finally:
-            asyncio.set_event_loop(None)
-            self.loop.close()
-            self._host.discard_abandoned()
-            self._emulation.costs.take_programs(self._meter.cpu_ns, self._meter.wake_ups)
-            if (ordered := self._host.mail.ordered) is not None:
-                self._emulation.orders.steps = ordered.steps
+    def begin(self) -> dict[str, Turn]:
+        """Return the first turns, by process."""
+        self._before_horizon(self._lockstep)
+        return self._turns(self._lockstep.start())
 
-    def _close(self, time_ns: int) -> None:
-        self._host.close(self.loop)
-        self._emulation.take_final(time_ns, [self._host.take_final()])
+    def go_on(self, yields: Mapping[str, wire.Yield]) -> dict[str, Turn]:
+        """Take the yields of all processes that were granted a window; returns the next turns, none at the end.
 
-    def _exchange(self, next_timer_ns: int | None) -> int:
-        next_ns = self._host.next_instant(next_timer_ns)
-        if next_ns is not None:
-            return next_ns
+        Raises KeyboardInterrupt if the run is to stop.
+        """
         if self.stop.is_set():
             raise KeyboardInterrupt
-        self._lockstep.receive(self._process_of, self._host.make_yield(_NONCE, self._seq, next_timer_ns))
+        for process_id, message in yields.items():
+            self._lockstep.receive(process_id, message)
         grants = self._lockstep.step()
         while self._lockstep.held:
             self._before_horizon(self._lockstep)
             grants = self._lockstep.step()
-        return self._take(grants)
+        return self._turns(grants)
 
-    def _take(self, grants: dict[str, wire.Grant]) -> int:
-        if not grants:
-            raise _RunOverError
-        grant = grants[self._process_of]
-        self._seq = grant.seq
-        self._host.apply_clock_error(grant.clocks, self.loop)
-        self._apply_process_faults(self._lockstep.take_actions())
-        return self._host.open_window(grant, self._lockstep.take_mail())
+    def _turns(self, grants: Mapping[str, wire.Grant]) -> dict[str, Turn]:
+        for actions in self._lockstep.take_actions():
+            for process_id, nodes in self._groups.items():
+                self._changes[process_id].append(self._part(actions, nodes))
+        mail = self._lockstep.take_mail()
+        turns = {process_id: Turn(self._changes[process_id], grant, mail) for process_id, grant in grants.items()}
+        self._changes.update({process_id: [] for process_id in turns})
+        return turns
 
-    def _apply_process_faults(self, actions: Sequence[ProcessActions]) -> None:
-        """Do to the programs what faults do to processes."""
-        for action in actions:
-            for node, killed in action.stop.items():
-                self._host.stop(node, killed, action.time_ns)
-            for node in action.start:
-                self._host.restart(self._emulation.welcome(node, _NONCE))
-            self._host.pause(action.paused)
+    def _part(self, actions: ProcessActions, nodes: frozenset[str]) -> Changes:
+        """Return the part of actions that concerns the nodes of a process."""
+        return Changes(
+            time_ns=actions.time_ns,
+            stop={node: killed for node, killed in actions.stop.items() if node in nodes},
+            start=[self._emulation.welcome(node, NONCE) for node in actions.start if node in nodes],
+            paused=actions.paused & nodes,
+        )
+
+
+class _Together:
+    """All nodes on one loop of this process."""
+
+    def __init__(self, emulation: Emulation, barrier: _Barrier, debug: DebugTarget | None) -> None:
+        self._emulation, self._barrier = emulation, barrier
+        welcomes = barrier.welcomes(emulation.world.node_ids)
+        programs = load_programs(welcomes)  # which may fail, and then there is nothing to close
+        debugger = None if debug is None else _debugger(debug, self._quit)
+        self._hosted = HostedPrograms(welcomes, programs, emulation.folder, self._swap, debugger)
+        self.no_signal_raises: Callable[[], bool] = lambda: False
+        """Tells whether a KeyboardInterrupt can only be the programs' own."""
+
+    @property
+    def now_ns(self) -> int:
+        """Emulated time of the programs."""
+        return self._hosted.loop.now_ns
+
+    def _quit(self) -> None:
+        """End the run wherever the debugger has stopped it."""
+        self._barrier.stop.set()
+        raise KeyboardInterrupt
+
+    def _swap(self, message: wire.Yield | None) -> Turn:
+        process_id = self._emulation.world.node_ids[0]
+        turns = self._barrier.begin() if message is None else self._barrier.go_on({process_id: message})
+        if not turns:
+            raise RunOverError
+        return turns[process_id]
+
+    def run(self) -> None:
+        """From the first grant to the last. Raises KeyboardInterrupt."""
+        emulation, hosted = self._emulation, self._hosted
+        hosted.only_programs_raise = lambda: not self._barrier.stop.is_set() and self.no_signal_raises()
+        try:
+            hosted.run()
+        except KeyboardInterrupt:
+            emulation.take_final(self.now_ns, [hosted.final])
+            raise
+        else:
+            emulation.take_final(emulation.duration_ns, [hosted.final])
+        finally:
+            emulation.costs.take_programs(hosted.meter.cpu_ns, hosted.meter.wake_ups)
+            emulation.orders.steps = hosted.order_steps
+
+
+class _Apart:
+    """The nodes in equal parts in processes of their own, which work side by side."""
+
+    no_signal_raises: Callable[[], bool]
+
+    def __init__(self, emulation: Emulation, barrier: _Barrier, groups: Sequence[Sequence[str]]) -> None:
+        self._emulation, self._barrier = emulation, barrier
+        self._welcomes = {nodes[0]: barrier.welcomes(nodes) for nodes in groups}
+        self._programs = load_programs(each for welcomes in self._welcomes.values() for each in welcomes)
+        self._processes: dict[str, ForkedPrograms] = {}
+
+    @property
+    def now_ns(self) -> int:
+        """Emulated time: the beginning of the window."""
+        return self._barrier.now_ns
+
+    def run(self) -> None:
+        """From the first grant to the last. Raises KeyboardInterrupt, and VnetError if a process ends."""
+        processes = self._processes
+        try:
+            for process_id, welcomes in self._welcomes.items():
+                others = list(processes.values())
+                processes[process_id] = ForkedPrograms(welcomes, self._programs, self._emulation.folder, others)
+            self._grant_all()
+        except KeyboardInterrupt:
+            self._end(self.now_ns)
+            raise
+        else:
+            self._end(self._emulation.duration_ns)
+        finally:
+            for process in processes.values():
+                process.close()
+
+    def _grant_all(self) -> None:
+        turns = self._barrier.begin()
+        while turns:
+            for process_id, turn in turns.items():
+                self._processes[process_id].give(turn)
+            turns = self._barrier.go_on({process_id: self._processes[process_id].take() for process_id in turns})
+
+    def _end(self, time_ns: int) -> None:
+        """End all processes but those that are in the midst of a window, and take what they have left to say."""
+        emulation = self._emulation
+        asked = [process for process in self._processes.values() if not process.owes]
+        for process in asked:
+            process.give(None)
+        ended: list[Ended] = [process.take() for process in asked]
+        emulation.take_final(time_ns, [each.final for each in ended])
+        cpu_ns, wake_ups = Counter[str](), Counter[str]()
+        for each in ended:
+            cpu_ns.update(each.cpu_ns)
+            wake_ups.update(each.wake_ups)
+        emulation.costs.take_programs(cpu_ns, wake_ups)
+        emulation.orders.steps = {node: count for each in ended for node, count in each.order_steps.items()}

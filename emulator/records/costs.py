@@ -18,11 +18,13 @@ MOST_VEHICLES = 100
 class Costs:
     """CPU time in ns and wake-ups by node, as the driver measures them while a run goes on.
 
-    Simulated, they are those of each node's program; live, those of its process, under its first node.
+    Simulated, they are those of each node's program; live, those of its process, under its first node. `processes`
+    have run the programs of a simulation; None for a live run.
     """
 
     def __init__(self) -> None:
         self.measured: Literal["program", "process"] = "process"
+        self.processes: int | None = None
         self.cpu_ns: Mapping[str, int] = {}
         self.wake_ups: Counter[str] = Counter()
 
@@ -82,6 +84,7 @@ class RunCost:
     """Costs of a run; `vehicles` are those that took most CPU time, the slowest first.
 
     `measured` says of what: of each vehicle's `program`, or of its `process`, which stands at its first node.
+    `processes` have run the programs of a simulation; None for a live run.
     """
 
     measured: Literal["program", "process"]
@@ -89,6 +92,7 @@ class RunCost:
     wake_ups: int | None
     payload: PayloadSizes
     vehicles: list[VehicleCost] = field(default_factory=list)
+    processes: int | None = None
 
     def line(self) -> str:
         """Return the costs in one line; "" if nothing is known."""
@@ -96,6 +100,7 @@ class RunCost:
         slowest = self.vehicles[0] if self.vehicles else None
         if self.cpu_s is not None and slowest is not None:
             of = {"program": "programs", "process": "processes"}[self.measured]
+            of += f" in {self.processes} processes" if (self.processes or 1) > 1 else ""
             parts.append(f"{of} {self.cpu_s:.2f} s of CPU time, most by {slowest.node}: {slowest.cpu_s or 0:.2f} s")
         if self.wake_ups is not None:
             parts.append(f"wake-ups {self.wake_ups:,}")
@@ -140,4 +145,5 @@ def run_cost(
         wake_ups=sum(costs.wake_ups.values()) if knows_wake_ups else None,
         payload=PayloadSizes.of(size_bytes),
         vehicles=[of(number) for number in slowest[:most]],
+        processes=costs.processes,
     )

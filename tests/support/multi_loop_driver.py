@@ -73,6 +73,13 @@ def run_together(scenario: Scenario) -> Emulation:
     return emulation
 
 
+def run_forked(scenario: Scenario) -> Emulation:
+    """Simulate in three processes."""
+    emulation = emulation_of(scenario)
+    simulate(emulation, processes=3)
+    return emulation
+
+
 def run_apart(scenario: Scenario) -> Emulation:
     """Run each process on a loop of its own."""
     emulation = emulation_of(scenario)

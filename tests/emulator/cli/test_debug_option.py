@@ -38,6 +38,11 @@ def test_hosts_have_no_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     refused("run", ["--debug", "v03", "--hosts", "2"], message, tmp_path, monkeypatch)
 
 
+def test_a_debugger_is_in_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    message = "--debug and --processes exclude each other"
+    refused("simulate", ["--debug", "v03", "--processes", "2"], message, tmp_path, monkeypatch)
+
+
 @pytest.mark.parametrize("command", ["run", "simulate"])
 def test_a_debugger_needs_a_terminal(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     message = "--debug v03: needs a terminal on standard input and output"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from emulator.drivers.backbone import BackboneNetwork
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.scenario import Scenario
-from tests.support.multi_loop_driver import run_apart, run_together
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together
 from vnet.backbone import Backbone
 from vnet.errors import PayloadTooLargeError
 from vnet.transport.backbone import SentMessage
@@ -88,7 +88,9 @@ def test_units_hear_the_same_together_apart_and_without_windows() -> None:
     apart = run_apart(scenario(backbone=section))
     without = run_together(scenario(backbone=section, run={"windows": False}))
     assert len(got(together)) > 100
-    assert got(together) == got(apart) == got(without)
+    forked = run_forked(scenario(backbone=section))
+    assert got(together) == got(apart) == got(without) == got(forked)
+    assert together.backbone.table() == forked.backbone.table()
     assert together.engine.trace.to_table() == apart.engine.trace.to_table()
     assert together.backbone.table() == apart.backbone.table() == without.backbone.table()
 

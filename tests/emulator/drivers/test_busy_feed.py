@@ -7,7 +7,7 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.radio.medium import SLICE_NS, WINDOW_NS
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 
 MS = 1_000_000
@@ -95,6 +95,7 @@ def test_live_processes_read_what_their_simulation_does(entry: str, latency_ms: 
     expected = readings(run_together(plan))
     assert len(expected) > 20
     assert readings(run_apart(plan)) == readings(run_together(without)) == expected
+    assert readings(run_forked(plan)) == expected
 
 
 def test_without_a_medium_there_is_nothing_to_measure() -> None:

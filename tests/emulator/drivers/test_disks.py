@@ -9,7 +9,7 @@ from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.records.node_files import DEEPEST, MOST_FILES, collect
 from emulator.records.run_folder import RunFolder
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
 from vnet.runtime.disks import Disks
 
@@ -45,7 +45,7 @@ def test_what_was_written_is_there_after_a_kill_and_in_the_run_at_its_end(nodes_
         vehicles=3,
         run={"nodes_per_process": nodes_per_process},
     )
-    together, apart, again = run_together(scenario), run_apart(scenario), run_together(scenario)
+    together, apart, again = run_together(scenario), run_apart(scenario), run_forked(scenario)
     assert concluded(together) == concluded(apart) == concluded(again)
     first = "0\n1\n" if nodes_per_process == 1 else "0\n"
     expected = {"v01/diary.txt": first, "v02/diary.txt": "0\n", "v03/diary.txt": "0\n"}

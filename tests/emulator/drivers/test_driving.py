@@ -16,7 +16,7 @@ from emulator.records.verdicts import Verdict
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.vehicles import COLLISION
 from tests.support.map_files import write_map
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.errors import ScenarioError
 from vnet.types import Array
@@ -51,6 +51,7 @@ def test_windows_and_processes_do_not_change_how_vehicles_drive(control_hz: floa
     assert {"drive_limited", "restarted"} <= kinds
     for changes in ({"windows": False}, {"nodes_per_process": 1}, {"windows": False, "nodes_per_process": 1}):
         assert fingerprint(run_together(driven(RESTLESS, faults=faults, run=run | changes))) == reference
+    assert fingerprint(run_forked(driven(RESTLESS, faults=faults, run=run))) == reference
     for size in (1, 2):
         apart = run_apart(driven(RESTLESS, faults=faults, run=run | {"nodes_per_process": size}))
         mine = [event for event in fingerprint(apart)[4] if event[1] != "started"]
@@ -65,12 +66,13 @@ def test_vehicles_that_leave_do_so_alike_in_processes_of_their_own(tmp_path: Pat
         path = write_map(tmp_path, ([(0.0, 0.0), (70.0, 0.0), (70.0, 52.0)], (1, 0)))
         road = {"road": "map", "routes": [["edge 0"]], "length_m": 5000.0, "lanes": 1}
         sections = {"road": road, "map": {"path": str(path)}}
-    together, apart = (
-        run(driven(PLATOON, run={"duration_s": 6.0}, **sections)) for run in (run_together, run_apart)
+    together, apart, forked = (
+        run(driven(PLATOON, run={"duration_s": 6.0}, **sections)) for run in (run_together, run_apart, run_forked)
     )
     left = [event.node for event in together.folder.events if event.kind == "left"]
     assert left == ["v01", "v02", "v03"]
     assert fingerprint(together)[:4] == fingerprint(apart)[:4]
+    assert fingerprint(together) == fingerprint(forked)
     last = together.metrics.states_table().to_pylist()[-4:]
     assert [bool(np.isnan(row["position_m"][0])) for row in last] == [True, True, True, False]
 

@@ -25,7 +25,7 @@ from emulator.world.world import build_world, components
 from tests.emulator.checks.test_judge import checked, result, run_scenario, verdict
 from tests.emulator.terminal.test_dashboard import row as row_of
 from tests.support.motion import along, scenario_of_trips, still, write_trips
-from tests.support.multi_loop_driver import emulation_of, run_apart, run_together
+from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together
 from vnet.errors import ScenarioError
 
 pytestmark = pytest.mark.slow
@@ -195,6 +195,9 @@ def test_apart_and_together_are_one_run(tmp_path: Path, faults: list[dict[str, A
     assert together.metrics.sha256() == apart.metrics.sha256()
     told = [[(e.kind, e.node, e.time_ns) for e in run.folder.events] for run in (together, apart)]
     assert [event for event in told[0] if event[0] != "started"] == told[1]
+    forked = run_forked(scenario)
+    assert [(e.kind, e.node, e.time_ns) for e in forked.folder.events] == told[0]
+    assert forked.metrics.sha256() == together.metrics.sha256()
 
 
 def test_faults_of_vehicles_that_come_and_go_are_judged(tmp_path: Path) -> None:

@@ -378,8 +378,8 @@ class Course:
         self, emulation: Emulation, groups: Sequence[Sequence[str]], seed: int, order: random.Random
     ) -> None:
         self.emulation = emulation
-        self.hosts_all = len(groups) == 1
-        self.lockstep = Lockstep(emulation, groups, hosts_all=self.hosts_all)
+        self.permanent = len(groups) == 1
+        self.lockstep = Lockstep(emulation, groups, permanent=self.permanent)
         self.groups = {nodes[0]: nodes for nodes in groups}
         self.seed = seed
         self.order = order
@@ -414,7 +414,7 @@ class Course:
             self.paused = actions.paused
             for node in actions.start:
                 self.vehicles[node] = Vehicle(node, self.emulation.incarnation[node], self.seed)
-                if not self.hosts_all:
+                if not self.permanent:
                     self.seqs.pop(node, None)
 
     def answer(self, process_id: str, grant: wire.Grant) -> wire.Yield:

@@ -15,7 +15,7 @@ from emulator.records.recorded_run import RecordedRun
 from emulator.records.states import COMMON_VALUES, STATES
 from emulator.report.source import Source
 from emulator.report.write import report_page
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
 from vnet.reports import RESERVED_NAMES
 
@@ -56,7 +56,7 @@ def told(emulation: Emulation) -> list[tuple[Any, ...]]:
 def test_logs_and_events_are_the_same_live_and_simulated(nodes_per_process: int) -> None:
     scenario = scenario_of([], f"{__name__}:talks", vehicles=2, run={"nodes_per_process": nodes_per_process})
     together, apart = run_together(scenario), run_apart(scenario)
-    assert told(together) == told(apart)
+    assert told(together) == told(apart) == told(run_forked(scenario))
     assert [each for each in told(together) if each[2] == "v01"] == [
         (400_000_000, "log", "v01", {"level": "warning", "text": "half way"}),
         (

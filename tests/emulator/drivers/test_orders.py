@@ -13,7 +13,7 @@ from emulator.drivers.order_length import with_order_steps
 from emulator.records.tape import MediumOrder, TapeEntry, dump_tape, first_left, read_tape
 from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.test_windows import fingerprint, same, scenarios
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.errors import VnetError
 from vnet.transport.orders import Deviation
 
@@ -44,6 +44,10 @@ def test_an_order_is_the_same_in_any_division_into_processes_and_from_its_tape(
     apart = run_apart(explored)
     assert same(fingerprint(apart)[:3], fingerprint(reference)[:3])
     assert apart.orders.in_order() == reference.orders.in_order()
+    forked = run_forked(explored)
+    assert same(fingerprint(forked), fingerprint(reference))
+    assert forked.orders.in_order() == reference.orders.in_order()
+    assert forked.orders.steps == reference.orders.steps
     again = run_together(taped(scenario, reference, tmp_path_factory.mktemp("tape")))
     assert same(fingerprint(again), fingerprint(reference))
     assert again.orders.left() is None

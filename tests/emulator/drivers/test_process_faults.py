@@ -9,7 +9,7 @@ import pytest
 
 from emulator.drivers.emulation import Emulation
 from emulator.scenario.faults import KINDS, parse_fault
-from tests.support.multi_loop_driver import emulation_of, run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
 from vnet import Node
 from vnet.reports import Report
 from vnet.transport import wire
@@ -117,7 +117,7 @@ def both(faults: list[dict[str, Any]], program: str, **sections: Any) -> tuple[E
     together = run_together(scenario)
     noted = {node: list(entries) for node, entries in diary.items()}
     apart = run_apart(scenario)
-    assert fingerprint(together) == fingerprint(apart)
+    assert fingerprint(together) == fingerprint(apart) == fingerprint(run_forked(scenario))
     return together, noted
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import sys
 import threading
+from collections.abc import Callable
 
 import pytest
 
@@ -10,7 +11,8 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.program_output import output_kept
 from emulator.records import node_logs
 from emulator.records.node_logs import NodeLogs
-from tests.support.multi_loop_driver import emulation_of, run_together, scenario_of
+from emulator.scenario.scenario import Scenario
+from tests.support.multi_loop_driver import emulation_of, run_forked, run_together, scenario_of
 from vnet.node import Node
 
 
@@ -42,8 +44,11 @@ async def prints_everywhere(node: Node) -> None:
 WHERE = ["main", "a task", "a callback", "a job", "a thread", "error", "pieces"]
 
 
-def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    emulation = run_together(scenario_of([], f"{__name__}:prints_everywhere", vehicles=2))
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_prints_are_in_the_log_of_their_vehicle_and_in_the_terminal(
+    capsys: pytest.CaptureFixture[str], run: Callable[[Scenario], Emulation]
+) -> None:
+    emulation = run(scenario_of([], f"{__name__}:prints_everywhere", vehicles=2))
     terminal = capsys.readouterr()
     for node in ("v01", "v02"):
         said = [f"{node} in {where}" for where in WHERE]

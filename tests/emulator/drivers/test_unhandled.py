@@ -19,7 +19,7 @@ from emulator.records.failures import kinds_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.run_folder import Event
 from emulator.records.verdicts import CheckResult, Verdict
-from tests.support.multi_loop_driver import run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together, scenario_of
 from vnet.node import Node
 from vnet.runtime.unhandled import UnhandledExceptions
 
@@ -252,7 +252,12 @@ def judged(emulation: Emulation) -> CheckResult:
     return next(check for check in judgement.checks if check.name == "no_exceptions")
 
 
-RUNS = {"simulated": (run_together, 1), "processes": (run_apart, 1), "shared": (run_apart, 2)}
+RUNS = {
+    "simulated": (run_together, 1),
+    "processes": (run_apart, 1),
+    "shared": (run_apart, 2),
+    "forked": (run_forked, 1),
+}
 
 
 @pytest.mark.parametrize("run", RUNS)
@@ -303,6 +308,10 @@ def test_faults_on_processes_change_nothing_between_live_and_simulated(program: 
         return sorted((event.time_ns, event.node, event.details["place"]) for event in exceptions(emulation))
 
     assert told(together) == told(apart)
+    forked = run_forked(scenario_of(faults, entry(program)))
+    assert [(e.time_ns, e.kind, e.node) for e in forked.folder.events] == [
+        (e.time_ns, e.kind, e.node) for e in together.folder.events
+    ]
     restarted = [time_ns / 1e9 for time_ns, node, _ in told(apart) if node == "v02"]
     killed = [time_ns / 1e9 for time_ns, node, _ in told(apart) if node == "v01"]
     if program is fails_at_the_end:

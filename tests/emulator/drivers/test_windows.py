@@ -16,7 +16,7 @@ from emulator.scenario.faults import parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.testing.strategies import faults as schedules
 from tests.support.motion import along, scenario_of_trips, still, write_trips
-from tests.support.multi_loop_driver import emulation_of, run_apart, run_together, scenario_of
+from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
 from tests.support.paths import ROOT
 from vnet.transport import wire
 
@@ -73,7 +73,9 @@ def test_shipped_scenarios_are_the_same_with_and_without_windows(name: str) -> N
     if data["program"]["entry"] != "agents.beacon:main":
         data["program"]["options"] = {**data["program"].get("options", {}), "particles": 20}
     scenario = Scenario.model_validate(data)
-    assert same(fingerprint(simulated(scenario, True)), fingerprint(simulated(scenario, False)))
+    reference = fingerprint(simulated(scenario, False))
+    assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_forked(scenario)), reference)
 
 
 # Random scenarios and programs.
@@ -113,6 +115,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 def test_random_runs_are_the_same_with_and_without_windows(scenario: Scenario) -> None:
     reference = fingerprint(simulated(scenario, False))
     assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_forked(with_windows(scenario, True))), reference)
     assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
 
 
@@ -146,6 +149,7 @@ def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
     scenario = scenario_of_trips(path, 1.6, IMPROVISES, radio=radio, run={"seed": seed, "settle_s": 0.2})
     reference = fingerprint(simulated(scenario, False))
     assert same(fingerprint(simulated(scenario, True)), reference)
+    assert same(fingerprint(run_forked(with_windows(scenario, True))), reference)
     assert same(fingerprint(run_apart(with_windows(scenario, True)))[:3], reference[:3])
 
 
@@ -154,7 +158,7 @@ def test_vehicles_that_enter_and_leave_do_so_at_the_same_instants(
 STILL_AIR = {"loss": 0.0, "jitter_ms": 0.0, "access_jitter_ms": 0.0}
 
 
-@pytest.mark.parametrize("run", [run_together, run_apart])
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
 def test_a_program_that_is_started_again_has_no_packets_of_the_one_before(
     run: Callable[[Scenario], Emulation],
 ) -> None:
@@ -168,7 +172,7 @@ def test_a_program_that_is_started_again_has_no_packets_of_the_one_before(
     assert row["outcome"] == "delivered"
 
 
-@pytest.mark.parametrize("run", [run_together, run_apart])
+@pytest.mark.parametrize("run", [run_together, run_apart, run_forked])
 def test_a_program_that_is_ended_has_the_packets_of_its_own_last_instant(
     run: Callable[[Scenario], Emulation],
 ) -> None:

@@ -32,7 +32,7 @@ from emulator.viewer.recorder import Recorder
 from emulator.viewer.sinks import Sinks
 from emulator.world.driven.sumo_world import SumoWorld
 from emulator.world.world import build_world
-from tests.support.multi_loop_driver import run_apart, run_together
+from tests.support.multi_loop_driver import run_apart, run_forked, run_together
 from tests.support.recordings import read_back
 from tests.support.sumo import install_fake, write_scenario
 from vnet import Node
@@ -151,6 +151,7 @@ def test_a_run_is_the_same_in_every_division_and_again(tmp_path: Path) -> None:
     assert "entered" in {event[1] for event in reference[3]}
     assert fingerprint(run_together(Scenario.model_validate(data))) == reference
     assert fingerprint(run_apart(Scenario.model_validate(data))) == reference
+    assert fingerprint(run_forked(Scenario.model_validate(data))) == reference
     narrow = {**data, "run": {**data["run"], "windows": False}}
     assert fingerprint(run_together(Scenario.model_validate(narrow))) == reference
     other = {**data, "network": {**data["network"], "seed": 2}}
