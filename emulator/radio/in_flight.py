@@ -99,7 +99,7 @@ class Deliveries(Sequence[Delivery]):
         return [replace(packet, rssi_dbm=rssi_dbm, snr_db=snr_db) for packet, rssi_dbm, snr_db in powers]
 
     def _order(self) -> NDArray[np.intp]:
-        order = self._table[_ARRIVAL].argsort(kind="stable")
+        order: NDArray[np.intp] = self._table[_ARRIVAL].argsort(kind="stable")
         arrival_ns = self._table[_ARRIVAL, order]
         is_same = arrival_ns[1:] == arrival_ns[:-1]
         if is_same.any():
