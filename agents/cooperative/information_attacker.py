@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +11,8 @@ from agents.cooperative.attack import EPOCH_LEAP, NOT_FINITE, Attack, shifted_su
 from agents.cooperative.information_estimator import InformationEstimator
 from agents.cooperative.information_frame import InformationFrame, encode
 from vnet import Fix
-from vnet.cmm.information import Five
-from vnet.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, matrices
+from vnet.cmm.information import Five, Information
+from vnet.cmm.plausibility import MEMORY_S, PRIOR_GATE, SUM_GATE, moved, scaled_by
 from vnet.types import Array
 from vnet.units import NS_PER_S
 
@@ -60,10 +59,8 @@ class InformationAttacker(InformationEstimator):
                 return replace(frame, running_sum=shifted_sum(frame.running_sum, offset_m))
             case "relay":
                 passed = frame.passed.copy()
-                moved_m = np.array([_shifted(row, offset_m) for row in frame.passed_numbers.tolist()]).reshape(
-                    -1, 5
-                )
-                passed["information"] = np.clip(moved_m, -6e4, 6e4)
+                for row, information in zip(passed, frame.passed_numbers.tolist(), strict=True):
+                    row["information"] = np.clip(_shifted(information, offset_m), -6e4, 6e4)
                 return replace(frame, passed=passed)
             case "epoch":
                 return replace(frame, epoch=frame.epoch + EPOCH_LEAP)
@@ -75,15 +72,13 @@ class InformationAttacker(InformationEstimator):
 
 def _louder(information: Five) -> Five:
     """Return what claims `EXAGGERATION` times as much information with the same mean."""
-    a, b, d, x, y = information
-    return EXAGGERATION * a, EXAGGERATION * b, EXAGGERATION * d, EXAGGERATION * x, EXAGGERATION * y
+    return scaled_by(information, EXAGGERATION)
 
 
-def _shifted(information: Sequence[float], by_m: Array) -> Five:
-    """Return information (5,) whose mean is off by (2,)."""
-    a, b, d, x, y = information
+def _shifted(information: Five, by_m: Array) -> Five:
+    """Return information whose mean is off by (2,)."""
     east, north = by_m.tolist()
-    return a, b, d, x + a * east + b * north, y + b * east + d * north
+    return moved(information, east, north)
 
 
 def _moved(frame: InformationFrame, prior_by_m: Array, increment_by_m: Array) -> InformationFrame:
@@ -102,8 +97,8 @@ def _undetected(frame: InformationFrame, direction: Array, period_s: float, limi
     `limit_m` is the distance from the median that its own neighbours are allowed.
     """
     unit = direction / max(float(np.hypot(*direction)), 1e-9)
-    variance_m2 = float(unit @ np.linalg.inv(matrices(np.array([frame.prior]))[0]) @ unit)
+    variance_m2 = float(unit @ np.linalg.inv(Information(frame.prior).matrix) @ unit)
     prior_m = min(limit_m, math.sqrt(PRIOR_GATE * 2 * variance_m2))
-    said = float(unit @ matrices(np.array([frame.increment]))[0] @ unit) * MEMORY_S / period_s
+    said = float(unit @ Information(frame.increment).matrix @ unit) * MEMORY_S / period_s
     increment_m = math.sqrt(SUM_GATE * (0.5 / max(said, 1e-6) + variance_m2))
     return BELOW_GATE * prior_m * unit, BELOW_GATE * min(increment_m, 10.0) * unit

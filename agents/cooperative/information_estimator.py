@@ -9,6 +9,7 @@ share that the pooled priors do not hold.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,12 +28,12 @@ from agents.cooperative.information_frame import (
     InformationFrame,
     decode,
     encode,
-    packed_numbers,
+    passed_increment,
     passed_record,
     room,
 )
 from agents.cooperative.options import Options
-from agents.cooperative.passing import Passing, codes_and_increments
+from agents.cooperative.passing import Passing
 from vnet import Fix, Packet
 from vnet.cmm.consensus import Share, tracked_mean
 from vnet.cmm.information import Five, Information, plain_moments
@@ -45,7 +46,9 @@ from vnet.cmm.plausibility import (
     Origins,
     cut_to,
     median_belief,
+    moved,
     priors_agree,
+    scaled_by,
     scaled_down,
     spread_limit_m,
     unless_most_disagree,
@@ -86,14 +89,22 @@ def _trace(information: Five) -> float:
     return information[0] + information[2]
 
 
-def _sum(rows: Array) -> Array:
-    """Return the sum (m,) of rows (n, m): numpy's takes longer where they are few."""
-    return np.asarray(np.ones(len(rows)).dot(rows))
-
-
-def _joined(rows: list[bytes]) -> Array:
-    """Return rows of `packed_numbers` as an array (n, 15)."""
-    return np.frombuffer(b"".join(rows)).reshape(len(rows), -1)
+def _pooled(weights: Sequence[float], priors: Sequence[Five], increments: Iterable[Five]) -> Information:
+    """Return the sum of `priors`, each by its weight, and of `increments`."""
+    sum_a = sum_b = sum_d = sum_x = sum_y = 0.0
+    for weight, (a, b, d, x, y) in zip(weights, priors, strict=True):
+        sum_a += weight * a
+        sum_b += weight * b
+        sum_d += weight * d
+        sum_x += weight * x
+        sum_y += weight * y
+    for a, b, d, x, y in increments:
+        sum_a += a
+        sum_b += b
+        sum_d += d
+        sum_x += x
+        sum_y += y
+    return Information((sum_a, sum_b, sum_d, sum_x, sum_y))
 
 
 class InformationEstimator:
@@ -102,7 +113,6 @@ class InformationEstimator:
     period_s, rng: the period and the vehicle's own random numbers.
     own: what the vehicle knows of itself and of the common error.
     fused_m: (2,), the estimate of the common error right after the latest fusion.
-    weights: the latest fusion weights by node id, the vehicle's own included.
     mean_m: (2,), the network's mean as far as it is known, None before the first.
     limit_m: distance from the median of what is heard to which the latest period's priors were moved.
     imported: number of increments that the latest period took from others.
@@ -117,9 +127,10 @@ class InformationEstimator:
         self.consensus = mean_consensus(options, self.name, self.rejected)
         self.fused_m = self.own.estimate_m
         self.mean_m: Array | None = None
-        self.weights: dict[str, float] = {}
+        self._weights: list[float] = []
+        self._weighed: list[str] = []
         self.imported = 0
-        self.limit_m = np.inf
+        self.limit_m = math.inf
         self._node_id = node_id
         self._options = options
         self._period_ns = period_ns
@@ -131,6 +142,7 @@ class InformationEstimator:
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
         self._contradicted = 0
+        self._used_shares: list[float] = []  # of the increments of the frames that are believed
         self._prior = as_sent(self.own.prior)
         self._increment: Five = _NOTHING
         self._largest_increment = 0.0
@@ -147,6 +159,16 @@ class InformationEstimator:
     def common_error(self) -> tuple[Array, Array]:
         """Estimate (2,) of the common error, and its covariance (2, 2)."""
         return self.own.estimate_m, self.own.estimate_covariance_m2
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The latest fusion weights by node id, the vehicle's own included."""
+        if not self._weights:
+            return {}
+        ids = self._admission.ids
+        return dict(
+            zip([self._node_id, *[ids.get(name, name) for name in self._weighed]], self._weights, strict=True)
+        )
 
     def sample(self, count: int) -> Array:
         """Draw `count` hypotheses (count, 2) of the common error."""
@@ -185,29 +207,26 @@ class InformationEstimator:
 
     def agree(self) -> None:
         """Do a round of consensus, and fuse, with the frames of this period."""
-        frames = self._current_frames()
-        # What this vehicle says itself is the first row of all.
         own = plain_moments(*self._prior)
-        table = _joined([packed_numbers(self._prior, self._increment, own), *[f.numbers for f in frames.values()]])
-        believed = self._believed(list(frames.values()), own, table)
-        if believed is not None:
-            frames = {name: frames[name] for name, share in zip(frames, believed, strict=True) if share}
-            table = table[[True, *map(bool, believed)]]
-            table[1:, 5:10] *= np.array([share for share in believed if share])[:, None]
+        frames = self._believed(self._current_frames(), own)
         heard = list(frames.values())
-        priors, means_m, leaning = self._moderated(heard, own, table[:, :5], table[:, 10:12])
-        self._share = self.consensus.round(means_m[0], {sender: frame.share for sender, frame in frames.items()})
+        # Of all that follows what this vehicle says itself is the first.
+        priors, means_m, leaning = self._moderated(heard, own)
+        shares = {sender: frame.share for sender, frame in frames.items()}
+        self._share = self.consensus.round(np.array(means_m[0]), shares)
         self.mean_m = self.consensus.mean_m
         if self._options.consensus == "ratio":
-            self.mean_m = tracked_mean(_sum(means_m) / len(means_m), self.mean_m, self.limit_m / SPREAD_GATE)
-        priors, increments = self._limited(heard, priors, table[:, 5:10])
-        weights = self._weigh(frames, means_m, table[:, 12] + table[:, 14], leaning)
+            count = len(means_m)
+            middle_m = sum([x for x, _ in means_m]) / count, sum([y for _, y in means_m]) / count
+            self.mean_m = tracked_mean(middle_m, self.mean_m, self.limit_m / SPREAD_GATE)
+        limited, increments = self._limited(heard, priors)
+        variances_m2 = [own[2] + own[4], *[frame.moments[2] + frame.moments[4] for frame in heard]]
+        weights = self._weigh(frames, means_m, variances_m2, leaning)
         passed = self._passed_on(heard, weights[1:])
-        pooled = np.array(weights).dot(priors) + _sum(increments) + _sum(passed)
-        self.imported = len(frames) + len(passed)
+        self.imported = len(heard) + len(passed)
         self._passing.use([passed_record(self._code, self._increment), *[frame.record for frame in heard]])
         if self.imported:
-            self.own.absorb(Information(tuple(pooled.tolist())))
+            self.own.absorb(_pooled(weights, limited, [*increments, *passed]))
         self.fused_m = self.own.estimate_m
 
     def _current_frames(self) -> dict[str, InformationFrame]:
@@ -224,33 +243,32 @@ class InformationEstimator:
         self._frames = {}
         return frames
 
-    def _believed(self, frames: Sequence[InformationFrame], own: Five, table: Array) -> list[float] | None:
-        """Return the share of the increment of each frame (n,) that is used, None if all are used in full.
-
-        It is 0 for frames that are not plausible. `own` is the mean and the covariance of the vehicle's own prior,
-        and `table` (1 + n, 15) has what all say.
-        """
+    def _believed(self, frames: dict[str, InformationFrame], own: Five) -> dict[str, InformationFrame]:
+        """Return the frames that are plausible; `own` is the mean and the covariance of the vehicle's own prior."""
         if not self._options.defence or not frames:
-            return None
-        x, y, p, q, r = own
-        codes, now_s = [frame.code for frame in frames], self._now_ns / NS_PER_S
-        near = priors_agree([frame.moments for frame in frames], own)
-        shares = self._origins.shares(codes, table[1:, 5:10], ((x, y), (p, q, r)), now_s)
-        shares = unless_most_disagree(shares)
-        self._notice_being_lost(near, table[1:, :5])
-        believed = [share if is_near else 0.0 for is_near, share in zip(near, shares, strict=True)]
-        if min(believed) == 1:
-            return None
+            return frames
+        x, y, *covariance_m2 = own
+        heard = list(frames.values())
+        near = priors_agree([frame.moments for frame in heard], own)
+        codes, increments = [frame.code for frame in heard], [frame.increment for frame in heard]
+        belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
+        used = self._origins.shares(codes, increments, belief, self._now_ns / NS_PER_S)
+        used = unless_most_disagree(used)
+        self._notice_being_lost(near, [frame.prior for frame in heard])
+        used = [share if is_near else 0.0 for is_near, share in zip(near, used, strict=True)]
+        self._used_shares = [share for share in used if share]
+        if min(used) == 1:
+            return frames
         self._reject("prior", near.count(False))
-        self._reject("increment", believed.count(0.0) - near.count(False))
-        return believed
+        self._reject("increment", used.count(0.0) - near.count(False))
+        return {name: frame for (name, frame), share in zip(frames.items(), used, strict=True) if share}
 
     def _reject(self, reason: str, count: int) -> None:
         """Count what is not used."""
         if count:
             self.rejected[reason] += count
 
-    def _notice_being_lost(self, near: list[bool], priors: Array) -> None:
+    def _notice_being_lost(self, near: list[bool], priors: Sequence[Five]) -> None:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long."""
         contradicted = len(near) >= LOST_NEIGHBOURS and 2 * near.count(False) > len(near)
         self._contradicted = self._contradicted + 1 if contradicted else 0
@@ -261,56 +279,61 @@ class InformationEstimator:
             self._prior, self._increment = as_sent(self.own.prior), _NOTHING
 
     def _moderated(
-        self, frames: Sequence[InformationFrame], own: Five, priors: Array, means_m: Array
-    ) -> tuple[Array, Array, list[bool] | None]:
-        """Return the priors (1 + n, 5) of the vehicle and of `frames`, and their means, none far from their median.
+        self, frames: Sequence[InformationFrame], own: Five
+    ) -> tuple[list[Five], list[tuple[float, float]], list[bool] | None]:
+        """Return the priors (1 + n,) of the vehicle and of `frames`, and their means, none far from their median.
 
         No vehicle is dropped: where a few hear what the others cannot know, they are always off, and right. The
         last value (n,) tells which always are, None if nobody is.
         """
+        priors, moments = [self._prior, *[frame.prior for frame in frames]], [frame.moments for frame in frames]
+        means_m = [own[:2], *[each[:2] for each in moments]]
         if not self._options.defence or not frames:
-            self.limit_m = np.inf
+            self.limit_m = math.inf
             return priors, means_m, None
-        moments = [frame.moments for frame in frames]
         middle_m, self.limit_m = spread_limit_m([own, *moments])
-        if self.limit_m == np.inf:
+        if self.limit_m == math.inf:
             middle_m = own[:2]
         codes = [frame.code for frame in frames]
         off_m, leaning = self._origins.without_lean(codes, moments, own, middle_m, self._now_ns / NS_PER_S)
         less_m = cut_to(off_m, self.limit_m)
         if less_m is off_m and leaning is None:
             return priors, means_m, None
-        moved_m = np.zeros_like(means_m)
-        moved_m[1:] = np.array(less_m) + middle_m - means_m[1:]
-        priors = priors.copy()
-        priors[:, 3] += priors[:, 0] * moved_m[:, 0] + priors[:, 1] * moved_m[:, 1]
-        priors[:, 4] += priors[:, 1] * moved_m[:, 0] + priors[:, 2] * moved_m[:, 1]
-        return priors, means_m + moved_m, leaning
+        middle_x, middle_y = middle_m
+        for row, (off_x, off_y) in enumerate(less_m, 1):
+            mean_x, mean_y = means_m[row]
+            means_m[row] = middle_x + off_x, middle_y + off_y
+            priors[row] = moved(priors[row], means_m[row][0] - mean_x, means_m[row][1] - mean_y)
+        return priors, means_m, leaning
 
-    def _limited(self, frames: Sequence[InformationFrame], priors: Array, increments: Array) -> tuple[Array, Array]:
-        """Return priors and increments (1 + n, 5) of all rows, none much more certain than one's own."""
+    def _limited(
+        self, frames: Sequence[InformationFrame], priors: list[Five]
+    ) -> tuple[Sequence[Five], Sequence[Five]]:
+        """Return priors and increments (1 + n,) of all, none much more certain than one's own."""
+        increments = [self._increment, *[frame.increment for frame in frames]]
         if not self._options.defence:
             return priors, increments
+        if frames and min(self._used_shares) < 1:
+            each = zip(increments[1:], self._used_shares, strict=True)
+            increments[1:] = [scaled_by(increment, share) for increment, share in each]
         own, largest = _trace(self._increment), PRIOR_FACTOR * _trace(self._prior)
-        traces = sorted([own, *[frame.increment[0] + frame.increment[2] for frame in frames]])
+        traces = sorted(map(_trace, increments))
         usual = INCREMENT_FACTOR * max(own, traces[len(traces) // 2])
         self._largest_increment = max(usual, self.own.largest_increment)
         if traces[-1] > self._largest_increment:
             increments = scaled_down(increments, self._largest_increment)
-        if max([frame.prior[0] + frame.prior[2] for frame in frames], default=0.0) > largest:
-            priors = scaled_down(priors, largest)
-        return priors, increments
+        return scaled_down(priors, largest), increments
 
     def _weigh(
         self,
         frames: Mapping[str, InformationFrame],
-        means_m: Array,
-        variances_m2: Array,
+        means_m: Sequence[tuple[float, float]],
+        variances_m2: Sequence[float],
         leaning: list[bool] | None,
     ) -> list[float]:
         """Return the weights (1 + n,) of the priors.
 
-        They have means (1 + n, 2) and covariances with traces (1 + n,). The weight of who is always to one side,
+        They have means (1 + n,) and covariances with traces (1 + n,). The weight of who is always to one side,
         `leaning` (n,), goes to the vehicle itself.
         """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
@@ -321,33 +344,31 @@ class InformationEstimator:
             each = zip(weights[1:], leaning, strict=True)
             others = [0.0 if leans else (1 - SELF_SHARE) * weight for weight, leans in each]
             weights = [1 - sum(others), *others]
-        ids = [self._node_id, *(self._admission.ids[name] for name in frames)]
-        self.weights = dict(zip(ids, weights, strict=True))
+        self._weights = weights
+        self._weighed = list(frames)
         return weights
 
     # What is passed on.
 
-    def _passed_on(self, frames: Sequence[InformationFrame], weights: Sequence[float]) -> Array:
-        """Return the increments (m, 5) of the last period from out of range, less what the pooled priors hold."""
+    def _passed_on(self, frames: Sequence[InformationFrame], weights: Sequence[float]) -> list[Five]:
+        """Return the increments of the last period from out of range, less what the pooled priors hold."""
         listed = [frame.passed_records for frame in frames]
         shares, forged = self._passing.shares(listed, weights, self._options.defence)
-        if forged:
-            self.rejected["forged"] += forged
-        new = [record for record, share in shares.items() if share < 1]
-        if not new:
-            return np.zeros((0, 5))
-        origins, increments = codes_and_increments(new)
-        added = np.array([PASSED_SHARE * (1 - share) for share in shares.values() if share < 1])
-        increments *= added[:, None]
-        if not self._options.defence:
+        self._reject("forged", forged)
+        origins, increments = [], []
+        for record, share in shares.items():
+            if share < 1:
+                code, increment = passed_increment(record)
+                origins.append(code)
+                increments.append(scaled_by(increment, PASSED_SHARE * (1 - share)))
+        if not origins or not self._options.defence:
             return increments
-        mean_m, covariance_m2 = self.own.belief
-        (p, q), (_, r) = covariance_m2.tolist()
-        belief = mean_m.tolist(), (p, q, r)
-        used = self._origins.shares(origins, increments, belief, self._now_ns / NS_PER_S)
+        x, y, p, q, r = self.own.plain_moments
+        used = self._origins.shares(origins, increments, ((x, y), (p, q, r)), self._now_ns / NS_PER_S)
         if min(used) < 1:
             self._reject("passed", used.count(0.0))
-            increments = (increments * np.array(used)[:, None])[np.array(used) > 0]
+            each = zip(increments, used, strict=True)
+            increments = [scaled_by(increment, share) for increment, share in each if share]
         return scaled_down(increments, self._largest_increment)
 
     # What goes out.

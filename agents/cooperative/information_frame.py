@@ -44,7 +44,6 @@ PASSED = np.dtype([("name", "<u4"), ("information", "<f2", (5,))])
 """An increment that is passed on: its origin, and (δΛ_xx, δΛ_xy, δΛ_yy, δη_x, δη_y) with half precision."""
 _RECORD = struct.Struct("<I5e")
 _AS_BYTES = struct.Struct(f"{_RECORD.size}s")
-_NUMBERS = struct.Struct("<15d")
 
 
 def _nothing_passed() -> NDArray[np.void]:
@@ -99,19 +98,14 @@ class InformationFrame:
         return plain_moments(*self.prior)
 
     @cached_property
-    def numbers(self) -> bytes:
-        """The prior, the increment, and the prior's mean and covariance as in `packed_numbers`."""
-        return packed_numbers(self.prior, self.increment, self.moments)
-
-    @cached_property
     def record(self) -> bytes:
         """The increment as a record of `PASSED`."""
         return passed_record(self.code, self.increment)
 
     @cached_property
-    def passed_records(self) -> frozenset[bytes]:
-        """The records that are passed on, as bytes."""
-        return frozenset(chain.from_iterable(_AS_BYTES.iter_unpack(self.passed.tobytes())))
+    def passed_records(self) -> tuple[bytes, ...]:
+        """The records that are passed on, as bytes, each once."""
+        return tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(self.passed.tobytes()))))
 
     @property
     def passed_numbers(self) -> Array:
@@ -120,16 +114,16 @@ class InformationFrame:
 
     @cached_property
     def fingerprint(self) -> bytes:
-        """Bytes that no two senders share at one time: they come from the noise of a receiver.
-
-        An increment of 0, of an outlier, has no noise; to send it again under another name does no harm.
-        """
-        return _FINGERPRINT.pack(*self.increment) if any(self.increment) else self.name.encode()
+        """Bytes that no two senders share at one time: they come from the noise of a receiver."""
+        return _fingerprint(self.name, self.increment)
 
 
-def packed_numbers(prior: Five, increment: Five, moments: Five) -> bytes:
-    """Return prior, increment, and the prior's mean and covariance (xx, xy, yy): fifteen doubles as bytes."""
-    return _NUMBERS.pack(*prior, *increment, *moments)
+def _fingerprint(name: str, increment: Five) -> bytes:
+    """Return the fingerprint of a frame.
+
+    An increment of 0, of an outlier, has no noise; to send it again under another name does no harm.
+    """
+    return _FINGERPRINT.pack(*increment) if any(increment) else name.encode()
 
 
 def passed_record(code: int, increment: Five) -> bytes:
@@ -207,9 +201,9 @@ def decode(payload: bytes) -> InformationFrame:
     prior, running_sum = (a, b, d, x, y), (s_x, s_y, weight)
     _check(prior, increment, running_sum)
     heard, out_neighbours, names_heard = _heard(payload[_HEADER.size : flags_end], heard_count)
-    records = [record for (record,) in _AS_BYTES.iter_unpack(payload[flags_end:end])]
-    if any(map(_fault, records)):
-        raise FrameError(next(filter(None, map(_fault, records))))
+    records = tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(payload[flags_end:end]))))
+    for record in records:
+        passed_increment(record)
     a, b, d, x, y = increment
     frame = InformationFrame(
         name=name_of_code(name),
@@ -222,16 +216,15 @@ def decode(payload: bytes) -> InformationFrame:
         passed=np.frombuffer(payload, dtype=PASSED, count=passed_count, offset=flags_end),
         largest_degree=degree,
     )
-    moments = plain_moments(*prior)
     frame.__dict__.update(  # each receiver reads these, and a property takes longer when it is first read
         code=name,
-        moments=moments,
-        numbers=packed_numbers(prior, frame.increment, moments),
+        moments=plain_moments(*prior),
         out_neighbours=out_neighbours,
         names_heard=names_heard,
         share=Share(epoch, running_sum, out_neighbours, names_heard),
         record=passed_record(name, frame.increment),
-        passed_records=frozenset(records),
+        passed_records=records,
+        fingerprint=_fingerprint(frame.name, frame.increment),
     )
     return frame
 
@@ -256,12 +249,17 @@ def _check(prior: Five, increment: list[float], running_sum: tuple[float, float,
 
 
 @lru_cache(maxsize=4096)  # most that hear a vehicle pass its increment on
-def _fault(record: bytes) -> str:
-    """Return why a record of `PASSED` cannot be, "" if it can."""
-    _, *increment = _RECORD.unpack(record)
-    if not math.isfinite(sum(increment)):
-        return "not_finite"
-    return "" if _is_semidefinite(*increment[:3]) else "covariance"
+def passed_increment(record: bytes) -> tuple[int, Five]:
+    """Return the origin's code and the increment of a record of `PASSED`.
+
+    Raises FrameError if it cannot be one: `not_finite` or `covariance`.
+    """
+    code, a, b, d, x, y = _RECORD.unpack(record)
+    if not math.isfinite(a + b + d + x + y):
+        raise FrameError("not_finite")
+    if not _is_semidefinite(a, b, d):
+        raise FrameError("covariance")
+    return code, (a, b, d, x, y)
 
 
 def _is_semidefinite(a: float, b: float, d: float) -> bool:

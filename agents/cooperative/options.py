@@ -81,11 +81,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     fusion_interval_s: Positive = 0.2
     """Time between two fusions."""
     particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    """Number of hypotheses of the common error that a vehicle keeps; 0 means 1000 with `exchange = "information"`
-    and 200 else, where a vehicle filters the fixes of all."""
+    """Number of hypotheses of the common error that a vehicle keeps; 0 means 200. With `exchange = "information"`
+    there are four times as many while lanes compete, and none once one is left; 0 means 1000 there."""
     least_particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
-    """With `exchange = "information"` on straight lanes: their number goes down to it as their spread does, by KLD
-    sampling (Fox 2003), `particles` being the largest; 0 keeps `particles` always."""
+    """With `exchange = "information"` on straight lanes, while several compete: the number of particles goes down
+    to it as their spread does, by KLD sampling (Fox 2003); 0 keeps their number."""
     common_sigma_m: Deviation = 3.0
     """Standard deviation of the common error, as the vehicle assumes it."""
     common_tau_s: Positive = 600.0

@@ -2,7 +2,7 @@
 
 A frame lists the increments that its sender used in the period before, and so says what its prior holds. A receiver
 adds of each the share that the pooled priors do not hold. A record of `PASSED` is an exact copy wherever it comes
-from, so records are compared and counted as bytes: for the few dozens of a period sets take a third of the time of
+from, so records are compared and counted as bytes: for the few dozens of a period that takes a third of the time of
 arrays.
 """
 
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from agents.cooperative.frame import NAME_BYTES
 from agents.cooperative.information_frame import PASSED
-from vnet.types import Array
 
 MAX_FORGED_SHARE = 0.5
 """Share of the increments that are known first-hand, beyond which a frame that passes on others is forged."""
 
-Records = frozenset[bytes]
+Records = Sequence[bytes]
+"""Different records, as a frame lists them."""
 
 
 class Passing:
@@ -43,29 +43,30 @@ class Passing:
     def shares(
         self, listed: Sequence[Records], weights: Sequence[float], defence: bool
     ) -> tuple[dict[bytes, float], int]:
-        """Return the records of `listed` that are not used yet, sorted, each with the share that priors hold.
+        """Return the records of `listed` that are not used yet, each with the share that priors hold.
 
         That is the sum of the `weights` of the senders that list it. With `defence` what forged frames list is not
         counted; the second value is their number.
         """
-        own = frozenset(self._used)
-        new = frozenset[bytes]().union(*listed) - own
-        names = {record[:NAME_BYTES] for record in new}
-        forged: set[int] = set()
-        if len(names) < len(new) or not names.isdisjoint([record[:NAME_BYTES] for record in self._used]):
-            forged = _forged(self._used, listed) if defence else set()
-            new, listed = _one_an_origin(self._used, listed, forged)
-        share = dict.fromkeys(sorted(new), 0.0)
-        for weight, records in zip(weights, listed, strict=True):
-            for record in records & new:
-                share[record] += weight
-        return share, len(forged)
+        shares = _shares(set(self._used), listed, weights)
+        names = {record[:NAME_BYTES] for record in shares}
+        if len(names) == len(shares) and names.isdisjoint([record[:NAME_BYTES] for record in self._used]):
+            return shares, 0
+        forged = _forged(self._used, listed) if defence else set()
+        new, listed = _one_an_origin(self._used, listed, forged)
+        return {record: share for record, share in _shares(set(), listed, weights).items() if record in new}, len(
+            forged
+        )
 
 
-def codes_and_increments(records: Sequence[bytes]) -> tuple[list[int], Array]:
-    """Return the origins' codes (n,) and the increments (n, 5) of records."""
-    table = np.frombuffer(b"".join(records), dtype=PASSED)
-    return table["name"].tolist(), table["information"].astype(np.float64)
+def _shares(known: set[bytes], listed: Sequence[Records], weights: Sequence[float]) -> dict[bytes, float]:
+    """Return the sum of the weights of the frames that list a record, for those that are not known."""
+    shares: dict[bytes, float] = {}
+    for weight, records in zip(weights, listed, strict=True):
+        for record in records:
+            if record not in known:
+                shares[record] = shares.get(record, 0.0) + weight
+    return shares
 
 
 def _forged(used: Sequence[bytes], listed: Sequence[Records]) -> set[int]:
@@ -81,20 +82,20 @@ def _forged(used: Sequence[bytes], listed: Sequence[Records]) -> set[int]:
 
 def _one_an_origin(
     used: Sequence[bytes], listed: Sequence[Records], forged: set[int]
-) -> tuple[frozenset[bytes], list[Records]]:
+) -> tuple[set[bytes], list[Records]]:
     """Return the records that are new, the first of each origin, and what each frame lists in terms of these.
 
     An origin that a forged frame lists first is not used, and a forged frame lists nothing.
     """
     first: dict[bytes, bytes] = {record[:NAME_BYTES]: record for record in used}
-    new = set()
+    new: set[bytes] = set()
     for index, records in enumerate(listed):
-        for record in sorted(records):
+        for record in records:
             if record[:NAME_BYTES] not in first:
                 first[record[:NAME_BYTES]] = record
                 new.update([record] if index not in forged else [])
-    of_origins = [
-        frozenset() if index in forged else frozenset(first[record[:NAME_BYTES]] for record in records)
+    of_origins: list[Records] = [
+        [] if index in forged else list(dict.fromkeys(first[record[:NAME_BYTES]] for record in records))
         for index, records in enumerate(listed)
     ]
-    return frozenset(new), of_origins
+    return new, of_origins

@@ -187,7 +187,7 @@ class RatioConsensus:
         x, y = value.tolist()
         shares, added = self._believed(x, y, shares)
         self._peers.listen(shares)
-        self._highest = max([self._highest, *[share.epoch for share in shares.values()]])
+        self._highest = max(self._highest, _newest_epoch(shares))
         if self._follow(x, y):
             each = ((peer, self._added(peer, share)) for peer, share in shares.items())
             added = {peer: mass for peer, mass in each if mass is not None}
@@ -217,21 +217,23 @@ class RatioConsensus:
                 p: (penalty - leak, epoch) for p, (penalty, epoch) in self._penalties.items() if penalty > leak
             }
         self._penalize_new_epochs(shares)
-        gate_m = self._config.gate_m
+        gate_m, penalties = self._config.gate_m, self._penalties
+        node, epoch, seen = self._node, self.epoch, self._seen
         believed: dict[str, Share] = {}
         added: dict[str, Triple] = {}
         for peer, share in shares.items():
-            if self._penalties and self._penalty(peer) > self._config.ban_penalty:
+            if penalties and self._penalty(peer) > self._config.ban_penalty:
                 self._rejected["banned"] += 1
                 continue
-            mass = self._added(peer, share)
-            if mass is not None:
-                s_x, s_y, w = mass
+            if share.epoch == epoch and node in share.out_neighbours:
+                s_x, s_y, w = share.running_sum
+                seen_x, seen_y, seen_w = seen.get(peer, _NO_MASS)
+                s_x, s_y, w = s_x - seen_x, s_y - seen_y, w - seen_w
                 if w < 0 or not math.hypot(s_x - w * x, s_y - w * y) <= gate_m * (w + MIN_MASS):
                     self._rejected["implausible_mass"] += 1
                     self._penalize(peer, self._config.ban_penalty, share.epoch)
                     continue
-                added[peer] = mass
+                added[peer] = s_x, s_y, w
             believed[peer] = share
         return believed, added
 
@@ -240,7 +242,7 @@ class RatioConsensus:
 
         They share the penalty: the peer that starts an epoch brings it alone, peers that hand it on do so together.
         """
-        newest = max([share.epoch for share in shares.values()], default=0)
+        newest = _newest_epoch(shares)
         if newest > self._highest > 0:  # a node that joins finds the others further on, which is no fault of theirs
             first = [peer for peer, share in shares.items() if share.epoch == newest]
             for peer in first:
@@ -316,6 +318,10 @@ class RatioConsensus:
             r_x, r_y, r_w = self._running_sum
             self._running_sum = r_x + x_given, r_y + y_given, r_w + w_given
             self._mass = x - x_given * given, y - y_given * given, w - w_given * given
+
+
+def _newest_epoch(shares: Mapping[str, Share]) -> int:
+    return max([share.epoch for share in shares.values()], default=0)
 
 
 class DirectMean:
@@ -424,16 +430,17 @@ CONSENSUS_SHARE = 0.2
 0.070 m, of consensus alone 0.147 m, and the estimates themselves are 0.086 m from the mean."""
 
 
-def tracked_mean(neighbours_mean_m: Array, mean_m: Array | None, limit_m: float = math.inf) -> Array:
+def tracked_mean(neighbours_mean_m: tuple[float, float], mean_m: Array | None, limit_m: float = math.inf) -> Array:
     """Return the network's mean (2,) from the neighbours' of this instant and what consensus says, if anything.
 
     Consensus takes dozens of rounds, in which the inputs move by more than they differ; what neighbours say is of
     this instant, but of few. What consensus says counts for at most `limit_m` from them: false sums would else
     choose the weights.
     """
-    if mean_m is None:
-        return neighbours_mean_m
-    off_m = mean_m - neighbours_mean_m
-    x, y = off_m.tolist()
-    off_m *= CONSENSUS_SHARE * min(1.0, limit_m / max(math.hypot(x, y), 1e-300))
-    return np.asarray(neighbours_mean_m + off_m)
+    x, y = neighbours_mean_m
+    if mean_m is not None:
+        consensus_x, consensus_y = mean_m.tolist()
+        off_x, off_y = consensus_x - x, consensus_y - y
+        share = CONSENSUS_SHARE * min(1.0, limit_m / max(math.hypot(off_x, off_y), 1e-300))
+        x, y = x + share * off_x, y + share * off_y
+    return np.array([x, y])

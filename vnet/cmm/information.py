@@ -66,6 +66,12 @@ class Information:
         more_a, more_b, more_d, more_x, more_y = other.numbers
         return Information((a + more_a, b + more_b, d + more_d, x + more_x, y + more_y))
 
+    def minus(self, other: Information) -> Information:
+        """Return what this belief says beyond another."""
+        a, b, d, x, y = self.numbers
+        less_a, less_b, less_d, less_x, less_y = other.numbers
+        return Information((a - less_a, b - less_b, d - less_d, x - less_x, y - less_y))
+
 
 NOTHING = Information((0.0, 0.0, 0.0, 0.0, 0.0))
 """A fix that is not used says this."""
@@ -85,18 +91,6 @@ def rooted(a: float, b: float, d: float) -> Three:
     root = math.sqrt(max(a * d - b * b, 0.0))
     scale = math.sqrt(a + d + 2 * root)
     return (a + root) / scale, b / scale, (d + root) / scale
-
-
-def between(a: float, b: float, d: float, p: float, q: float, r: float) -> Three:
-    """Return A P A for symmetric matrices A = (a, b, d) and P = (p, q, r)."""
-    x, y, z, w = a * p + b * q, a * q + b * r, b * p + d * q, b * q + d * r  # A P
-    return x * a + y * b, x * b + y * d, z * b + w * d
-
-
-def transported(p: float, q: float, r: float, new_p: float, new_q: float, new_r: float) -> Three:
-    """Return `transport` of two covariances."""
-    root = rooted(p, q, r)
-    return between(*inverted(*root), *rooted(*between(*root, new_p, new_q, new_r)))
 
 
 def plain_moments(a: float, b: float, d: float, x: float, y: float) -> Five:

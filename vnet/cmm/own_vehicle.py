@@ -1,7 +1,8 @@
 """The filter of one vehicle, from its first fix on: itself and the common error (MODEL 10).
 
-On straight lanes that is `own_rbpf`, on the map of a city `own_vehicle_on_map`. Both say to others what
-they knew before a fix, and what the fix says about the common error: the *increment*.
+On straight lanes that is `own_rbpf` while lanes compete, and `own_kalman` once one is left; on the map of a city it
+is `own_vehicle_on_map`. All say to others what they knew before a fix, and what the fix says about the common
+error: the *increment*.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vnet.cmm.information import NOTHING, Information
+from vnet.cmm.information import NOTHING, Five, Information
 from vnet.cmm.kalman_bound import UNKNOWN_ALONG_M, LaneModel
 from vnet.cmm.map_matching import candidate_lanes
+from vnet.cmm.own_kalman import OwnKalman
 from vnet.cmm.own_rbpf import OwnRbpf
 from vnet.cmm.own_vehicle_on_map import OwnVehicleOnMap
 from vnet.cmm.rbpf import Observation, RbpfConfig
@@ -40,7 +42,8 @@ MAX_LANES = 8
 class OwnConfig:
     """Constants of a vehicle's filter: `rbpf` those of the filter on a map, `lateral_sigma_m` 0 for the map's.
 
-    least_particles: number to which particles go down as their spread does; 0 for as many always.
+    least_particles: number to which particles go down as their spread does, while lanes compete; 0 for as many
+    always.
     """
 
     rbpf: RbpfConfig
@@ -75,9 +78,8 @@ class OwnVehicle:
         # On no road a vehicle keeps its place: a renewed offset would be anywhere after seconds without a fix.
         tau_s = 2 * (UNKNOWN_ALONG_M / OFF_ROAD_WALK_M) ** 2
         unknown = replace(self._model, lateral_sigma_m=UNKNOWN_ALONG_M, lateral_tau_s=tau_s)
-        nowhere = np.zeros((1, 2)), np.zeros(1)
         self._unknown = unknown
-        self._filter = OwnRbpf(nowhere, unknown, self._particles, rng, start, self._least)
+        self._filter: OwnKalman | OwnRbpf = OwnKalman.start(np.zeros(2), 0.0, unknown, start)
         self._is_placed = False
         self._outliers_s = 0.0
         self.prior = self._filter.belief
@@ -97,13 +99,18 @@ class OwnVehicle:
         """Estimate (2,) of the common error, and its covariance (2, 2)."""
         return self._filter.estimate_m, self._filter.estimate_covariance_m2
 
+    @property
+    def plain_moments(self) -> Five:
+        """Mean (x, y) and covariance (xx, xy, yy) of the common error."""
+        return self._filter.plain_moments
+
     def position_m(self) -> tuple[Array, Array] | None:
         """Return position (2,) and covariance (2, 2); None as long as no fix tells it."""
         return self._filter.position_m() if self._is_placed else None
 
     def sample(self, count: int) -> Array:
         """Draw `count` equally likely hypotheses (count, 2) of the common error."""
-        return self._filter.sample(count)
+        return self._filter.sample(count, self._rng)
 
     def step(self, dt_s: float, fix: Observation | None) -> Information:
         """Advance by `dt_s` and take the vehicle's own fix; returns the increment, which is 0 for an outlier."""
@@ -114,32 +121,32 @@ class OwnVehicle:
         was_placed = self._is_placed
         if not was_placed:
             self._place(fix)
-        distance, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
-        if distance > GATE_SIGMAS**2:
+        increment = self._filter.take(fix.position_m, fix.covariance_m2, GATE_SIGMAS**2)
+        if increment is None:
             self._is_placed = was_placed  # along a lane nothing is known before a fix has been taken
             self._outliers_s += dt_s
             if self._outliers_s < LOST_S:
                 return NOTHING
             self._place(fix)
-            _, increment = self._filter.expects(fix.position_m, fix.covariance_m2)
+            increment = self._filter.take(fix.position_m, fix.covariance_m2)
+            assert increment is not None, "without a gate each fix is taken"
         self._outliers_s = 0.0
-        self._filter.update(fix.position_m, fix.covariance_m2)
+        self._go_on()
         return increment
 
     def absorb(self, pooled: Information) -> None:
         """Replace what is known of c by `pooled`."""
         self._filter.absorb(pooled)
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Go on without particles once one lane is left."""
+        if isinstance(self._filter, OwnRbpf):
+            self._filter = self._filter.decided() or self._filter
 
     def restart(self, belief: Information) -> None:
         """Begin again with this belief about c, and seek the lane again."""
-        self._filter = OwnRbpf(
-            (np.zeros((1, 2)), np.zeros(1)),
-            self._unknown,
-            self._particles,
-            self._rng,
-            belief.moments(),
-            self._least,
-        )
+        self._filter = OwnKalman.start(np.zeros(2), 0.0, self._unknown, belief.moments())
         self._is_placed = False
 
     def _place(self, fix: Observation) -> None:
@@ -149,12 +156,15 @@ class OwnVehicle:
         variance_m2 = np.trace(belief[1]) + np.trace(fix.covariance_m2)
         lanes = candidate_lanes(self._lanes, expected_m, fix.heading_rad, 3 * float(np.sqrt(variance_m2)))
         self._is_placed = True
-        if len(lanes):
-            found = self._different(lanes, expected_m)
-            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief, self._least)
+        if not len(lanes):
+            self._filter = OwnKalman.start(expected_m, 0.0, self._unknown, belief)
+            return
+        point_m, heading_rad = self._different(lanes, expected_m)
+        if len(heading_rad) == 1:
+            self._filter = OwnKalman.start(point_m[0], float(heading_rad[0]), self._model, belief)
         else:
-            nowhere = expected_m[None], np.zeros(1)
-            self._filter = OwnRbpf(nowhere, self._unknown, self._particles, self._rng, belief, self._least)
+            found = point_m, heading_rad
+            self._filter = OwnRbpf(found, self._model, self._particles, self._rng, belief, self._least)
 
     def _different(self, lanes: NDArray[np.intp], expected_m: Array) -> tuple[Array, Array]:
         """Return point and direction of those lanes that differ, the nearest first: a map may have a lane often."""

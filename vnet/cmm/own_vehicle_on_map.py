@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vnet.cmm.information import NOTHING, Information, gained
+from vnet.cmm.information import NOTHING, Five, Information, gained
 from vnet.cmm.kalman_bound import common_step
 from vnet.cmm.map_evidence import MAX_GATE_M, MIN_GATE_M, STAND_M
 from vnet.cmm.map_matching import MAX_LANES
@@ -74,6 +74,12 @@ class OwnVehicleOnMap:
     def belief(self) -> tuple[Array, Array]:
         """Estimate (2,) of the common error, and its covariance (2, 2)."""
         return self.estimate_m, self.estimate_covariance_m2
+
+    @property
+    def plain_moments(self) -> Five:
+        """Mean (x, y) and covariance (xx, xy, yy) of the common error."""
+        (x, y), ((p, q), (_, r)) = self.estimate_m.tolist(), self.estimate_covariance_m2.tolist()
+        return x, y, p, q, r
 
     @property
     def lanes(self) -> dict[int, float]:

@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vnet.cmm.information import Five, Information, Three
-from vnet.types import Array
+from vnet.cmm.information import Five, Information, Three, plain_moments
 
 INCREMENT_FACTOR = 1.5
 """Largest trace of an increment, relative to one's own: what it says more is scaled down."""
@@ -51,101 +48,69 @@ MAX_ORIGINS = 1024
 Belief = tuple[Sequence[float], Three]
 """Mean (x, y) in m and covariance (xx, xy, yy) in m² of what is believed about c."""
 
-_ENTRIES = np.array([0, 1, 1, 2])
-
-
-def matrices(information: Array) -> Array:
-    """Return the matrices (n, 2, 2) of information (n, 5): (xx, xy, yy) and the vector."""
-    return information.take(_ENTRIES, axis=1).reshape(-1, 2, 2)
-
-
-def moments(information: Array) -> tuple[Array, Array]:
-    """Return means (n, 2) and covariances (n, 2, 2) of beliefs (n, 5)."""
-    a, b, d, x, y = np.ascontiguousarray(information.T)
-    entries = np.stack([d, -b, a]) / (a * d - b * b)
-    variance_x, covariance, variance_y = entries
-    mean = np.stack([variance_x * x + covariance * y, covariance * x + variance_y * y], axis=1)
-    return mean, matrices(entries.T)
-
-
-def scaled_down(information: Array, largest_trace: float) -> Array:
-    """Return information (n, 5) with traces of at most `largest_trace`; means stay."""
-    trace = information[:, 0] + information[:, 2]
-    if max(trace.tolist(), default=0.0) <= largest_trace:
-        return information
-    return information * np.minimum(1.0, largest_trace / np.maximum(trace, 1e-300))[:, None]
-
-
-def deviation(information: Array, belief: Belief) -> Array:
-    """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for information (n, 5) about c ~ N(x, P): (n,)."""
-    return _squared(_compared(information, belief))
-
-
-_LAYOUT = np.array(
-    [
-        [2, 3, 0, 0, 0],
-        [0, 2, 3, 0, 0],
-        [0, 4, 0, 0, 0],
-        [0, 0, 4, 0, 0],
-        [5, 6, 0, 1, 0],
-        [0, 5, 6, 0, 1],
-        [7, 0, 0, 0, 0],
-        [0, 7, 0, 0, 0],
-        [0, 0, 7, 0, 0],
-    ]
-)
-"""Indices into 0, 1, C (xx, yx, yy), −x, 1: a row for each term of `_compared`, a column for each number."""
-
-
-def _compared(information: Array, belief: Belief, weight: float = 1.0) -> Array:
-    """Return the terms (9, n) of the deviation of information (n, 5) from c ~ N(x, P), which may be summed up.
-
-    With P = C Cᵀ these are Λ C by columns and r = η − Λ x, times `weight`, and Λ (xx, xy, yy), which is the
-    covariance of r given c, times its square. The deviation is the same for any weight.
-    """
-    (mean_x, mean_y), (p, q, r) = belief
-    c_xx = math.sqrt(p)
-    c_yx = q / c_xx
-    c_yy = math.sqrt(max(r - c_yx * c_yx, 0.0))
-    factors = [0.0, 1.0, c_xx, c_yx, c_yy, -mean_x, -mean_y, weight]
-    return np.asarray((weight * np.array(factors)).take(_LAYOUT).dot(information.T))
-
-
-_LEFT, _RIGHT = np.array([0, 0, 1, 2, 2, 3, 4, 4, 5]), np.array([0, 1, 1, 2, 3, 3, 4, 5, 5])
-"""Rows of the factors of the products xx, xy, yy of both columns of Λ C and of r."""
-_OF_PRODUCTS = np.array(
-    [
-        [1e-4, 0, 1 + 1e-4, 1e-4, 0, 1 + 1e-4, 0, 0, 0],
-        [0, 1, 0, 0, 1, 0, 0, 0, 0],
-        [1 + 1e-4, 0, 1e-4, 1 + 1e-4, 0, 1e-4, 0, 0, 0],
-        [0, 0, 0, 0, 0, 0, 1, 0, 0],
-        [0, 0, 0, 0, 0, 0, 0, -2, 0],
-        [0, 0, 0, 0, 0, 0, 0, 0, 1],
-    ]
-)
-_OF_INFORMATION = np.array([[1e-4, 0, 1 + 1e-4], [0, 1, 0], [1 + 1e-4, 0, 1e-4]])
-"""S = Λ + Λ P Λ (yy, xy, xx) and r rᵀ (xx, −2 xy, yy) as sums of the products and of Λ. A lane says nothing along
-itself: a ten thousandth of the trace is added to S, so that rounding there is not counted."""
+Ten = tuple[float, float, float, float, float, float, float, float, float, float]
+"""Sums of an origin's increments: Λ C (xx, xy, yx, yy) with P = C Cᵀ, r = η − Λ x, Λ (xx, xy, yy), their number."""
+LEAST_DETERMINANT = 1e-300
+"""In place of a determinant of 0: deviations are then huge."""
 _TINY = 1e-300
 """Least squared deviation: that of an increment which says nothing is 0."""
-_FLOOR = np.array([[1e-9], [0.0], [1e-9]])
-_ADJUGATE, _SQUARES = np.array([0, 1, 2, 0, 1]), np.array([3, 4, 5, 2, 1])
-_RATIO = np.array([[1.0, 1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])
-"""rᵀ adj(S) r and det S as sums of products of these rows."""
+_NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+# For the few dozens of a period plain numbers take less time than arrays, and are the same on each processor.
 
 
-def _squared(compared: Array) -> Array:
-    """Return the squared deviations rᵀ S⁻¹ r (m,) of terms (9, m)."""
-    products = compared.take(_LEFT, axis=0)
-    products *= compared.take(_RIGHT, axis=0)
-    sums = _OF_PRODUCTS.dot(products)
-    adjugate = sums[:3]
-    adjugate += _OF_INFORMATION.dot(compared[6:9])
-    adjugate += _FLOOR
-    products = sums.take(_ADJUGATE, axis=0)
-    products *= sums.take(_SQUARES, axis=0)
-    squared, determinant = _RATIO.dot(products)
-    return np.asarray(squared / determinant)
+def scaled_down(information: Sequence[Five], largest_trace: float) -> list[Five]:
+    """Return pieces of information with traces of at most `largest_trace`; means stay."""
+    scaled = []
+    for numbers in information:
+        trace = numbers[0] + numbers[2]
+        scaled.append(numbers if trace <= largest_trace else scaled_by(numbers, largest_trace / trace))
+    return scaled
+
+
+def scaled_by(information: Five, factor: float) -> Five:
+    """Return what says `factor` times as much."""
+    a, b, d, x, y = information
+    return factor * a, factor * b, factor * d, factor * x, factor * y
+
+
+def moved(information: Five, x_m: float, y_m: float) -> Five:
+    """Return a belief whose mean is off by (`x_m`, `y_m`)."""
+    a, b, d, x, y = information
+    return a, b, d, x + a * x_m + b * y_m, y + b * x_m + d * y_m
+
+
+def rooted_triangle(xx: float, xy: float, yy: float) -> Three:
+    """Return C (xx, yx, yy), lower triangular, with C Cᵀ a positive definite matrix (xx, xy, yy)."""
+    root_xx = math.sqrt(xx)
+    root_yx = xy / root_xx
+    return root_xx, root_yx, math.sqrt(max(yy - root_yx * root_yx, 0.0))
+
+
+def deviation(information: Five, belief: Belief) -> float:
+    """Return rᵀ (Λ + Λ P Λ)⁻¹ r with r = η − Λ x for what is said about c ~ N(x, P)."""
+    (mean_x, mean_y), covariance_m2 = belief
+    c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
+    a, b, d, x, y = information
+    x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
+    return _squared(a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy, x, y, a, b, d)
+
+
+def _squared(
+    m_xx: float, m_xy: float, m_yx: float, m_yy: float, x: float, y: float, a: float, b: float, d: float
+) -> float:
+    """Return rᵀ S⁻¹ r with S = Λ + (Λ C)(Λ C)ᵀ.
+
+    A lane says nothing along itself: a ten thousandth of the trace is added to S, so that rounding there is not
+    counted.
+    """
+    a += m_xx * m_xx + m_xy * m_xy
+    b += m_xx * m_yx + m_xy * m_yy
+    d += m_yx * m_yx + m_yy * m_yy
+    more = 1e-4 * (a + d) + 1e-9
+    a += more
+    d += more
+    return (d * x * x - 2 * b * x * y + a * y * y) / ((a * d - b * b) or LEAST_DETERMINANT)
 
 
 def priors_agree(priors: Sequence[Five], own: Five) -> list[bool]:
@@ -196,62 +161,6 @@ def unless_most_disagree(shares: list[float]) -> list[float]:
     return shares
 
 
-class Sums:
-    """Sums of the terms of each origin's increments, that decay in `MEMORY_S`, and of their number.
-
-    In place of a sum that decays, what is added is given a weight that grows: deviations are the same, and nothing
-    is to be done for those who are silent. Once in `MEMORY_S` all sums are reduced to a weight of 1.
-    """
-
-    def __init__(self) -> None:
-        self._row: dict[int, int] = {}
-        self._numbers = np.zeros((11, 0))  # terms, weights, and the time at which they were stored
-        self._since_s = 0.0
-
-    def __len__(self) -> int:
-        """Number of origins."""
-        return len(self._row)
-
-    def weight(self, now_s: float) -> float:
-        """Return the weight of what is added now."""
-        weight = math.exp((now_s - self._since_s) / MEMORY_S)
-        if weight <= math.e:
-            return weight
-        self._numbers[:10] /= weight
-        self._numbers[6:9] /= weight
-        self._since_s = now_s
-        return 1.0
-
-    def recall(self, codes: Sequence[int], now_s: float) -> tuple[NDArray[np.intp], Array]:
-        """Return the rows (n,) of origins, and their numbers (11, n).
-
-        New origins are added with zeros, and old ones forgotten when there are too many.
-        """
-        known = list(map(self._row.get, codes))
-        if None in known:
-            self._add([code for code in codes if code not in self._row], now_s)
-            known = list(map(self._row.get, codes))
-        rows = np.array(known, dtype=np.intp)
-        return rows, self._numbers.take(rows, axis=1)
-
-    def store(self, rows: NDArray[np.intp], numbers: Array) -> None:
-        """Replace the numbers (11, n) of the rows (n,)."""
-        self._numbers[:, rows] = numbers
-
-    def _add(self, new: list[int], now_s: float) -> None:
-        if len(self._row) + len(new) > MAX_ORIGINS:
-            kept = [code for code, row in self._row.items() if now_s - self._numbers[-1, row] < MEMORY_S]
-            kept = kept[-(MAX_ORIGINS // 2) :]
-            rows = [self._row[code] for code in kept]
-            self._row = {code: row for row, code in enumerate(kept)}
-            self._numbers = self._numbers[:, rows]
-        first = self._numbers.shape[1]
-        self._row |= {code: first + index for index, code in enumerate(new)}
-        more = np.zeros((len(self._numbers), len(new)))
-        more[-1] = now_s
-        self._numbers = np.hstack([self._numbers, more])
-
-
 def _sum_gate(count: float) -> float:
     """Return the largest squared deviation of a sum of so many increments."""
     return INCREMENT_GATE + (SUM_GATE - INCREMENT_GATE) * min(1.0, count / MANY)
@@ -265,34 +174,48 @@ class Origins:
 
     def __init__(self, drops_outliers: bool = True) -> None:
         self._drops_outliers = drops_outliers
-        self._increments = Sums()
-        self._leans: dict[int, tuple[float, float, float]] = {}  # mean deviation (x, y) and its time
+        self._sums: dict[int, tuple[float, Ten]] = {}  # their time, and what they were then
+        self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
 
-    def shares(self, codes: Sequence[int], increments: Array, belief: Belief, now_s: float) -> list[float]:
-        """Return the share (n,) of each increment (n, 5) of the origins `codes` that is used.
+    def __len__(self) -> int:
+        """Number of origins whose increments are summed up."""
+        return len(self._sums)
+
+    def shares(self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, now_s: float) -> list[float]:
+        """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
 
         It is 1 within the gates, for the increment by itself and for the origin's sum. Beyond it is 0, or, if
         outliers are weighed, the gate relative to the squared deviation: an M-estimator whose influence descends.
         What is beyond is summed up all the same: who has lied is believed again when it has decayed. Each is
         compared with the belief (x, P) when it came: c itself moves by half a metre in the sum's memory.
         """
-        if not codes:
-            return []
-        weight = self._increments.weight(now_s)
-        rows, sums = self._increments.recall(codes, now_s)
-        said = np.empty((11, 2, len(codes)))  # each by itself, then the sums: terms, weights and the time
-        said[:9, 0] = _compared(increments, belief, weight)
-        said[9, 0], said[10, 1] = weight, now_s
-        np.add(sums[:10], said[:10, 0], out=said[:10, 1])
-        self._increments.store(rows, said[:, 1])
-        alone, in_sum = _squared(said[:9].reshape(9, -1)).reshape(2, -1).tolist()
-        if max(alone) < INCREMENT_GATE and max(in_sum) < SUM_GATE:
-            return [1.0] * len(codes)
-        each = zip(alone, in_sum, (said[9, 1] / weight).tolist(), strict=True)
-        shares = [
-            min(INCREMENT_GATE / max(one, _TINY), _sum_gate(count) / max(many, _TINY)) for one, many, count in each
-        ]
-        return [1.0 if share > 1 else 0.0 if self._drops_outliers else share for share in shares]
+        sums = self._sums
+        if len(sums) + len(codes) > MAX_ORIGINS:
+            sums = self._sums = _newest(sums, now_s)
+        (mean_x, mean_y), covariance_m2 = belief
+        c_xx, c_yx, c_yy = rooted_triangle(*covariance_m2)
+        then_s, keep, keep_2 = now_s, 1.0, 1.0
+        shares = []
+        for code, (a, b, d, x, y) in zip(codes, increments, strict=True):
+            # The terms of the deviation, which may be summed up; Λ is the covariance of r given c.
+            m_xx, m_xy, m_yx, m_yy = a * c_xx + b * c_yx, b * c_yy, b * c_xx + d * c_yx, d * c_yy
+            x, y = x - a * mean_x - b * mean_y, y - b * mean_x - d * mean_y
+            since_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count) = sums.get(code, (now_s, _NO_SUMS))
+            if since_s != then_s:  # for most the same
+                then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
+                keep_2 = keep * keep  # covariances of sums whose parts have decayed
+            n_xx, n_xy, n_yx, n_yy = m_xx + keep * n_xx, m_xy + keep * n_xy, m_yx + keep * n_yx, m_yy + keep * n_yy
+            n_x, n_y, count = x + keep * n_x, y + keep * n_y, 1.0 + keep * count
+            n_a, n_b, n_d = a + keep_2 * n_a, b + keep_2 * n_b, d + keep_2 * n_d
+            sums[code] = now_s, (n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d, count)
+            in_sum = _squared(n_xx, n_xy, n_yx, n_yy, n_x, n_y, n_a, n_b, n_d)
+            alone = _squared(m_xx, m_xy, m_yx, m_yy, x, y, a, b, d)
+            share = 1.0
+            if not (alone < INCREMENT_GATE and (in_sum < SUM_GATE or in_sum < _sum_gate(count))):
+                beyond = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
+                share = 0.0 if self._drops_outliers else beyond
+            shares.append(share)
+        return shares
 
     def without_lean(
         self, codes: Sequence[int], priors: Sequence[Five], own: Five, middle_m: tuple[float, float], now_s: float
@@ -304,10 +227,10 @@ class Origins:
         second; a mean of more than `LEAN_LIMIT` deviations is taken off.
         """
         if len(self._leans) + len(codes) > MAX_ORIGINS:
-            kept = [code for code, (_, _, then_s) in self._leans.items() if now_s - then_s < MEMORY_S]
-            self._leans = {code: self._leans[code] for code in kept[-(MAX_ORIGINS // 2) :]}
+            self._leans = _newest(self._leans, now_s)
         off_m: list[tuple[float, float]] = []
         leans: list[bool] = []
+        then_s, keep = now_s, 1.0
         for code, (mean_x, mean_y, xx, xy, yy) in zip(codes, priors, strict=True):
             # The deviation in terms of what is claimed: C⁻¹ off with C Cᵀ the sum of both covariances.
             root_xx = math.sqrt(xx + own[2])
@@ -316,10 +239,11 @@ class Origins:
             off_x, off_y = mean_x - middle_m[0], mean_y - middle_m[1]
             x = off_x / root_xx
             y = (off_y - root_yx * x) / root_yy
-            lean_x, lean_y, then_s = self._leans.get(code, (0.0, 0.0, now_s))
-            keep = math.exp((then_s - now_s) / MEMORY_S)
+            since_s, lean_x, lean_y = self._leans.get(code, (now_s, 0.0, 0.0))
+            if since_s != then_s:  # for most the same
+                then_s, keep = since_s, math.exp((since_s - now_s) / MEMORY_S)
             lean_x, lean_y = x + keep * (lean_x - x), y + keep * (lean_y - y)
-            self._leans[code] = lean_x, lean_y, now_s
+            self._leans[code] = now_s, lean_x, lean_y
             squared = lean_x * lean_x + lean_y * lean_y
             is_leaning = squared > LEAN_LIMIT**2
             if is_leaning:
@@ -331,9 +255,18 @@ class Origins:
         return off_m, leans if True in leans else None
 
 
-def median_belief(priors: Array) -> Information:
-    """Return a belief at the coordinate-wise median of the means of `priors` (n, 5), as wide as the widest."""
-    means, covariance = moments(priors)
-    mean = np.median(means, axis=0)
-    variance = float(np.max(covariance[:, 0, 0] + covariance[:, 1, 1]))
-    return Information.of(mean, variance * np.eye(2))
+T = TypeVar("T", bound=tuple[Any, ...])
+
+
+def _newest(of_origins: dict[int, T], now_s: float) -> dict[int, T]:
+    """Return what is known of the latest origins; it begins with its time."""
+    kept = [code for code, known in of_origins.items() if now_s - known[0] < MEMORY_S]
+    return {code: of_origins[code] for code in kept[-(MAX_ORIGINS // 2) :]}
+
+
+def median_belief(priors: Sequence[Five]) -> Information:
+    """Return a belief at the coordinate-wise median of the means of `priors`, as wide as the widest."""
+    moments = [plain_moments(*prior) for prior in priors]
+    x, y = _median([mean_x for mean_x, *_ in moments]), _median([mean_y for _, mean_y, *_ in moments])
+    precision = 1 / max(xx + yy for _, _, xx, _, yy in moments)
+    return Information((precision, 0.0, precision, precision * x, precision * y))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from agents.cooperative.information_frame import passed_record
-from agents.cooperative.passing import Passing, codes_and_increments
+from agents.cooperative.information_frame import passed_increment, passed_record
+from agents.cooperative.passing import Passing
 
 
 def _record(code: int, value: float = 1.0) -> bytes:
@@ -22,29 +22,29 @@ def _passing() -> Passing:
 
 
 def test_what_is_not_used_yet_is_new_and_priors_hold_the_weight_of_who_lists_it() -> None:
-    listed = [frozenset([FIRST, OWN, FAR]), frozenset([SECOND, FAR, FURTHER])]
+    listed = [(FIRST, OWN, FAR), (SECOND, FAR, FURTHER)]
     shares, forged = _passing().shares(listed, [0.25, 0.5], True)
     assert shares == {FAR: 0.75, FURTHER: 0.5}
-    assert list(shares) == sorted(shares), "the order does not depend on the hashes of bytes"
+    assert list(shares) == [FAR, FURTHER], "the order is that of the frames, and not that of hashes of bytes"
     assert not forged
-    codes, increments = codes_and_increments(list(shares))
-    assert sorted(codes) == [300, 70_000]
-    assert increments.tolist() == [[1.0, 0.0, 1.0, 0.0, 0.0]] * 2
-    assert _passing().shares([frozenset([OWN])], [1.0], True) == ({}, 0)
+    assert [passed_increment(record) for record in shares] == [
+        (code, (1.0, 0.0, 1.0, 0.0, 0.0)) for code in (300, 70_000)
+    ]
+    assert _passing().shares([(OWN,)], [1.0], True) == ({}, 0)
 
 
 @pytest.mark.parametrize("defence", [True, False])
 def test_who_changes_most_that_is_known_first_hand_is_not_counted(defence: bool) -> None:
     """A record that it lists first is not used either; without the defence the first record counts for all."""
-    false = frozenset([_record(2, 9.0), _record(3, 9.0), OWN, _record(300, 9.0)])
-    honest = frozenset([FIRST, FAR, FURTHER])
+    false = (_record(2, 9.0), _record(3, 9.0), OWN, _record(300, 9.0))
+    honest = (FIRST, FAR, FURTHER)
     shares, forged = _passing().shares([false, honest], [0.25, 0.5], defence)
     assert forged == int(defence)
     assert shares == ({FURTHER: 0.5} if defence else {_record(300, 9.0): 0.75, FURTHER: 0.5})
 
 
 def test_a_frame_that_differs_in_one_of_two_is_not_forged() -> None:
-    listed = [frozenset([FIRST, _record(3, 9.0), FAR]), frozenset([SECOND, FAR])]
+    listed = [(FIRST, _record(3, 9.0), FAR), (SECOND, FAR)]
     assert _passing().shares(listed, [0.25, 0.5], True) == ({FAR: 0.75}, 0)
 
 

@@ -324,7 +324,7 @@ def test_who_gives_to_the_dead_keeps_the_mean_of_before(alive_rounds: int) -> No
 
 
 def test_a_moving_mean_is_mostly_what_neighbours_say_now() -> None:
-    neighbours, consensus = np.array([1.0, 2.0]), np.array([2.0, 2.0])
+    neighbours, consensus = (1.0, 2.0), np.array([2.0, 2.0])
     assert tracked_mean(neighbours, None).tolist() == [1.0, 2.0]
     assert tracked_mean(neighbours, consensus).tolist() == [1.2, 2.0]
     assert tracked_mean(neighbours, consensus, 0.5).tolist() == [1.1, 2.0]

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from vnet.cmm.information import Information
 from vnet.cmm.kalman_bound import KalmanBound, LaneModel, MultipathLaneModel
+from vnet.cmm.own_kalman import LEAST_VARIANCE_M2, OwnKalman
 from vnet.cmm.own_rbpf import OwnRbpf
 from vnet.types import Array
 
 NOISE_M2 = np.eye(2)
-EAST = (np.zeros((1, 2)), np.zeros(1))
+UNKNOWN = np.zeros(2), 9 * np.eye(2)
+"""Belief about the common error at the start."""
+
+
+def _on_a_lane(heading_rad: float = 0.0, model: LaneModel | None = None) -> OwnKalman:
+    return OwnKalman.start(np.zeros(2), heading_rad, model or LaneModel(), UNKNOWN)
 
 
 def _fixes(count: int, heading_rad: float, common_m: Array, seed: int) -> Array:
@@ -83,90 +91,125 @@ def test_a_vehicle_without_a_fix_is_predicted() -> None:
     assert np.trace(bound.common_covariance_m2) >= np.trace(before) - 1e-9
 
 
-@pytest.mark.parametrize("heading_rad", [0.0, 1.1])
+@pytest.mark.parametrize("heading_rad", [0.0, 1.1, 4.0])
 def test_alone_it_is_the_kalman_filter(heading_rad: float) -> None:
-    model = LaneModel()
-    lane = np.zeros((1, 2)), np.array([heading_rad])
-    own = OwnRbpf(lane, model, 20_000, np.random.default_rng(1))
-    bound = KalmanBound(*lane, model)
+    own, noise_m2 = _on_a_lane(heading_rad), np.array([[1.2, 0.3], [0.3, 0.8]])
+    bound = KalmanBound(np.zeros((1, 2)), np.array([heading_rad]))
     for k, fix in enumerate(_fixes(100, heading_rad, np.array([2.0, -1.0]), 7)):
         own.predict(0.1 if k else 0.0)
-        bound.step(0.1 if k else 0.0, fix[None], NOISE_M2)
-        own.update(fix, NOISE_M2)
-    assert_allclose(own.estimate_m, bound.common_m, atol=0.15)
-    assert_allclose(own.estimate_covariance_m2, bound.common_covariance_m2, rtol=0.1, atol=0.25)
-    position_m, covariance_m2 = own.position_m()
-    assert_allclose(position_m, bound.position_m[0], atol=0.15)
-    assert_allclose(covariance_m2, bound.position_covariance_m2()[0], rtol=0.1, atol=0.25)
-
-
-def test_the_increment_is_what_the_fix_adds() -> None:
-    own = OwnRbpf(EAST, LaneModel(), 50_000, np.random.default_rng(2))
-    for fix in _fixes(5, 0.0, np.array([1.0, 1.0]), 5):
-        own.predict(0.1)
-        before, (_, increment) = own.belief, own.expects(fix, NOISE_M2)
-        own.update(fix, NOISE_M2)
+        bound.step(0.1 if k else 0.0, fix[None], noise_m2)
+        before, increment = own.belief, own.take(fix, noise_m2)
+        assert increment is not None
         expected = before.plus(increment).moments()
-        assert_allclose(own.estimate_m, expected[0], atol=0.05)
-        assert_allclose(own.estimate_covariance_m2, expected[1], rtol=0.05, atol=0.05)
+        assert_allclose(own.estimate_m, expected[0], atol=1e-9)
+        assert_allclose(own.estimate_covariance_m2, expected[1], atol=1e-9)
+    assert_allclose(own.estimate_m, bound.common_m, atol=1e-9)
+    assert_allclose(own.estimate_covariance_m2, bound.common_covariance_m2, atol=1e-9)
+    position_m, covariance_m2 = own.position_m()
+    assert_allclose(position_m, bound.position_m[0], atol=1e-9)
+    assert_allclose(covariance_m2, bound.position_covariance_m2()[0], atol=1e-9)
 
 
 def test_nothing_counts_twice() -> None:
     """A vehicle that has long known its offset says little more: the lane is evidence once."""
-    own = OwnRbpf(EAST, LaneModel(common_tau_s=1e9, lateral_tau_s=1e9), 2000, np.random.default_rng(3))
-    said = []
+    own, said = _on_a_lane(model=LaneModel(common_tau_s=1e9, lateral_tau_s=1e9)), []
     for fix in _fixes(300, 0.0, np.zeros(2), 9):
         own.predict(0.1)
-        said.append(np.trace(own.expects(fix, NOISE_M2)[1].matrix))
-        own.update(fix, NOISE_M2)
+        increment = own.take(fix, NOISE_M2)
+        assert increment is not None
+        said.append(np.trace(increment.matrix))
     assert sum(said) < 1.2 / 0.38**2  # no more than what an offset of 0.38 m can tell
     assert said[-1] < said[0] / 50
 
 
 def test_pooled_information_is_taken_exactly() -> None:
-    own = OwnRbpf(EAST, LaneModel(), 500, np.random.default_rng(4))
+    own = _on_a_lane()
     own.predict(0.0)
-    own.update(np.array([1.0, 1.0]), NOISE_M2)
+    own.take(np.array([1.0, 1.0]), NOISE_M2)
     pooled = Information.of(np.array([0.5, -0.5]), np.array([[0.3, 0.1], [0.1, 0.2]]))
     place_m, _ = own.position_m()
     moved = own.estimate_m - pooled.moments()[0]
     own.absorb(pooled)
-    assert_allclose(own.estimate_m, [0.5, -0.5], atol=1e-9)
-    assert_allclose(own.estimate_covariance_m2, [[0.3, 0.1], [0.1, 0.2]], atol=1e-6)
+    assert_allclose(own.estimate_m, [0.5, -0.5], atol=1e-12)
+    assert_allclose(own.estimate_covariance_m2, [[0.3, 0.1], [0.1, 0.2]], atol=1e-12)
     # Along the lane nothing but the fix tells where it is: it moves against c.
-    assert_allclose((own.position_m()[0] - place_m)[0], moved[0], atol=0.05)
+    assert_allclose((own.position_m()[0] - place_m)[0], moved[0], atol=1e-6)
+
+
+def test_what_others_say_counts_as_a_measurement_of_c() -> None:
+    """The order in which things are measured at one instant does not matter."""
+    measured = Information.of(np.array([1.0, 2.0]), np.array([[0.5, 0.2], [0.2, 0.4]]))
+    first, last = _on_a_lane(0.7), _on_a_lane(0.7)
+    first.absorb(first.belief.plus(measured))
+    for fix in _fixes(10, 0.7, np.array([1.0, 1.0]), 3):
+        first.take(fix, NOISE_M2)
+        last.take(fix, NOISE_M2)
+    last.absorb(last.belief.plus(measured))
+    assert_allclose(first.plain_moments, last.plain_moments, atol=1e-7)
+    for one, other in zip(first.position_m(), last.position_m(), strict=True):
+        assert_allclose(one, other, atol=1e-6)
+
+
+def test_nothing_is_known_to_a_centimetre() -> None:
+    """A common error that is none can be written as information all the same."""
+    own = OwnKalman.start(np.zeros(2), 0.3, LaneModel(common_sigma_m=0.0), (np.zeros(2), np.zeros((2, 2))))
+    for fix in _fixes(50, 0.3, np.zeros(2), 2):
+        own.predict(0.1)
+        increment = own.take(fix, 1e-8 * NOISE_M2)
+        assert increment is not None
+        assert np.linalg.eigvalsh(increment.matrix)[0] > -1e-6
+        assert np.linalg.eigvalsh(own.estimate_covariance_m2)[1] < 4 * LEAST_VARIANCE_M2
 
 
 @pytest.mark.parametrize("lane", [0, 1, 2])
 def test_of_competing_lanes_the_one_that_fits_c_is_found(lane: int) -> None:
     """Three lanes 3.5 m apart; the fixes alone cannot tell which, what others know of c can."""
     points = np.array([[0.0, 3.5], [0.0, 0.0], [0.0, -3.5]])
-    own = OwnRbpf((points, np.zeros(3)), LaneModel(), 1000, np.random.default_rng(5))
+    own: OwnRbpf | OwnKalman = OwnRbpf((points, np.zeros(3)), LaneModel(), 250, np.random.default_rng(5))
     rng = np.random.default_rng(6)
     common_m = np.array([1.0, 2.0])
     for k in range(60):
         own.predict(0.1)
         fix = points[lane] + common_m + rng.standard_normal(2)
-        own.update(fix, NOISE_M2)
+        assert own.take(fix, NOISE_M2) is not None
         if k == 5:
-            assert len(own.lane_probability) > 1
+            assert isinstance(own, OwnRbpf), "several lanes compete"
         if k >= 10:
             own.absorb(own.belief.plus(Information.of(common_m + 0.5 * rng.standard_normal(2), np.eye(2))))
-    assert len(own.lane_probability) == 1
+        if isinstance(own, OwnRbpf) and (decided := own.decided()):
+            assert_allclose(decided.estimate_m, own.estimate_m, atol=1e-9)
+            assert_allclose(decided.estimate_covariance_m2, own.estimate_covariance_m2, atol=2 * LEAST_VARIANCE_M2)
+            assert_allclose(decided.position_m()[0], own.position_m()[0], atol=1e-9)
+            assert_allclose(decided.position_m()[1], own.position_m()[1], atol=1e-3)
+            own = decided
+    assert isinstance(own, OwnKalman), "one lane is left"
     assert_allclose(own.position_m()[0], points[lane], atol=0.8)
     assert_allclose(own.estimate_m, common_m, atol=0.6)
 
 
-def test_a_fix_that_is_far_off_is_seen() -> None:
-    own = OwnRbpf(EAST, LaneModel(), 500, np.random.default_rng(8))
+def _beside_each_other() -> OwnRbpf:
+    return OwnRbpf((np.array([[0.0, 3.5], [0.0, 0.0]]), np.zeros(2)), LaneModel(), 100, np.random.default_rng(8))
+
+
+@pytest.mark.parametrize("new", [_on_a_lane, _beside_each_other])
+def test_a_fix_that_is_far_off_is_not_taken(new: Callable[[], OwnKalman | OwnRbpf]) -> None:
+    own = new()
     for fix in _fixes(20, 0.0, np.zeros(2), 4):
         own.predict(0.1)
-        own.update(fix, NOISE_M2)
-    assert own.expects(np.array([0.3, 0.2]), NOISE_M2)[0] < 9
-    assert own.expects(np.array([30.0, 0.0]), NOISE_M2)[0] > 25
+        assert own.take(fix, NOISE_M2, 25.0) is not None
+    before = own.plain_moments
+    assert own.take(np.array([30.0, 0.0]), NOISE_M2, 25.0) is None
+    assert own.plain_moments == before
+    assert own.take(np.array([0.3, 0.2]), NOISE_M2, 9.0) is not None
 
 
-def test_the_sample_is_of_the_cloud() -> None:
-    own = OwnRbpf(EAST, LaneModel(), 400, np.random.default_rng(8))
-    assert own.sample(50).shape == (50, 2)
-    assert set(map(tuple, own.sample(50).tolist())) <= set(map(tuple, own.common_m.T.tolist()))
+def test_the_sample_is_of_what_is_known() -> None:
+    rng = np.random.default_rng(1)
+    own = _beside_each_other()
+    assert own.sample(50, rng).shape == (50, 2)
+    assert set(map(tuple, own.sample(50, rng).tolist())) <= set(map(tuple, own.common_m.T.tolist()))
+    alone = _on_a_lane(0.5)
+    alone.take(np.array([1.0, 2.0]), NOISE_M2)
+    points = alone.sample(20_000, rng)
+    assert_allclose(points.mean(axis=0), alone.estimate_m, atol=0.1)
+    assert_allclose(np.cov(points.T), alone.estimate_covariance_m2, atol=0.3)
