@@ -34,7 +34,7 @@ class Mailbox(Generic[T]):
     @property
     def waiting(self) -> bool:
         """True if a task waits for the next item."""
-        return any(not waiter.done() for waiter in self._waiters)
+        return bool(self._waiters) and any(not waiter.done() for waiter in self._waiters)
 
     def deliver(self, items: Sequence[T]) -> None:
         """Append items and wake the waiting tasks."""

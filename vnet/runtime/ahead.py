@@ -67,12 +67,17 @@ class RunAhead:
 
     def _pass_on(self, next_timer_ns: int | None) -> int:
         now_ns = self._clock()
-        if now_ns >= self._end_ns and (self._host.has_traffic or not self._may_pass(next_timer_ns)):
+        if now_ns >= self._end_ns and (self._host.has_traffic or not self._may_pass(self._wake_ns(next_timer_ns))):
             self._reach(now_ns)  # the last of quiet instants, too: a program that is ended finds what came by then
         next_ns = self._host.next_instant(next_timer_ns)
-        if next_ns is None:
-            next_ns = self._quiet_instant(next_timer_ns)
-        return self._swap(self._wake_ns(next_timer_ns)) if next_ns is None else next_ns
+        if next_ns is not None:
+            return next_ns
+        wake_ns = self._wake_ns(next_timer_ns)
+        if wake_ns is None or not self._may_pass(wake_ns):
+            return self._swap(wake_ns)
+        if self._fixes_ns is not None and self._fixes_ns <= wake_ns:
+            self._host.mail.deliver(Mail.of((), self._take_fixes()), wake_ns)
+        return wake_ns
 
     def catch_up(self) -> None:
         """Have this instant granted if it is quiet: a program looks for packets, tells anything, or begins a job.
@@ -96,26 +101,19 @@ class RunAhead:
         """Let programs that are ended look for packets, and tell what they will, without asking."""
         self._is_over = True
 
-    def _quiet_instant(self, next_timer_ns: int | None) -> int | None:
-        """Return the next instant beyond the window that is quiet, with its fixes delivered, or None."""
-        wake_ns = self._wake_ns(next_timer_ns)
-        if wake_ns is None or not self._may_pass(next_timer_ns):
-            return None
-        if self._fixes_ns is not None and self._fixes_ns <= wake_ns:
-            self._host.mail.deliver(Mail.of((), self._take_fixes()), wake_ns)
-        return wake_ns
-
-    def _may_pass(self, next_timer_ns: int | None) -> bool:
-        """Return whether the process may go on to its next instant beyond the window by itself."""
-        wake_ns = self._wake_ns(next_timer_ns)
-        listens = any(_listens(node) for node in self._host.nodes.values())
-        return wake_ns is not None and wake_ns < self._quiet_ns and not listens
+    def _may_pass(self, wake_ns: int | None) -> bool:
+        """Return whether the process may go on to `wake_ns`, beyond the window, by itself."""
+        if wake_ns is None or wake_ns >= self._quiet_ns:
+            return False
+        return not any(map(_listens, self._host.nodes.values()))
 
     def _wake_ns(self, next_timer_ns: int | None) -> int | None:
         """Return the earliest of the next timer and, if a vehicle waits for one, the fixes that are here."""
+        fixes_ns = self._fixes_ns
+        if fixes_ns is None or (next_timer_ns is not None and next_timer_ns <= fixes_ns):
+            return next_timer_ns
         awaits_fix = any(node.gnss.inbox.waiting for node in self._host.nodes.values())
-        fixes_ns = self._fixes_ns if awaits_fix else None
-        return min((time_ns for time_ns in (next_timer_ns, fixes_ns) if time_ns is not None), default=None)
+        return fixes_ns if awaits_fix else next_timer_ns
 
     def _take_fixes(self) -> Sequence[wire.WireFix]:
         fixes, self._fixes, self._fixes_ns = self._fixes, (), None

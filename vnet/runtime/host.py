@@ -254,8 +254,10 @@ class Host:
         """
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
-        self.busy.add(grant.busy)
-        self.news.add(grant.results, arrived_in_full(grant.messages))
+        if grant.busy:
+            self.busy.add(grant.busy)
+        if grant.results or grant.messages:
+            self.news.add(grant.results, arrived_in_full(grant.messages))
         self._deliver_due(grant.time_ns, fixes)
         return grant.time_ns
 
@@ -264,7 +266,8 @@ class Host:
 
         Returns None if there is none before the end of the window. Packets that nobody awaits make no instant.
         """
-        self._settle_stopped()
+        if self._stopped_ns:
+            self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
         next_ns = window.end_ns if next_timer_ns is None else next_timer_ns
         next_ns = self.news.first_ns(self._paused, next_ns)
@@ -280,8 +283,8 @@ class Host:
         packets = self._window.take_packets(time_ns, self._paused)
         due = {node: some for node, some in packets.items() if self._active[node]}
         self.mail.deliver(Mail(due, fixes), time_ns)
-        arrived = self.news.take(time_ns, self._paused)
-        self.mail.deliver_news([each for each in arrived if self._active[each.node]], time_ns)
+        if arrived := self.news.take(time_ns, self._paused):
+            self.mail.deliver_news([each for each in arrived if self._active[each.node]], time_ns)
 
     def make_yield(self, nonce: bytes, seq: int, next_timer_ns: int | None) -> wire.Yield:
         """Return the yield of the process when `next_instant` has found no further one in its window."""

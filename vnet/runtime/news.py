@@ -31,6 +31,8 @@ class News:
 
     def first_ns(self, paused: Collection[str], otherwise_ns: int) -> int:
         """Return the instant of the first item for a node that is not paused, or `otherwise_ns` if earlier."""
+        if not self._waiting:
+            return otherwise_ns
         times_ns = (item.time_ns for item in self._waiting if item.node not in paused)
         return min(next(times_ns, otherwise_ns), otherwise_ns)
 

@@ -107,6 +107,8 @@ class UnhandledExceptions:
 
     def take(self) -> list[Unhandled]:
         """Return the exceptions that are told by now, in the order of their instants."""
+        if not self._ready:
+            return []
         with self._lock:
             ready, self._ready = self._ready, []
         return sorted(ready, key=lambda each: (each.time_ns is None, each.time_ns))

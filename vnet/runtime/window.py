@@ -27,7 +27,8 @@ class Window:
 
     def open(self, end_ns: int, packets: dict[str, list[Packet]]) -> None:
         """Begin the next window; the steps of the last one have been taken."""
-        self._queue_new()
+        if self._new:
+            self._queue_new()
         self.end_ns = end_ns
         self._new = packets
 
