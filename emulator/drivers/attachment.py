@@ -86,7 +86,9 @@ class Attachment:
         """Listen or connect, and declare what is said and heard. Raises TransportError."""
         stack, options = self._stack, self._options
         if self._connect is None:
-            session = stack.enter_context(open_router(self.endpoint, options.access, self._lease_ms))
+            session = stack.enter_context(
+                open_router(self.endpoint, options.access, self._lease_ms, not self._drops)
+            )
             self.endpoint = router_endpoint(session)
         else:
             login = options.access.credentials(EMULATOR)

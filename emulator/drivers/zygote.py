@@ -25,11 +25,11 @@ from vnet.runtime import forking
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.scheduling import default_time_slice
-from vnet.transport.session import AGENT_RUNTIME
+from vnet.transport.session import AGENT_RUNTIME, RUNTIME_VARIABLE
 
 AGENT_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
-    "ZENOH_RUNTIME": AGENT_RUNTIME,
+    RUNTIME_VARIABLE: AGENT_RUNTIME,
     "PYTHONUNBUFFERED": "1",
     **KEPT_MEMORY,
 }
@@ -140,9 +140,13 @@ _subreaper = _Subreaper()
 
 
 class Zygote:
-    """The process from which agents are forked. `modules` are imported there, if they are vnet's own programs."""
+    """The process from which agents are forked. `modules` are imported there, if they are vnet's own programs.
 
-    def __init__(self, modules: Sequence[str]) -> None:
+    `runtime` is the setting of Zenoh's threads in agents.
+    """
+
+    def __init__(self, modules: Sequence[str], runtime: str = AGENT_RUNTIME) -> None:
+        self._environment = {**AGENT_ENVIRONMENT, RUNTIME_VARIABLE: runtime}
         self._modules = [module for module in modules if module.partition(".")[0] == "agents"]
         self._process: subprocess.Popen[bytes] | None = None
         self._ready = False
@@ -172,7 +176,7 @@ class Zygote:
                     stderr=subprocess.STDOUT,
                     pass_fds=[other_end.fileno()],
                     process_group=0,
-                    env={**SAME_ARITHMETIC, **os.environ, **AGENT_ENVIRONMENT},
+                    env={**SAME_ARITHMETIC, **os.environ, **self._environment},
                 )
         except OSError as error:
             raise VnetError(f"cannot start the process from which agents are forked: {error.strerror}") from None

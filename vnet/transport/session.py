@@ -21,8 +21,16 @@ from vnet.transport import wire
 from vnet.transport.access import Access, is_tls, router_config
 from vnet.transport.credentials import Credentials, Identity, as_base64, write_private
 
-AGENT_RUNTIME = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:2))"
-"""`ZENOH_RUNTIME` of an agent, read by Zenoh when it starts: fewer threads, 30 % less CPU time."""
+_ONE_POOL = "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),app:(worker_threads:{}))"
+"""Setting of Zenoh that has all its tasks share some threads: those of a message do not wake one another."""
+RUNTIME_VARIABLE = "ZENOH_RUNTIME"
+"""Environment variable of this setting, read by Zenoh when the first session of a process is opened."""
+AGENT_RUNTIME = _ONE_POOL.format(2)
+"""Setting of an agent."""
+LOCKSTEP_AGENT_RUNTIME = _ONE_POOL.format(1)
+"""Setting of an agent in lockstep: it sends or receives, and a second thread is woken to find nothing to do."""
+ROUTER_RUNTIME = _ONE_POOL.format(2)
+"""Setting of an emulator in lockstep: while one thread passes a message on, the other serves connections."""
 
 CONNECT_TIMEOUT_S = 5.0
 """Longest time to connect to a router that may not be there: long enough for a loaded machine."""
@@ -32,12 +40,15 @@ _NO_CONFIGURATIONS = "zenoh::api::session=off"
 
 
 @contextmanager
-def open_router(listen: str, access: Access, lease_ms: int) -> Iterator[zenoh.Session]:
+def open_router(listen: str, access: Access, lease_ms: int, one_pool: bool = False) -> Iterator[zenoh.Session]:
     """Open a session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
 
+    With `one_pool` Zenoh's tasks share two threads, if this is the first session of the process.
     Raise TransportError if it cannot listen there, or if only one of the endpoint and the users is set up for TLS.
     """
     access.check_endpoint(listen)
+    if one_pool:
+        os.environ.setdefault(RUNTIME_VARIABLE, ROUTER_RUNTIME)
     with tempfile.TemporaryDirectory(prefix="vnet-") as folder:
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())

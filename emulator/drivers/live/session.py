@@ -43,6 +43,7 @@ from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.transport import wire
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.session import AGENT_RUNTIME, LOCKSTEP_AGENT_RUNTIME
 
 LEASE_MS = 60_000
 """Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
@@ -97,7 +98,8 @@ def _zygote(scenario: Scenario) -> Zygote | None:
     """The process from which agents are forked, if they are to be, and this system can."""
     if scenario.run.start == "spawn" or sys.platform != "linux":
         return None
-    return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)])
+    runtime = LOCKSTEP_AGENT_RUNTIME if scenario.run.pacing == "lockstep" else AGENT_RUNTIME
+    return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)], runtime)
 
 
 def _lease_ms(scenario: Scenario) -> int:

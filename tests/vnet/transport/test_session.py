@@ -65,6 +65,16 @@ def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool
             assert set(came) == {own_rx, *[rx] * may}
 
 
+def test_a_router_has_one_pool_of_threads_unless_the_user_has_set_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    access = Access.create("r", [["v01"]])
+    for given, used in ((None, session.ROUTER_RUNTIME), ("(rx:(worker_threads:3))", "(rx:(worker_threads:3))")):
+        monkeypatch.setenv(session.RUNTIME_VARIABLE, given or "")
+        if given is None:
+            monkeypatch.delenv(session.RUNTIME_VARIABLE)
+        with open_router("tcp/127.0.0.1:0", access, LEASE_MS, one_pool=True):
+            assert os.environ[session.RUNTIME_VARIABLE] == used
+
+
 def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:
     """By Zenoh's defaults the 101st was refused, and tried again so long that a run of many did not start."""
     access = Access.create("r", [["v01"]])
