@@ -338,7 +338,8 @@ class InformationEstimator:
         """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
-        weights: list[float] = self._rule.weights(means_m, variances_m2, self.mean_m, degrees).tolist()
+        of_rule = self._rule.weights(np.array(means_m), np.array(variances_m2), self.mean_m, degrees)
+        weights: list[float] = of_rule.tolist()
         if self._options.defence:
             leaning = leaning or [False] * len(frames)
             each = zip(weights[1:], leaning, strict=True)
