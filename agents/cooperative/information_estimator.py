@@ -209,6 +209,7 @@ class InformationEstimator:
         """Do a round of consensus, and fuse, with the frames of this period."""
         own = plain_moments(*self._prior)
         frames = self._believed(self._current_frames(), own)
+        own = plain_moments(*self._prior)  # another one if the vehicle has begun again
         heard = list(frames.values())
         # Of all that follows what this vehicle says itself is the first.
         priors, means_m, leaning = self._moderated(heard, own)
@@ -254,7 +255,9 @@ class InformationEstimator:
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
         used = self._origins.shares(codes, increments, belief, self._now_ns / NS_PER_S)
         used = unless_most_disagree(used)
-        self._notice_being_lost(near, [frame.prior for frame in heard])
+        if self._begins_again(near, [frame.prior for frame in heard]):
+            self._used_shares = []  # the new belief is what they know
+            return {}
         used = [share if is_near else 0.0 for is_near, share in zip(near, used, strict=True)]
         self._used_shares = [share for share in used if share]
         if min(used) == 1:
@@ -268,15 +271,20 @@ class InformationEstimator:
         if count:
             self.rejected[reason] += count
 
-    def _notice_being_lost(self, near: list[bool], priors: Sequence[Five]) -> None:
-        """Begin again at the median of what the others know, if most have contradicted this vehicle for long."""
+    def _begins_again(self, near: list[bool], priors: Sequence[Five]) -> bool:
+        """Begin again at the median of what the others know, if most have contradicted this vehicle for long.
+
+        Returns whether it did.
+        """
         contradicted = len(near) >= LOST_NEIGHBOURS and 2 * near.count(False) > len(near)
         self._contradicted = self._contradicted + 1 if contradicted else 0
-        if self._contradicted >= LOST_PERIODS:
-            self._contradicted = 0
-            self._origins = Origins(self.own.drops_outliers)
-            self.own.restart(median_belief(priors))
-            self._prior, self._increment = as_sent(self.own.prior), _NOTHING
+        if self._contradicted < LOST_PERIODS:
+            return False
+        self._contradicted = 0
+        self._origins = Origins(self.own.drops_outliers)
+        self.own.restart(median_belief(priors))
+        self._prior, self._increment = as_sent(self.own.prior), _NOTHING
+        return True
 
     def _moderated(
         self, frames: Sequence[InformationFrame], own: Five

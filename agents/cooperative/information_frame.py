@@ -204,12 +204,11 @@ def decode(payload: bytes) -> InformationFrame:
     records = tuple(dict.fromkeys(chain.from_iterable(_AS_BYTES.iter_unpack(payload[flags_end:end]))))
     for record in records:
         passed_increment(record)
-    a, b, d, x, y = increment
     frame = InformationFrame(
         name=name_of_code(name),
         fix_time_ns=fix_time_ns,
         prior=prior,
-        increment=(a, b, d, x, y),
+        increment=_semidefinite(*increment),
         epoch=epoch,
         running_sum=running_sum,
         heard=heard,
@@ -259,10 +258,15 @@ def passed_increment(record: bytes) -> tuple[int, Five]:
         raise FrameError("not_finite")
     if not _is_semidefinite(a, b, d):
         raise FrameError("covariance")
-    return code, (a, b, d, x, y)
+    return code, _semidefinite(a, b, d, x, y)
 
 
 def _is_semidefinite(a: float, b: float, d: float) -> bool:
     """Tell whether a matrix (xx, xy, yy) is positive semidefinite, but for rounding."""
     slack = 1e-2 * max(abs(a), abs(d)) + 1e-6
     return a >= 0 and d >= 0 and (a + slack) * (d + slack) >= b * b
+
+
+def _semidefinite(a: float, b: float, d: float, x: float, y: float) -> Five:
+    """Return an increment without what rounding leaves: with a negative eigenvalue it would pass all gates."""
+    return (a, b, d, x, y) if b * b <= a * d else (a, math.copysign(math.sqrt(a * d), b), d, x, y)

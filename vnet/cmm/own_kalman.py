@@ -213,7 +213,8 @@ class OwnKalman:
             return None
         before = self.belief
         self._update(off_r, off_a, a, b, d)
-        return self.belief.minus(before)
+        xx, xy, yy, x, y = self.belief.minus(before).numbers
+        return Information((max(xx, 0.0), xy, max(yy, 0.0), x, y))  # along a lane only rounding may be left
 
     def _update(self, off_r: float, off_a: float, a: float, b: float, d: float) -> None:
         """Take a fix that is off by (`off_r`, `off_a`); (a, b, d) is the inverse of the covariance of that."""

@@ -148,6 +148,7 @@ class OwnVehicle:
         """Begin again with this belief about c, and seek the lane again."""
         self._filter = OwnKalman.start(np.zeros(2), 0.0, self._unknown, belief.moments())
         self._is_placed = False
+        self.prior = belief
 
     def _place(self, fix: Observation) -> None:
         """Seek the lanes on which the vehicle may be; without any its fixes say nothing about c."""

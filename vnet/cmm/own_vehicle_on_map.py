@@ -212,4 +212,5 @@ class OwnVehicleOnMap:
         self._hypotheses = RoadHypotheses(mean, covariance, self._config.off_road, self._config.lateral_m)
         self.owed = NOTHING
         self._is_placed = False
+        self.prior = belief
         self._take_moments()

@@ -83,6 +83,14 @@ def test_multipath_is_told_from_c_by_the_bound_that_knows_of_it() -> None:
     assert told < 3
 
 
+def test_along_a_lane_a_fix_never_says_less_than_nothing() -> None:
+    vehicle = _on_a_lane(0.0, LaneModel(common_tau_s=1e6))
+    for fix_m in _fixes(300, 0.0, np.array([2.0, -1.0]), 4):
+        vehicle.predict(0.1)
+        increment = vehicle.take(fix_m, NOISE_M2)
+        assert increment is not None and min(increment.numbers[0], increment.numbers[2]) >= 0
+
+
 def test_a_vehicle_without_a_fix_is_predicted() -> None:
     bound = KalmanBound(np.zeros((2, 2)), np.array([0.0, 1.0]))
     bound.step(0.0, np.array([[1.0, 1.0], [np.nan, np.nan]]), NOISE_M2)
