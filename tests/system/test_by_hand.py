@@ -13,8 +13,8 @@ from tests.support.paths import ROOT
 from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet
 
 SCENARIO = "scenarios/beacon.toml"
-OPTIONS = ["--duration", "2", "--set", "network.vehicles=2"]
-NODES = ["v01", "v02"]
+OPTIONS = ["--duration", "2", "--set", "network.vehicles=4"]
+NODES = ["v01", "v02", "v03", "v04"]
 ROUTER = """
 import sys, zenoh
 with zenoh.open(zenoh.Config.from_file(sys.argv[1])):
@@ -44,7 +44,7 @@ def start_emulator(stack: ExitStack, folder: Path, *options: str) -> tuple[subpr
     stack.callback(emulator.kill)
     assert emulator.stderr is not None
     for line in emulator.stderr:
-        if found := re.search(r"listening at (\S+); waiting for 2 vehicles", line):
+        if found := re.search(r"listening at (\S+); waiting for 4 vehicles", line):
             return emulator, found[1]
     pytest.fail("the emulator ended early")
 
