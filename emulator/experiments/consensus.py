@@ -47,6 +47,8 @@ AFTER = (50, 100, 150)
 TARGET, TARGET_LOSS, TARGET_ROUNDS = 1e-3, 0.3, 150
 ONE_WAY_SHARE, CHURN_SHARE = 0.1, 0.1
 AWAY_S = (6.0, 20.0)
+LEAST_SLOPE = 1e-9
+"""Slope a round up to which an error counts as constant: rounding makes a slope of about 1e-17."""
 FLOOR = 1e-10
 """Smaller relative errors are rounding: the convergence factor is measured above."""
 COLOURS = {
@@ -235,7 +237,7 @@ def measured_factor(error: Array) -> float | None:
     if len(rounds) < 10:
         return None
     slope = float(np.polyfit(rounds, np.log(error[rounds]), 1)[0])
-    return float(np.exp(slope)) if slope < 0 else None
+    return float(np.exp(slope)) if slope < -LEAST_SLOPE else None
 
 
 # The linear model.

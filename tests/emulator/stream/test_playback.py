@@ -280,7 +280,7 @@ def test_tables_that_do_not_fit_together(copied: Path, watched: Watched) -> None
     world = RecordedRun.open(copied).world
     fewer = replace(world, node_ids=world.node_ids[:5], position_m=world.position_m[:5])
     fewer.write(copied / "world.npz")
-    assert "other vehicles" in refused(copied)
+    assert "node 'v06' in trace or events: the states know only 5 others" in refused(copied)
 
 
 def test_a_run_without_a_period_has_a_scene_and_an_end(tmp_path: Path) -> None:
