@@ -52,7 +52,15 @@ def has_same_arithmetic() -> bool:
 def arithmetic() -> str:
     """Return where numpy computes the same bits: on all processors with `AVX2`, or on `this processor`."""
     same = has_same_arithmetic() and "OPENBLAS_CORETYPE" in SAME_ARITHMETIC
-    return "AVX2" if same else "this processor"
+    return "AVX2" if same and _numpy_obeys() else "this processor"
+
+
+def _numpy_obeys() -> bool:
+    """Return whether numpy knows the variables: from 2.4 on, and with OpenBLAS."""
+    import numpy  # heavy
+
+    blas = numpy.show_config(mode="dicts")["Build Dependencies"].get("blas", {})
+    return numpy.lib.NumpyVersion(numpy.__version__) >= "2.4.0" and "openblas" in blas.get("name", "")
 
 
 KEPT_MEMORY = {

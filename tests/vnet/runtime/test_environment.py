@@ -6,9 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.support.paths import ROOT
+from vnet.runtime import environment
 from vnet.runtime.environment import SAME_ARITHMETIC, same_arithmetic
 
 PLAIN = {key: value for key, value in os.environ.items() if key not in {*SAME_ARITHMETIC, "PYTHONHASHSEED"}}
@@ -106,6 +108,25 @@ def test_a_processor_with_avx2_computes_as_all_that_have_it() -> None:
     new, old = same_arithmetic(["sse2", "avx", "fma", "avx2", "avx512f"]), same_arithmetic(["sse2", "avx"])
     assert new["OPENBLAS_CORETYPE"] == "Haswell" and old.items() < new.items()
     assert "OPENBLAS_CORETYPE" not in old, "a kernel for AVX2 would end the process"
+
+
+@pytest.mark.parametrize(
+    ("version", "blas", "expected"),
+    [
+        ("2.4.0", {"name": "scipy-openblas"}, "AVX2"),
+        ("2.3.5", {"name": "scipy-openblas"}, "this processor"),
+        ("2.10.0", {"name": "mkl-sdl"}, "this processor"),
+        ("2.4.0", {}, "this processor"),
+    ],
+)
+def test_a_numpy_that_does_not_know_the_variables_computes_as_its_processor_does(
+    monkeypatch: pytest.MonkeyPatch, version: str, blas: dict[str, str], expected: str
+) -> None:
+    monkeypatch.setattr(environment, "SAME_ARITHMETIC", {"OPENBLAS_CORETYPE": "Haswell"})
+    monkeypatch.setenv("OPENBLAS_CORETYPE", "Haswell")
+    monkeypatch.setattr(np, "__version__", version)
+    monkeypatch.setattr(np, "show_config", lambda mode: {"Build Dependencies": {"blas": blas} if blas else {}})
+    assert environment.arithmetic() == expected
 
 
 @pytest.mark.skipif("OPENBLAS_CORETYPE" not in SAME_ARITHMETIC, reason="this processor has no AVX2")
