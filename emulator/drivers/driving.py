@@ -79,6 +79,11 @@ class Driving:
         if self._world is not None:
             self._world.close()
 
+    def detach(self) -> None:
+        """Let go of it in a process forked from the emulator's, which goes on with it."""
+        if self._world is not None:
+            self._world.detach()
+
     def _tell(self, happened: Iterable[Happening]) -> None:
         for each in happened:
             self._folder.event(each.time_ns, each.kind, self._node_ids[each.number], **each.details)

@@ -13,12 +13,13 @@ import os
 import pickle
 import signal
 import sys
+import threading
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 from msgspec.structs import replace
 
@@ -68,7 +69,10 @@ class _Told(NamedTuple):
 
 
 class ForkedPrograms:
-    """The process of these nodes, at its parent's side. `others` are those that have been forked before."""
+    """The process of these nodes, at its parent's side. Raises VnetError if there can be none.
+
+    `others` are those that have been forked before. In the process `detach` lets go of what only its parent needs.
+    """
 
     def __init__(
         self,
@@ -76,22 +80,26 @@ class ForkedPrograms:
         programs: Programs,
         folder: RunFolder,
         others: Sequence[ForkedPrograms],
+        detach: Callable[[], None],
     ) -> None:
         self._nodes = [welcome.node for welcome in welcomes]
-        self._connection, its = Pipe()
         self.owes = False
         """True while it has been given a turn that it has not answered."""
         self._is_gone = False
         for stream in (sys.stdout, sys.stderr):
             with suppress(AttributeError, OSError, ValueError):  # what is held back would be written twice
                 stream.flush()
-        with warnings.catch_warnings():  # of Python 3.12 about a display's thread, which this does not need
-            warnings.simplefilter("ignore", DeprecationWarning)
-            self._pid = os.fork()
+        try:
+            self._connection, its = Pipe()
+            with warnings.catch_warnings():  # of Python 3.12 about a display's thread, which this does not need
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self._pid = os.fork()
+        except OSError as error:
+            raise VnetError(f"process {len(others) + 1} for programs: {error.strerror}") from None
         if self._pid == 0:
             for connection in (self._connection, *(other._connection for other in others)):
                 connection.close()  # so that each process sees when its other end is gone
-            _be(its, welcomes, programs, folder)
+            _be(its, welcomes, programs, folder, detach)
         its.close()
 
     def give(self, turn: Turn | None) -> None:
@@ -100,6 +108,7 @@ class ForkedPrograms:
         try:
             self._connection.send_bytes(pickle.dumps(None if turn is None else _Told.of(turn)))
         except OSError:
+            self.take()  # an error that it has raised before its first turn
             self._raise_ended()
 
     def take(self) -> Any:
@@ -111,7 +120,7 @@ class ForkedPrograms:
         self.owes = False
         for stream, text in zip((sys.stdout, sys.stderr), said.printed, strict=True):
             if text:
-                stream.write(text)
+                _write(stream, text)
         if isinstance(said.answer, BaseException):
             raise said.answer
         return said.answer
@@ -122,7 +131,10 @@ class ForkedPrograms:
         code = os.waitstatus_to_exitcode(status)
         how = signal.Signals(-code).name if code < 0 else f"status {code}"
         first, last = self._nodes[0], self._nodes[-1]
-        raise VnetError(f"the process of {first} to {last} ended with {how} in the middle of the run") from None
+        raise VnetError(
+            f"the process of {first} to {last} ended with {how} in the middle of the run; "
+            "what its programs printed last is in logs/ only"
+        ) from None
 
     def close(self) -> None:
         """End it, whatever it does."""
@@ -133,11 +145,21 @@ class ForkedPrograms:
             os.waitpid(self._pid, 0)
 
 
+def _write(stream: TextIO, text: str) -> None:
+    """Write what a program has printed, without the characters that the stream has not: the run goes on."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    stream.write(text.encode(encoding, "replace").decode(encoding))
+
+
 # In the process.
 
 
 def _be(
-    connection: Connection, welcomes: Sequence[wire.Welcome], programs: Programs, folder: RunFolder
+    connection: Connection,
+    welcomes: Sequence[wire.Welcome],
+    programs: Programs,
+    folder: RunFolder,
+    detach: Callable[[], None],
 ) -> NoReturn:
     """Be the process of these nodes, to its end."""
     status = 1
@@ -145,6 +167,7 @@ def _be(
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         signal_at_parent_death(signal.SIGKILL)
+        detach()
         gc.freeze()
         _run(connection, welcomes, programs, folder)
         status = 0
@@ -153,7 +176,7 @@ def _be(
 
 
 def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Programs, folder: RunFolder) -> None:
-    printed = _Printed(), _Printed()
+    printed = _Printed(sys.stdout), _Printed(sys.stderr)
     sys.stdout, sys.stderr = printed
 
     def say(answer: wire.Yield | Ended | BaseException) -> None:
@@ -171,22 +194,60 @@ def _run(connection: Connection, welcomes: Sequence[wire.Welcome], programs: Pro
     try:
         hosted = HostedPrograms(welcomes, programs, folder, swap)
         hosted.run()
+        _flush_files()
         say(Ended(hosted.final, hosted.meter.cpu_ns, hosted.meter.wake_ups, hosted.order_steps))
     except BaseException as error:
+        _flush_files()
         say(error if isinstance(error, VnetError) else RuntimeError(error_line(error)))
 
 
-class _Printed(io.TextIOWrapper):
-    """A stream that keeps what is written until it is taken."""
+def _flush_files() -> None:
+    """Write what programs have yet to write to files, as the end of a process does.
 
-    def __init__(self) -> None:
-        self._kept = io.BytesIO()
-        super().__init__(self._kept, encoding="utf-8", errors="replace", write_through=True)
+    Files that were open before the fork are the parent's: `gc.freeze` has put them where they are not found.
+    """
+    for each in gc.get_objects():
+        if type(each) in (io.TextIOWrapper, io.BufferedWriter, io.BufferedRandom):
+            with suppress(OSError, ValueError):  # it is closed, or its disk is full
+                each.flush()
+
+
+class _Printed(io.TextIOWrapper):
+    """A stream that keeps what is written until it is taken, in place of `stream`, whose encoding it has."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._kept = _Kept()
+        encoding = getattr(stream, "encoding", None) or "utf-8"
+        errors = getattr(stream, "errors", None) or "replace"
+        super().__init__(self._kept, encoding=encoding, errors=errors, write_through=True)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the stream, for what other processes write."""
+        return self._stream.fileno()
 
     def take(self) -> str:
         """Return what was written since the last call."""
         self.flush()
-        written = self._kept.getvalue().decode(errors="replace")
-        self._kept.seek(0)
-        self._kept.truncate()
+        return self._kept.take().decode(self.encoding, "replace")
+
+
+class _Kept(io.BytesIO):
+    """The bytes of a stream, which threads may write while they are taken."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lock = threading.RLock()
+
+    def write(self, data: Any, /) -> int:
+        """Keep some more."""
+        with self._lock:
+            return super().write(data)
+
+    def take(self) -> bytes:
+        """Return what was written since the last call."""
+        with self._lock:
+            written = self.getvalue()
+            self.seek(0)
+            self.truncate()
         return written

@@ -129,7 +129,7 @@ class Lockstep:
         """The first grants, to all, at time 0."""
         if self._emulation.next_change_ns() == 0:
             self._act(0)
-        if first := [process_id for process_id, process in self._processes.items() if process.running]:
+        if first := [one.id for one in self._processes.values() if one.running or self._known_wake_ns(one) == 0]:
             self._open_window(0)
             return self._grant(dict.fromkeys(first, 0))
         return self._go_on()  # all are dead or paused
@@ -332,10 +332,10 @@ class Lockstep:
 
     def _known_wake_ns(self, process: _Process) -> int | None:
         """Return when a process runs next without an arrival: at a timer, at a fix, or now if it was woken."""
+        if process.id in self._woken and (self._permanent or process.running):
+            return self.now_ns  # a program may end while all are paused
         if not process.running:
             return None
-        if process.id in self._woken:
-            return self.now_ns
         fixes_ns = [
             self._emulation.fix_time_ns(process.next_fix[node])
             for node in process.waiting_gnss

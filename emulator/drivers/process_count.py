@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from itertools import pairwise
+from operator import index
 from typing import Literal
 
 from vnet.errors import VnetError, shown
@@ -20,10 +21,10 @@ def process_count(asked: Processes | str, vehicles: int) -> int:
     if asked == "auto":
         return max(1, min(_usable_cores(), vehicles // VEHICLES_A_PROCESS))
     try:
-        count = int(asked)
-    except ValueError:
+        count = int(asked) if isinstance(asked, str) else index(asked)
+    except (TypeError, ValueError):
         count = 0
-    if count < 1:
+    if count < 1 or isinstance(asked, bool):
         raise VnetError(f"processes = {shown(asked)}: a whole number from 1, or auto, is expected")
     return min(count, vehicles)
 

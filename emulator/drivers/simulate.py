@@ -238,8 +238,13 @@ class _Apart:
         processes = self._processes
         try:
             for process_id, welcomes in self._welcomes.items():
-                others = list(processes.values())
-                processes[process_id] = ForkedPrograms(welcomes, self._programs, self._emulation.folder, others)
+                processes[process_id] = ForkedPrograms(
+                    welcomes,
+                    self._programs,
+                    self._emulation.folder,
+                    others=list(processes.values()),
+                    detach=self._emulation.driving.detach,
+                )
             self._grant_all()
         except KeyboardInterrupt:
             self._end(self.now_ns)

@@ -163,6 +163,9 @@ class SteppedWorld(World):
     def close(self) -> None:
         """Let go of what moves the vehicles; the run is over."""
 
+    def detach(self) -> None:
+        """Let go of it in a process forked from the emulator's, which goes on with it."""
+
     def _fill(self, period: int) -> None:
         """Take the truth at the start of a period, and what receivers and sensors make of it."""
         position_m, heading_rad = self.vehicles.place()

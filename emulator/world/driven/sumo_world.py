@@ -87,6 +87,10 @@ class SumoWorld(SteppedWorld):
         """End SUMO; the run is over."""
         self._process.close()
 
+    def detach(self) -> None:
+        """Close the pipes of a forked process, without which SUMO would not see the emulator close its own."""
+        self._process.kill()  # in a fork it closes no more than these
+
     def _fill(self, period: int) -> None:
         super()._fill(period)
         self._lights_of[period] = self.vehicles.lights
