@@ -74,9 +74,9 @@ def _network(source: Source) -> Drawing:
     else:
         shown = _draw_links(made, source, scale)
         text = f"{_ground(source)} Lines: {shown}; points: vehicles."
-    if background := positions_by_time(source.recorded.background):
-        _draw_background(made, background[max(background)] * scale)
-        text += " Small grey points: vehicles without programs, where they were last."
+    if len(background_m := _background_m(source)):
+        _draw_background(made, background_m * scale)
+        text += " Small grey points: vehicles without programs, where they were at the end."
     _draw_vehicles(made, position_m * scale)
     if units := source.scenario.roadside:
         made.axes.plot(*(position_m[-len(units) :] * scale).T, **UNIT)
@@ -254,7 +254,8 @@ def _draw_trajectories(made: Canvas, source: Source, scale: float) -> str:
     pieces = np.stack([ways[:, :-1], ways[:, 1:]], axis=2).reshape(-1, 2, 2)
     pieces = pieces[np.isfinite(pieces).all(axis=(1, 2))]
     _draw_lines(made, pieces * scale, SKY, 0.8, 1.4)
-    return f"{len(vehicles):,} of {count:,} vehicles" if len(vehicles) < count else f"{count:,} vehicles"
+    part = f"{len(vehicles):,} of " if len(vehicles) < count else ""
+    return f"{part}{counted(count, 'vehicle')}"
 
 
 def _last_positions(source: Source) -> Array:
@@ -262,6 +263,15 @@ def _last_positions(source: Source) -> Array:
     if not source.recorded.moves:
         return source.recorded.places.position_m(0)
     return np.stack([_last_values(source.recorded.vectors("position_m")[..., axis]) for axis in (0, 1)], axis=1)
+
+
+def _background_m(source: Source) -> Array:
+    """Return where vehicles without programs were in the run's last period (k, 2)."""
+    period_ns = source.recorded.scenario.period_ns
+    last_ns = (source.recorded.closed_ns - 1) // period_ns * period_ns
+    positions_m = positions_by_time(source.recorded.background)
+    ends_ns = [time_ns for time_ns in positions_m if time_ns >= last_ns]
+    return positions_m[ends_ns[-1]] if ends_ns else np.zeros((0, 2))
 
 
 def _last_values(value: Array) -> Array:

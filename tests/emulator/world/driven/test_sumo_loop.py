@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 
@@ -20,7 +21,7 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.records.background_table import BACKGROUND, positions_by_time
 from emulator.records.recorded_run import RecordedRun
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import BACKGROUND_FILE, RunFolder
 from emulator.records.verdicts import Verdict
 from emulator.report.drawing import draw_charts
 from emulator.report.map_figures import map_charts
@@ -108,6 +109,13 @@ def test_programs_drive_their_vehicles_and_the_others_react(tmp_path: Path) -> N
     assert (tmp_path / "closed").read_text() == "closed", "SUMO may write its files"
 
 
+def test_sumo_writes_its_files_in_a_run_in_several_processes(tmp_path: Path) -> None:
+    """It ends when its pipe does, of which forked processes must keep no copy."""
+    plan, program = {"closes": str(tmp_path / "closed")}, {"entry": BRAKES}
+    run_forked(Scenario.model_validate(write_scenario(tmp_path, plan, program=program)))
+    assert (tmp_path / "closed").read_text() == "closed"
+
+
 @pytest.mark.slow
 def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> None:
     """`behind` and `late` have none; `late` comes after a second."""
@@ -123,7 +131,8 @@ def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> Non
     of_late = table.filter(pc.equal(table["vehicle"].cast("string"), "late"))
     assert of_late["time_ns"].to_pylist() == list(range(10**9, 3 * 10**9, 10**8)), "one row a period"
     (drawing, *_), _ = draw_charts(map_charts(Source(tmp_path / "run")))
-    assert "vehicles without programs, where they were last" in drawing.caption
+    assert "the ways of 1 vehicle;" in drawing.caption
+    assert "vehicles without programs, where they were at the end" in drawing.caption
     assert [len(each) for each in positions_by_time(table).values()] == [1] * 10 + [2] * 20
     played = list(messages(tmp_path / "run"))
     watched = [message for stream, message in played if stream == "period"]
@@ -134,6 +143,10 @@ def test_vehicles_without_programs_are_recorded_and_drawn(tmp_path: Path) -> Non
             recorder.take(stream, message)
     drawn = read_back(tmp_path / "recording.rrd")["/map/background"]
     assert_allclose(drawn.array("Points2D:positions", 0.0), [[30.0, -5.0]], err_msg="north is up")
+    gone = table.filter(pc.less(table["time_ns"], 2 * 10**9))
+    pq.write_table(gone, tmp_path / "run" / BACKGROUND_FILE)
+    (drawing, *_), _ = draw_charts(map_charts(Source(tmp_path / "run")))
+    assert "vehicles without programs" not in drawing.caption, "they were not there at the end"
 
 
 def fingerprint(emulation: Emulation) -> tuple[Any, ...]:
