@@ -318,7 +318,7 @@ class Engine:
             if number:
                 self._counts[Outcome(kind)] += number
         if self._csma is not None and self._trace.acknowledges:
-            self._csma.unicasts.note_duplicates(frames, first, outcome, arrival_ns)
+            self._csma.unicasts.note_duplicates(frames, first, outcome, arrival_ns, self._trace)
         flying = np.flatnonzero(outcome == PENDING)
         self._in_flight.add(frames, frame_index[flying], receiver[flying], first + flying, arrival_ns[flying])
 

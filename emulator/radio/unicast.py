@@ -177,13 +177,24 @@ class Unicasts:
             self.counts["attempts"] += attempts
 
     def note_duplicates(
-        self, frames: Sequence[Frame], first_row: int, outcome: NDArray[np.uint8], arrival_ns: IntArray
+        self,
+        frames: Sequence[Frame],
+        first_row: int,
+        outcome: NDArray[np.uint8],
+        arrival_ns: IntArray,
+        trace: Trace,
     ) -> None:
-        """Note the attempts received once more; outcome and arrival (n,) are those of rows from the first on."""
+        """Note the attempts received once more; outcome and arrival (n,) are those of rows from the first on.
+
+        One that would arrive before the attempt received first stays a duplicate: that may still find somebody.
+        """
         for frame in frames:
             index = frame.row - first_row
-            if frame.received_as is not None and outcome[index] == Outcome.duplicate:
-                heappush(self._duplicates, (int(arrival_ns[index]), frame.row, frame.to, frame.received_as))
+            first = frame.received_as
+            if first is None or outcome[index] != Outcome.duplicate:
+                continue
+            if arrival_ns[index] >= trace.rows(np.array([first.row]))["arrival_ns"][0]:
+                heappush(self._duplicates, (int(arrival_ns[index]), frame.row, frame.to, first))
 
     def miss_duplicates(self, time_ns: int, up: Mask, trace: Trace, counts: dict[Outcome, int]) -> None:
         """Change attempts that would arrive by `time_ns` to `receiver_down`, where nobody got the one before.

@@ -1,5 +1,6 @@
 """Frames to single vehicles: every one ends, is delivered once, and keeps to the rules of 802.11p."""
 
+from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
 
@@ -235,21 +236,29 @@ def test_a_vehicle_that_comes_back_between_attempts_receives_the_first_that_find
     assert [result.delivered for result in subject.take_results(10**12)] == [True] and len(arrived) == 1
 
 
+def lose_acknowledgements(subject: Engine) -> Callable[[], None]:
+    """Have nobody receive acknowledgements, until what this returns is called."""
+    csma = subject._csma
+    assert csma is not None
+    judge = csma.judge
+
+    def judge_frames_alone(frame: Frame) -> None:
+        judge(frame)
+        if frame.to == BROADCAST and frame.size_bytes == ACK_BYTES and frame.decoded is not None:
+            frame.decoded[:] = False
+
+    def hear_again() -> None:
+        csma.judge = judge
+
+    csma.judge = judge_frames_alone
+    return hear_again
+
+
 @pytest.mark.parametrize("comes_back", [False, True])
 def test_an_attempt_after_one_that_found_nobody_in_the_end_is_no_duplicate(comes_back: bool) -> None:
     """Its addressee acknowledges it and goes down before it arrives; its sender misses the acknowledgement."""
     subject = engine(line(0, 50), **PHYSICAL)
-    deaf = subject._csma
-    assert deaf is not None
-    judge = deaf.judge
-
-    def lose_acknowledgements(frame: Frame) -> None:
-        judge(frame)
-        if frame.to == BROADCAST and frame.size_bytes == ACK_BYTES and frame.decoded is not None and is_deaf:
-            frame.decoded[:] = False
-
-    is_deaf = True
-    deaf.judge = lose_acknowledgements
+    hear_again = lose_acknowledgements(subject)
     subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
     subject.advance(LATENCY_NS)
     rows = rows_of(subject)
@@ -258,7 +267,7 @@ def test_an_attempt_after_one_that_found_nobody_in_the_end_is_no_duplicate(comes
     arrived = list(subject.advance(LATENCY_NS + 1_000_000))
     if comes_back:
         subject.set_up(1, True)
-        is_deaf = False
+        hear_again()
     arrived += list(subject.advance(1000 * MS))
     outcomes = [row["outcome"] for row in rows_of(subject)]
     assert len(arrived) == outcomes.count("delivered") == int(comes_back)
@@ -268,3 +277,23 @@ def test_an_attempt_after_one_that_found_nobody_in_the_end_is_no_duplicate(comes
         assert set(outcomes) == {"receiver_down"} and len(outcomes) == MOST_ATTEMPTS
     counts = {outcome.name: count for outcome, count in subject.counts.items() if count}
     assert counts == {name: outcomes.count(name) for name in outcomes}
+
+
+@pytest.mark.parametrize("seed", [3, 4, 6])
+def test_what_becomes_of_an_attempt_does_not_depend_on_the_looks_at_the_engine(seed: int) -> None:
+    """With much jitter attempts would arrive before the one that was received first, which finds nobody."""
+
+    def outcomes(stops: Iterable[int]) -> list[str]:
+        subject = engine(line(0, 50), seed, **{**PHYSICAL, "jitter_ms": 20.0})
+        lose_acknowledgements(subject)
+        subject.transmit(0, 0, [bytes(200)], {0: SendOptions(to="v1")})
+        subject.advance(LATENCY_NS - 500_000)
+        subject.set_up(1, False)
+        for stop_ns in stops:
+            subject.advance(stop_ns)
+        subject.drain()
+        return [row["outcome"] for row in rows_of(subject)]
+
+    at_once = outcomes([])
+    assert outcomes(range(LATENCY_NS, 60 * MS, 100_000)) == at_once
+    assert at_once[:2] == ["receiver_down", "duplicate"] and len(at_once) == MOST_ATTEMPTS
