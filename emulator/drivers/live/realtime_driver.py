@@ -14,6 +14,9 @@ from emulator.drivers.realtime import RealTime
 from vnet.transport import wire
 from vnet.transport.backbone import MessageRef, SentMessage
 
+LATE_WAIT_S = 1.0
+"""Seconds for which messages of the backbone are awaited at the end: they and frames come by keys of their own."""
+
 
 class RealTimeDriver(Driver):
     """Sends batches when they are due and takes frames when they come."""
@@ -41,7 +44,8 @@ class RealTimeDriver(Driver):
         if refs := message.traffic.messages:
             self._check_refs(process_id, refs)
             here, missing = self._sent.split(refs)
-            self._late.update(missing)
+            if self.time_ns < self._emulation.duration_ns:  # later ones are sent to nobody
+                self._late.update(missing)
             message = replace(message, traffic=replace(message.traffic, messages=here))
         self._realtime.receive(self.time_ns, process_id, message)
         self._changes.set()
@@ -89,8 +93,11 @@ class RealTimeDriver(Driver):
         """Wait for nobody: time goes on."""
 
     async def finish(self, deadline_s: float) -> None:
-        """Wait for the last acknowledgements, and decide what nobody has acknowledged."""
+        """Wait for the last acknowledgements and late messages, and decide what nobody has acknowledged."""
         while self._is_final_missing() and await self._changes.wait(deadline_s - time.monotonic()):
+            pass
+        deadline_s = min(deadline_s, time.monotonic() + LATE_WAIT_S)
+        while self._late and await self._changes.wait(deadline_s - time.monotonic()):
             pass
         self._realtime.gaps += len(self._late)
         self._realtime.finish()

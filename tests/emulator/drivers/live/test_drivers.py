@@ -457,3 +457,27 @@ def test_in_real_time_a_message_of_the_backbone_may_come_after_its_frames_and_on
         assert gap.details["count"] == 1
 
     in_virtual_time(run(), monkeypatch)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_in_real_time_a_message_of_the_backbone_may_come_after_the_last_frames(
+    ended: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If it was sent when the run was over, nobody misses it."""
+
+    async def run() -> None:
+        play = Play(RealTimeDriver, frames, **UNITS)
+        if ended:
+            await play.driver.run()
+        for node in IDS:
+            refs = [MessageRef(node, 0)] if node == "v03" else []
+            seq = sum(1 for each, _ in play.sent(wire.Batch) if each == node)
+            last = wire.Frames(b"1", seq, seq, [], wire.Traffic(messages=refs), final=True)
+            play.inbox.put_message(node, wire.encode(last))
+        if not ended:
+            content = backbone_keys.encode(Sent(b"1", 0, None, b"x"))
+            asyncio.get_running_loop().call_later(0.1, play.inbox.put_backbone, "v03", content)
+        await play.driver.finish(3600.0)
+        assert play.stage.events("transport_gap", "refused") == []
+
+    in_virtual_time(run(), monkeypatch)
