@@ -149,9 +149,9 @@ class Lockstep:
 
         Raises ProtocolError if it was not owed, speaks for others' nodes, or does not keep to its window.
         """
-        process = self._processes[process_id]
         if self.owed.get(process_id) != message.seq:
             raise ProtocolError(f"yield {message.seq} of {process_id}: expected {self.owed.get(process_id)}")
+        process = self._processes[process_id]
         check_yield(process.nodes, message, process.granted_ns, self._end_ns)
         del self.owed[process_id]
         process.next_timer_ns = message.next_timer_ns

@@ -109,6 +109,21 @@ def test_in_lockstep_a_death_is_told_at_the_barrier_that_the_process_does_not_an
     in_virtual_time(run(), monkeypatch)
 
 
+def test_in_lockstep_a_yield_after_the_death_of_its_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            if node == "v02" and isinstance(message, wire.Grant) and message.time_ns == 200 * MS:
+                play.stage.launcher.dies(play.stage.supervisor, "v02")
+            return yields(node, message)
+
+        play = Play(LockstepDriver, answer)
+        await play.driver.run()
+        assert play.stage.events("died", "refused", "stalled") == [("died", "v02"), ("refused", "v02")]
+        assert [node for node, _ in play.sent(wire.Grant)].count("v04") == 6
+
+    in_virtual_time(run(), monkeypatch)
+
+
 def test_in_lockstep_a_killed_process_is_awaited_before_time_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
         returning: list[str] = []
