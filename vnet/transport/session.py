@@ -10,7 +10,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +43,11 @@ _NO_CONFIGURATIONS = "zenoh::api::session=off"
 def open_router(listen: str, access: Access, lease_ms: int, one_pool: bool = False) -> Iterator[zenoh.Session]:
     """Open a session in router mode that listens at `listen` (e.g. tcp/127.0.0.1:0) with the run's rules.
 
-    With `one_pool` Zenoh's tasks share two threads, if this is the first session of the process.
+    With `one_pool` Zenoh's tasks share two threads, if this is the first session of the process: all later ones
+    have the threads of the first, but no process that this one starts does.
     Raise TransportError if it cannot listen there, or if only one of the endpoint and the users is set up for TLS.
     """
     access.check_endpoint(listen)
-    if one_pool:
-        os.environ.setdefault(RUNTIME_VARIABLE, ROUTER_RUNTIME)
     with tempfile.TemporaryDirectory(prefix="vnet-") as folder:
         dictionary = Path(folder) / "users.txt"
         write_private(dictionary, access.dictionary())
@@ -57,9 +56,23 @@ def open_router(listen: str, access: Access, lease_ms: int, one_pool: bool = Fal
         link = {**_queues(lease_ms), "rx": {"max_message_size": largest_bytes}}
         config["transport"]["link"] = {**config["transport"].get("link", {}), **link}
         config["adminspace"] = {"enabled": True, "permissions": {"read": True, "write": False}}
-        session = _open(config, f"cannot listen on {listen}")
+        with _runtime(ROUTER_RUNTIME) if one_pool else nullcontext():
+            session = _open(config, f"cannot listen on {listen}")
     with _closed_at_end(session):
         yield session
+
+
+@contextmanager
+def _runtime(setting: str) -> Iterator[None]:
+    """Set Zenoh's threads within the block, which opens the first session, unless the user has set them."""
+    if RUNTIME_VARIABLE in os.environ:
+        yield
+        return
+    os.environ[RUNTIME_VARIABLE] = setting
+    try:
+        yield
+    finally:
+        os.environ.pop(RUNTIME_VARIABLE, None)
 
 
 @contextmanager

@@ -65,14 +65,25 @@ def test_only_a_unit_has_rights_on_its_keys_of_the_backbone(user: str, may: bool
             assert set(came) == {own_rx, *[rx] * may}
 
 
-def test_a_router_has_one_pool_of_threads_unless_the_user_has_set_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    access = Access.create("r", [["v01"]])
-    for given, used in ((None, session.ROUTER_RUNTIME), ("(rx:(worker_threads:3))", "(rx:(worker_threads:3))")):
-        monkeypatch.setenv(session.RUNTIME_VARIABLE, given or "")
-        if given is None:
-            monkeypatch.delenv(session.RUNTIME_VARIABLE)
-        with open_router("tcp/127.0.0.1:0", access, LEASE_MS, one_pool=True):
-            assert os.environ[session.RUNTIME_VARIABLE] == used
+@pytest.mark.parametrize("given", [None, "(rx:(worker_threads:3))"])
+def test_a_router_has_one_pool_of_threads_unless_the_user_has_set_another(
+    given: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The setting is not left to what this process starts afterwards."""
+    monkeypatch.setenv(session.RUNTIME_VARIABLE, given or "")
+    if given is None:
+        monkeypatch.delenv(session.RUNTIME_VARIABLE)
+    seen: list[str | None] = []
+
+    def fail(*_: object) -> None:
+        seen.append(os.environ.get(session.RUNTIME_VARIABLE))
+        raise TransportError("not opened")
+
+    monkeypatch.setattr(session, "_open", fail)
+    with pytest.raises(TransportError), open_router("tcp/127.0.0.1:0", Access.create("r", [["v01"]]), 1000, True):
+        pass
+    assert seen == [given or session.ROUTER_RUNTIME]
+    assert os.environ.get(session.RUNTIME_VARIABLE) == given
 
 
 def test_many_that_log_in_at_once_do_not_keep_an_agent_out() -> None:
