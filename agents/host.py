@@ -294,6 +294,7 @@ class _RealTimeAgent:
 
     def _take_overdue(self) -> list[MessageRef]:
         """Return references to messages that have not come for `UNSEEN_NS`, and await them no longer."""
+        self._deliver_messages()  # a program that has computed for long has looked at none
         now_ns = time.monotonic_ns()
         overdue = [ref for ref, since_ns in self._unseen.items() if now_ns - since_ns >= UNSEEN_NS]
         for ref in overdue:

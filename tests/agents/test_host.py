@@ -2,6 +2,7 @@
 
 import asyncio
 import queue
+import time
 from contextlib import ExitStack, nullcontext
 from types import SimpleNamespace
 from typing import Any
@@ -9,10 +10,11 @@ from typing import Any
 import pytest
 
 from agents.attachment import Attachment
-from agents.host import _RealTimeAgent
+from agents.host import UNSEEN_NS, _RealTimeAgent
 from tests.support.multi_loop_driver import emulation_of, scenario_of
 from vnet.errors import TransportError
 from vnet.transport import wire
+from vnet.transport.backbone import MessageRef
 from vnet.transport.send_results import WireSendResult
 
 
@@ -65,7 +67,8 @@ def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
     """Other batches wait until the program asks for them, or for a second."""
     welcome = emulation_of(scenario_of((), "agents.beacon:main", radio={"mac": {}})).welcome("v01", b"n")
     said: list[Any] = []
-    attached: Any = SimpleNamespace(inbox=queue.SimpleQueue(), nonce=b"n", say=said.append, publish=said.append)
+    attached: Any = SimpleNamespace(nonce=b"n", say=said.append, publish=said.append)
+    attached.inbox, attached.units = queue.SimpleQueue(), None
     attached.decode = lambda item: wire.decode_rx(item[0])
 
     async def awaits_a_result() -> None:
@@ -92,3 +95,22 @@ def test_in_real_time_a_result_wakes_the_program_that_awaits_it() -> None:
         assert await sending == (False, 0)
 
     asyncio.run(awaits_a_result())
+
+
+def test_a_message_of_the_backbone_that_has_come_while_the_program_computed_is_not_asked_for_again() -> None:
+    welcome = emulation_of(scenario_of((), "agents.beacon:main")).welcome("v01", b"n")
+    there: list[MessageRef] = []
+    said: list[Any] = []
+
+    def take(refs: list[MessageRef]) -> tuple[list[Any], list[MessageRef]]:
+        return [], [ref for ref in refs if ref not in there]
+
+    attached: Any = SimpleNamespace(nonce=b"n", say=said.append, publish=said.append)
+    attached.units = SimpleNamespace(take=take)
+    agent = _RealTimeAgent(attached, [welcome], {}, None)
+    agent._loop = SimpleNamespace()  # type: ignore[assignment]
+    batch = wire.Batch([], 0, [], messages=[MessageRef("v01", 0), MessageRef("v01", 1)])
+    agent._take(batch, time.monotonic_ns() - UNSEEN_NS)
+    there.append(MessageRef("v01", 0))
+    agent._flush()
+    assert said[0].unseen == [MessageRef("v01", 1)]
