@@ -62,8 +62,8 @@ class RealTime:
         self._packets: dict[str, list[Delivery]] = {}
         self._fixes: dict[str, list[wire.WireFix]] = {}
         self._news = NewsFeed(emulation)
-        self._shown: dict[tuple[str, int], WireMessage] = {}
-        """Messages of the backbone that went out within `KEPT_NS`, by unit and number: they may have to again."""
+        self._shown: dict[tuple[str, int], tuple[int, WireMessage]] = {}
+        """Messages of the backbone that went out within `KEPT_NS`, and when, by unit and number."""
         self._clocks: dict[str, list[wire.ClockError]] = {process_id: [] for process_id in self._nodes}
         self._lost: dict[str, list[tuple[int, int]]] = {process_id: [] for process_id in self._nodes}
         """First and last of the ranges of frames that have not come, and of which their process is to know."""
@@ -130,9 +130,9 @@ class RealTime:
         waiting = self._unacknowledged[process_id]
         if message.unseen:
             self.gaps += 1
-            unseen = [self._shown.get((ref.node, ref.number)) for ref in message.unseen]
             own = self._nodes[process_id]
-            self._news.repeat(item for item in unseen if item is not None and item.node in own)
+            unseen = [(ref.node, ref.number) for ref in message.unseen if ref.node in own]
+            self._news.repeat(self._shown[key][1] for key in unseen if key in self._shown)
         for first, last in message.missed:
             self.gaps += 1
             for seq in [seq for seq in waiting if first <= seq <= last]:
@@ -231,9 +231,9 @@ class RealTime:
         busy = self._emulation.busy.of(tuple(self._nodes[process_id]), self._collected_ns, self._collected_ns + 1)
         results, messages = self._news.take(self._nodes[process_id])
         for message in messages:
-            self._shown[message.node, message.number] = message
-        while self._shown and (first := next(iter(self._shown.values()))).time_ns < self._collected_ns - KEPT_NS:
-            del self._shown[first.node, first.number]
+            self._shown[message.node, message.number] = self._collected_ns, message
+        while self._shown and (first := next(iter(self._shown.items())))[1][0] < self._collected_ns - KEPT_NS:
+            del self._shown[first[0]]
         self._unacknowledged[process_id][seq] = _Sent(deliveries, [*results, *messages], lost)
         return wire.Batch(fixes, seq, packets, origin_ns, start_ns, held, clocks, busy, results, messages, lost)
 

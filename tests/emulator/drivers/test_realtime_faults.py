@@ -28,6 +28,14 @@ def started(*faults: dict[str, Any]) -> tuple[RealTime, Emulation]:
     return realtime, emulation
 
 
+def with_units() -> RealTime:
+    units = [{"position_m": [0.0, 0.0]}, {"position_m": [10.0, 0.0]}]
+    plan = Scenario.model_validate({"run": {"pacing": "realtime"}, "network": {"vehicles": 1}, "roadside": units})
+    realtime = RealTime(emulation_of(plan), [["v01"], ["rsu01"], ["rsu02"]])
+    realtime.start(0)
+    return realtime
+
+
 def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
     plan = scenario_of((), "agents.beacon:main", run={"pacing": "realtime"}, radio={"mac": {}})
     realtime = RealTime(emulation_of(plan), [[node] for node in IDS])
@@ -44,10 +52,7 @@ def test_a_result_in_a_batch_that_was_missed_goes_out_again() -> None:
 
 
 def test_a_message_of_the_backbone_in_a_batch_that_was_missed_goes_out_again() -> None:
-    units = [{"position_m": [0.0, 0.0]}, {"position_m": [10.0, 0.0]}]
-    plan = Scenario.model_validate({"run": {"pacing": "realtime"}, "network": {"vehicles": 1}, "roadside": units})
-    realtime = RealTime(emulation_of(plan), [["v01"], ["rsu01"], ["rsu02"]])
-    realtime.start(0)
+    realtime = with_units()
     traffic = wire.Traffic(messages=[SentMessage("rsu01", 0, None, b"x")])
     realtime.receive(10 * MS, "rsu01", wire.Frames(b"n", 0, 1, [], traffic))
     batch = realtime.due(20 * MS)["rsu02"]
@@ -62,6 +67,20 @@ def test_a_message_of_the_backbone_in_a_batch_that_was_missed_goes_out_again() -
     realtime.receive(40 * MS, "rsu02", answer)
     assert realtime.due(41 * MS)["rsu02"].messages == [message]
     assert realtime.gaps == 2
+
+
+def test_an_old_message_of_the_backbone_goes_out_again_to_a_process_that_was_paused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is kept from when it went out, and not from when it came."""
+    monkeypatch.setattr("emulator.drivers.realtime.KEPT_NS", 10 * MS)
+    realtime = with_units()
+    traffic = wire.Traffic(messages=[SentMessage("rsu01", 0, None, b"x")])
+    realtime.receive(10 * MS, "rsu01", wire.Frames(b"n", 0, 1, [], traffic))
+    batch = realtime.due(50 * MS)["rsu02"]
+    unseen = [MessageRef("rsu02", batch.messages[0].number)]
+    realtime.receive(51 * MS, "rsu02", wire.Frames(b"n", 0, batch.seq + 1, [], wire.Traffic(), unseen=unseen))
+    assert realtime.due(52 * MS)["rsu02"].messages == batch.messages
 
 
 def test_a_process_is_told_of_frames_that_were_lost_until_it_has_taken_that() -> None:
