@@ -104,6 +104,8 @@ class Launcher:
         """Folder of the disks of vehicles, if agents are to have them in one place."""
         self.debug: DebugPoint | None = None
         """The debugger of a vehicle, and where its user answers."""
+        self.agent_environment: Mapping[str, str] = AGENT_ENVIRONMENT
+        """The environment of agents that are not forked, beside this process's own."""
         self._folders = folders
         self._zygote = zygote
         self._patience_s = patience_s
@@ -136,7 +138,7 @@ class Launcher:
             return
         for name, arguments in agents.items():
             command = ["-P", "-m", "agents.cli", *arguments]
-            self.start(name, command, access.credentials(node_user(name)), AGENT_ENVIRONMENT)
+            self.start(name, command, access.credentials(node_user(name)), self.agent_environment)
             self._lower_priority(name, nice)
 
     def _agent_arguments(self, endpoint: str, run: str, nodes: Sequence[str]) -> list[str]:

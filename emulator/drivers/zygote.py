@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
 
@@ -25,7 +25,7 @@ from vnet.runtime import forking
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.scheduling import default_time_slice
-from vnet.transport.session import AGENT_RUNTIME, RUNTIME_VARIABLE
+from vnet.transport.session import AGENT_RUNTIME, LOCKSTEP_AGENT_RUNTIME, RUNTIME_VARIABLE
 
 AGENT_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
@@ -33,6 +33,8 @@ AGENT_ENVIRONMENT = {
     "PYTHONUNBUFFERED": "1",
     **KEPT_MEMORY,
 }
+LOCKSTEP_ENVIRONMENT = {**AGENT_ENVIRONMENT, RUNTIME_VARIABLE: LOCKSTEP_AGENT_RUNTIME}
+"""The environment of agents in lockstep, forked or spawned."""
 START_TIMEOUT_S = 60.0
 """Seconds for the zygote to import its modules, or to answer: long enough for a loaded machine."""
 ROOM_FOR_ARGUMENTS = 300
@@ -142,11 +144,11 @@ _subreaper = _Subreaper()
 class Zygote:
     """The process from which agents are forked. `modules` are imported there, if they are vnet's own programs.
 
-    `runtime` is the setting of Zenoh's threads in agents.
+    `environment` is that of agents, beside this process's own.
     """
 
-    def __init__(self, modules: Sequence[str], runtime: str = AGENT_RUNTIME) -> None:
-        self._environment = {**AGENT_ENVIRONMENT, RUNTIME_VARIABLE: runtime}
+    def __init__(self, modules: Sequence[str], environment: Mapping[str, str] = AGENT_ENVIRONMENT) -> None:
+        self._environment = environment
         self._modules = [module for module in modules if module.partition(".")[0] == "agents"]
         self._process: subprocess.Popen[bytes] | None = None
         self._ready = False

@@ -12,7 +12,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 
 import zenoh
@@ -37,13 +37,12 @@ from emulator.drivers.live.waiting import ChangeSignal, Stalled
 from emulator.drivers.memory import MemoryWatch
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
-from emulator.drivers.zygote import Zygote
+from emulator.drivers.zygote import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Zygote
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.transport import wire
 from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
-from vnet.transport.session import AGENT_RUNTIME, LOCKSTEP_AGENT_RUNTIME
 
 LEASE_MS = 60_000
 """Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
@@ -75,6 +74,7 @@ async def run_live(
         zygote = _zygote(emulation.scenario) if options.launch and not options.access.hosts else None
         scenario = emulation.scenario
         launcher = Launcher(emulation.folder.logs, scenario.program.folders, zygote, scenario.run.join_timeout_s)
+        launcher.agent_environment = _agent_environment(scenario)
         stack.callback(launcher.stop)
         if emulation.scenario.run.pacing == "realtime":
             set_time_slice(PROMPT_SLICE_NS)
@@ -98,8 +98,11 @@ def _zygote(scenario: Scenario) -> Zygote | None:
     """The process from which agents are forked, if they are to be, and this system can."""
     if scenario.run.start == "spawn" or sys.platform != "linux":
         return None
-    runtime = LOCKSTEP_AGENT_RUNTIME if scenario.run.pacing == "lockstep" else AGENT_RUNTIME
-    return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)], runtime)
+    return Zygote([entry.partition(":")[0] for entry in entries_of(scenario)], _agent_environment(scenario))
+
+
+def _agent_environment(scenario: Scenario) -> Mapping[str, str]:
+    return LOCKSTEP_ENVIRONMENT if scenario.run.pacing == "lockstep" else AGENT_ENVIRONMENT
 
 
 def _lease_ms(scenario: Scenario) -> int:
