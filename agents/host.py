@@ -27,7 +27,7 @@ from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import lateness, wire
 from vnet.transport.backbone import MessageRef
 from vnet.transport.credentials import Credentials
-from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, never_preempt, set_time_slice
 from vnet.transport.send_results import WireSendResult
 from vnet.transport.session import open_client
 
@@ -77,6 +77,7 @@ def run_agent(
         attachment.open_units(session, run, [each.node for each in welcomes if each.unit is not None], stack)
         attachment.say_hello(ready=True)
         if welcomes[0].pacing == "lockstep":
+            never_preempt()
             _run_lockstep(attachment, welcomes, programs, disks, debugger)
         else:
             _run_realtime(attachment, welcomes, programs, disks)

@@ -98,6 +98,8 @@ class Course:
         self._phase = "starting"
         self._missing: tuple[str, ...] = ()
         self._figures: dict[str, float | None] = dict.fromkeys(FIGURES)
+        self._periods = 0
+        """Number of the periods whose figures are in `_over_time`."""
         self._over_time = {name: _Series(emulation.duration_ns) for name in FIGURES}
         self._speed: deque[tuple[float, int]] = deque()  # wall clock in s, emulated ns
         self._counts: deque[tuple[int, dict[Outcome, int]]] = deque([(0, dict(emulation.engine.counts))])
@@ -123,9 +125,17 @@ class Course:
         self._counts.append((end_ns, dict(self._emulation.engine.counts)))
         while len(self._counts) > 2 and self._counts[1][0] <= end_ns - RATES_OVER_S * NS_PER_S:
             self._counts.popleft()
-        self._figures = {name: getattr(view.figures, name) for name in FIGURES}
-        for name, series in self._over_time.items():
-            series.add(end_ns, self._figures[name])
+
+    def _take_figures(self) -> None:
+        """Take the figures of the periods since the last call: many at once cost little more than one."""
+        emulation = self._emulation
+        rows = emulation.metrics.rows
+        for row in rows[self._periods :]:
+            self._figures = {name: getattr(row, name) for name in FIGURES}
+            end_ns = min((row.period + 1) * emulation.world.period_ns, emulation.duration_ns)
+            for name, series in self._over_time.items():
+                series.add(end_ns, self._figures[name])
+        self._periods = len(rows)
 
     @property
     def wall_s(self) -> float:
@@ -138,6 +148,7 @@ class Course:
 
     def snapshot(self, now_ns: int | None = None) -> Snapshot:
         """Status of the run at this emulated instant, or at the end of its last period."""
+        self._take_figures()
         emulation = self._emulation
         run = emulation.scenario.run
         factor = self._real_time_factor()

@@ -1,8 +1,10 @@
-"""Time slices of a run's threads in the Linux scheduler.
+"""Scheduling of a run's threads by Linux: who may preempt whom.
 
-Threads that pass messages on have little work but must run at once; programs compute for milliseconds, many on one
-processor. Since Linux 6.12 a thread with a short time slice preempts those with longer ones as soon as it wakes
-(EEVDF: `sched_runtime` of sched_setattr(2), without privileges). On other systems these functions do nothing.
+In real time, threads that pass messages on have little work but must run at once; programs compute for
+milliseconds, many on one processor. Since Linux 6.12 a thread with a short time slice preempts those with longer
+ones as soon as it wakes (EEVDF: `sched_runtime` of sched_setattr(2), without privileges). In lockstep nobody waits
+for the wall clock: a thread that is not preempted finds its caches as it left them. On other systems these
+functions do nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ import platform
 import struct
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 PROMPT_SLICE_NS = 100_000
 """Time slice of threads that pass messages on: the least that Linux accepts."""
@@ -52,3 +55,38 @@ def default_time_slice() -> Iterator[None]:
         yield
     finally:
         set_time_slice(former_ns)
+
+
+def never_preempt() -> list[int]:
+    """Have no thread of this process, nor those that they will start, preempt others as it wakes (SCHED_BATCH).
+
+    Returns the ids of the threads whose policy this has changed. See sched(7).
+    """
+    changed: list[int] = []
+    if not hasattr(os, "SCHED_BATCH"):
+        return changed
+    with suppress(OSError):
+        for thread in [int(path.name) for path in Path("/proc/self/task").iterdir()]:
+            if _set_policy(thread, os.SCHED_OTHER, os.SCHED_BATCH):
+                changed.append(thread)
+    return changed
+
+
+@contextmanager
+def preempting_nobody() -> Iterator[None]:
+    """Have no thread of this process preempt others within the context, as `never_preempt` does."""
+    changed = never_preempt()
+    try:
+        yield
+    finally:
+        for thread in changed:
+            _set_policy(thread, os.SCHED_BATCH, os.SCHED_OTHER)
+
+
+def _set_policy(thread: int, former: int, policy: int) -> bool:
+    """Change the policy of a thread, if it is `former`; return whether it was, and the thread is still there."""
+    with suppress(OSError):
+        if os.sched_getscheduler(thread) == former:
+            os.sched_setscheduler(thread, policy, os.sched_param(0))
+            return True
+    return False

@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 
 import zenoh
 
@@ -42,7 +42,7 @@ from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from vnet.errors import VnetError
 from vnet.transport import wire
-from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.scheduling import DEFAULT_SLICE, PROMPT_SLICE_NS, preempting_nobody, set_time_slice
 
 LEASE_MS = 60_000
 """Milliseconds. Long: a starved machine must not look like a dead one, and a closed connection is seen at once."""
@@ -125,6 +125,7 @@ class LiveSession:
         realtime = emulation.scenario.run.pacing == "realtime"
         later = [node for node, up in emulation.up.items() if not up]
         self._emulation = emulation
+        self._in_lockstep = not realtime
         self._options = options
         self._launcher = launcher
         self._before_horizon = before_horizon
@@ -239,7 +240,8 @@ class LiveSession:
             started_s = time.monotonic()
             self._feed.begin()
             self._driver = self._make_driver(processes)
-            await self._driver.run()
+            with preempting_nobody() if self._in_lockstep else nullcontext():
+                await self._driver.run()
             completed = True
         except Stalled:
             self._emulation.finish(self._time_ns())
@@ -279,7 +281,7 @@ class LiveSession:
             changes=self._changes,
             debugged=None if self._options.debug is None else self._options.debug.node,
         )
-        if self._emulation.scenario.run.pacing == "lockstep":
+        if self._in_lockstep:
             return LockstepDriver(parts, processes, self._before_horizon)
         return RealTimeDriver(parts, processes)
 

@@ -1,4 +1,4 @@
-"""Time slices: what is asked for is set, and nothing else of a thread changes."""
+"""Scheduling: what is asked for is set, and nothing else of a thread changes."""
 
 import os
 import threading
@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from vnet.transport import scheduling
-from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, set_time_slice
+from vnet.transport.scheduling import COMPUTING_SLICE_NS, PROMPT_SLICE_NS, preempting_nobody, set_time_slice
 
 
 def in_a_thread(what: list[object], nice: int) -> None:
@@ -45,3 +45,40 @@ def test_what_is_started_meanwhile_has_the_default() -> None:
 def test_elsewhere_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("platform.machine", lambda: "abacus")
     assert not set_time_slice(PROMPT_SLICE_NS)
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="a policy of Linux")
+def test_no_thread_preempts_others_meanwhile_not_even_those_started_then() -> None:
+    before = os.sched_getscheduler(0)
+    seen: list[int] = []
+    ask, end = threading.Event(), threading.Event()
+
+    def earlier() -> None:
+        ask.wait()
+        seen.append(os.sched_getscheduler(0))
+        end.wait()
+        seen.append(os.sched_getscheduler(0))
+
+    thread = threading.Thread(target=earlier)
+    thread.start()
+    with preempting_nobody():
+        later = threading.Thread(target=lambda: seen.append(os.sched_getscheduler(0)))
+        later.start()
+        later.join()
+        ask.set()
+        while len(seen) < 2:
+            os.sched_yield()
+        assert seen == [os.SCHED_BATCH, os.SCHED_BATCH]
+        assert os.sched_getscheduler(0) == os.SCHED_BATCH
+    end.set()
+    thread.join()
+    assert seen[2] == before == os.sched_getscheduler(0)
+
+
+def test_a_policy_of_the_users_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("os.sched_getscheduler", lambda thread: os.SCHED_IDLE)
+    monkeypatch.setattr("os.sched_setscheduler", lambda thread, policy, param: asked.append(policy))
+    with preempting_nobody():
+        pass
+    assert asked == []
