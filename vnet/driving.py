@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 
 from vnet.errors import shown
+from vnet.numbers import number_or_nan
 
 LARGEST_M_S2 = 1e6
 """Largest acceleration that can be asked for; what vehicles can do is far below it."""
@@ -38,17 +39,16 @@ def checked_action(
         raise ValueError('drive(…): programs drive only with [network] kind = "driven", or with step = true')
     asked = acceleration_m_s2
     if asked is not None:
-        try:
-            asked = float(asked)
-        except (TypeError, ValueError):
-            asked = math.nan
+        asked = number_or_nan(asked)
         if not abs(asked) <= LARGEST_M_S2:
             text = f"a finite number within ±{LARGEST_M_S2:g} is needed"
             raise ValueError(f"drive(acceleration_m_s2={shown(acceleration_m_s2)}): {text}")
     if lane not in (-1, 0, 1):
         raise ValueError(f"drive(lane={shown(lane)}): allowed are -1 (right), 1 (left) and 0 (stay)")
+    if not isinstance(release, bool):
+        raise ValueError(f"drive(release={shown(release)}): True or False is needed")
     if asked is not None and release:
         raise ValueError("drive(…, release=True): gives the speed back, and takes no acceleration_m_s2")
     if asked is None and lane == 0 and not release:
         raise ValueError("drive(): give acceleration_m_s2, lane or both")
-    return Action(node, asked, int(lane), bool(release))
+    return Action(node, asked, int(lane), release)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -11,6 +10,7 @@ from msgspec import Struct
 
 from vnet.errors import PayloadTooLargeError, shown
 from vnet.mailbox import Mailbox
+from vnet.numbers import number_or_nan
 from vnet.payload import checked_payload
 
 
@@ -80,14 +80,6 @@ MIN_POWER_DBM = -100.0
 """Least transmit power that a frame can have."""
 NO_ABILITIES = RadioAbilities()
 """A radio with which nothing can be chosen."""
-
-
-def _number(value: float) -> float:
-    """Return a number as a float; NaN for what is none."""
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        return math.nan
 
 
 def _can_be_name(to: object) -> bool:
@@ -194,7 +186,7 @@ class Radio:
             raise ValueError(
                 f"{call}(power_dbm={shown(power_dbm)}): only with [radio.path_loss] a frame has a power"
             )
-        number = _number(power_dbm)
+        number = number_or_nan(power_dbm)
         if not MIN_POWER_DBM <= number <= self.max_power_dbm:
             text = f"{MIN_POWER_DBM:g} to {self.max_power_dbm:g} dBm; radio.path_loss.tx_power_dbm is the largest"
             raise ValueError(f"{call}(power_dbm={shown(power_dbm)}): allowed are {text}")
@@ -207,7 +199,7 @@ class Radio:
         if not self.rates_mbps:
             text = "only with [radio.path_loss] or [radio.mac] a frame has a rate of its own"
             raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): {text}")
-        number = _number(rate_mbps)
+        number = number_or_nan(rate_mbps)
         if number not in self.rates_mbps:
             rates = ", ".join(f"{rate:g}" for rate in self.rates_mbps)
             raise ValueError(f"{call}(rate_mbps={shown(rate_mbps)}): 802.11p has {rates}")

@@ -42,7 +42,7 @@ def check_conservation(recorded: RecordedRun) -> Finding:
     broken: dict[str, Mask] = {
         "repeated": _repeated(recorded),
         "wrong_count": _in_frames_of_wrong_size(recorded),
-        "not_in_range": recorded.placed & (recorded.in_range == _sent_beyond_range(recorded)),
+        "not_in_range": recorded.placed & (recorded.in_range == _sent_beyond_range(recorded)) & ~_unsent(recorded),
         "undecided": ~(recorded.outcome_is(*IN_TRACE) | _sent_beyond_range(recorded)),
         "orphans": _orphans(recorded),
         "disordered": _out_of_order(recorded),
@@ -71,6 +71,11 @@ def check_conservation(recorded: RecordedRun) -> Finding:
 def _sent_beyond_range(recorded: RecordedRun) -> Mask:
     """Rows of frames to single vehicles that were out of range."""
     return np.asarray((recorded.attempt > 0) & recorded.outcome_is("out_of_range"))
+
+
+def _unsent(recorded: RecordedRun) -> Mask:
+    """Rows of frames to single vehicles that never left their sender, whether or not the addressee was in range."""
+    return np.asarray((recorded.attempt > 0) & recorded.never_sent)
 
 
 def _repeated(recorded: RecordedRun) -> Mask:

@@ -14,7 +14,6 @@ from emulator.checks.channel import nothing_seen, received_twice
 from emulator.radio.csma import edca_parameters
 from emulator.radio.dot11p import DETECTION_NS, SIFS_NS, arrival_probability
 from emulator.radio.medium import WINDOW_NS
-from emulator.radio.outcomes import Stage, decided_at
 from emulator.radio.reception import Threshold, milliwatts
 from emulator.radio.unicast import MOST_ATTEMPTS, ack_airtime_ns
 from emulator.records.distributions import chi2_sf
@@ -33,7 +32,6 @@ TELLING_VARIANCE = 5.0
 """Least variance of the number of faded receptions on a link: with less, a sum is not yet normal."""
 GRID_DB = 0.25
 FACTORS = 1024
-NEVER_SENT = decided_at(Stage.SENDER)
 LEAST_PAUSE_NS = 25_000_000
 ROUNDING = 1e-6
 
@@ -218,8 +216,7 @@ def _mistimed(recorded: RecordedRun) -> NDArray[np.intp]:
     began = recorded.on_air_ns >= 0
     end_ns = np.where(began, recorded.on_air_ns + recorded.airtime_ns, recorded.sent_ns)
     left_ns = recorded.column("left_ns")
-    never = recorded.outcome_is(*NEVER_SENT) | recorded.dropped_by_sender
-    wrong = (began == never) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
+    wrong = (began == recorded.never_sent) | (began & (left_ns != end_ns)) | (left_ns < end_ns)
     wrong |= began & (recorded.on_air_ns < recorded.sent_ns)
     for planned in recorded.plan:
         if isinstance(planned.fault, Throttle):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from emulator.learning.episode import ENTRY, Act, Behaviour, Ends, Observe, Reward
 from emulator.scenario.source import Source, hinting, scenario_of
-from vnet.errors import VnetError
+from vnet.errors import VnetError, shown
 
 if TYPE_CHECKING:
     from gymnasium.spaces import Space
@@ -45,11 +45,25 @@ def environment(
     `rl` is not installed.
     """
     try:
+        from gymnasium import spaces
+
         from emulator.learning.vehicle_environment import VehicleEnvironment
     except ModuleNotFoundError as error:
         if error.name not in ("pettingzoo", "gymnasium"):
             raise
         raise VnetError(f"environment: {error.name} is not installed: pip install 'vnet-emulator[rl]'") from None
+    for name, given in {"observe": observe, "act": act, "reward": reward}.items():
+        _check(name, given, callable(given), "a function is needed")
+    for name, space in {"observation_space": observation_space, "action_space": action_space}.items():
+        _check(
+            name, space, callable(space) or isinstance(space, spaces.Space), "a space of gymnasium, or a function"
+        )
     loaded = scenario_of(scenario, {**(set or {}), "program.entry": ENTRY, "run.pacing": "lockstep"})
     say = Behaviour(observe, act, reward, terminated or (lambda agent, moment: False))
     return VehicleEnvironment(loaded, say, observation_space, action_space, None if out is None else Path(out))
+
+
+def _check(name: str, given: object, is_right: bool, needed: str) -> None:
+    """Raise VnetError unless an argument is of the kind that is needed."""
+    if not is_right:
+        raise VnetError(f"environment: {name} = {shown(given)}: {needed}")

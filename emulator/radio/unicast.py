@@ -269,4 +269,5 @@ def address_all(frames: Sequence[Frame], receptions: Receptions, mac: SharedMedi
             is_up = frame.to == BROADCAST or mac.is_up(frame.to)
             address(frame, outcome, mac.medium.locked(frame), cause, is_up)
         elif frame.attempt:
-            outcome[np.arange(len(outcome)) != frame.to] = Outcome.out_of_range.value
+            outcome[:] = Outcome.out_of_range.value
+            outcome[frame.to] = frame.sender_outcome.value  # also if its addressee is out of range: it was not sent

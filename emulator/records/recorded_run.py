@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from emulator.faults.plan import FaultPlan, PlannedFault, swizzle_times_ns
 from emulator.faults.selectors import Nodes
+from emulator.radio.outcomes import Stage, decided_at
 from emulator.records.recorded_tables import ARRIVED, ON_AIR, RecordedTables
 from emulator.records.run_files import Columns, RunFiles
 from emulator.records.run_folder import Event
@@ -233,6 +234,11 @@ class RecordedRun(RecordedTables):
     def dropped_by_sender(self) -> Mask:
         """Mask of the rows of frames that a rule at their sender dropped: they were never enqueued."""
         return np.asarray(self.outcome_is("fault") & self.caused_by("custom_sender"))
+
+    @cached_property
+    def never_sent(self) -> Mask:
+        """Mask of the rows of frames that never left their sender."""
+        return np.asarray(self.outcome_is(*decided_at(Stage.SENDER)) | self.dropped_by_sender)
 
     @cached_property
     def last_heal_ns(self) -> int:

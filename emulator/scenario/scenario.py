@@ -227,6 +227,15 @@ class Scenario(Section):
         return self
 
     @model_validator(mode="after")
+    def _powers_of_units_are_modelled(self) -> Scenario:
+        powers = [number for number, unit in enumerate(self.roadside) if unit.tx_power_dbm is not None]
+        if powers and self.radio.path_loss is None:
+            raise ValueError(
+                f"roadside.{powers[0]}.tx_power_dbm goes with radio.path_loss: without it no radio has a power"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _buildings_are_in_a_file(self) -> Scenario:
         buildings = self.radio.buildings
         if buildings is not None and buildings.path is None and self.map is None:

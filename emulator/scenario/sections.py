@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, get_args
 
@@ -33,6 +34,10 @@ WORDS = {
 """Words for what is allowed where a value is of a wrong type or out of bounds, by pydantic's type of error."""
 
 
+_ALTERNATIVE = re.compile(r"constrained-\w+|(function-[\w-]+|tuple|list|dict|union)\[.*")
+"""Names of pydantic's for one of several types that a key's value may have; they are no part of the key."""
+
+
 class Section(BaseModel):
     """Common behaviour of all sections: immutable, and no key is ignored silently.
 
@@ -52,6 +57,8 @@ def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]
     # A key that is misspelt is unknown, and the one that was meant may be missing.
     problem = next((each for each in problems if each["type"] == "extra_forbidden"), problems[0])
     path = problem["loc"]
+    if problem["type"] != "extra_forbidden":
+        path = tuple(part for part in path if not _ALTERNATIVE.fullmatch(str(part)))
     key = printable(".".join(str(part) for part in path) or "it")
     before = f"{key}: " if path else ""
     if problem["type"] == "extra_forbidden":
@@ -66,9 +73,14 @@ def first_problem(error: ValidationError, of: type[BaseModel] | TypeAdapter[Any]
     message = _worded(problem)
     if problem["type"] == "missing":
         return f"{key}: {message}"
-    if isinstance(problem["input"], dict):  # a whole section is wrong, or is not a section's kind of value
+    if _is_long(problem["input"]):  # a whole section is wrong, or is not a section's kind of value
         return f"{key}: {message}" if path else message
     return f"{key} = {shown(problem['input'])}: {message}"
+
+
+def _is_long(given: Any) -> bool:
+    """Return whether a value is a section, or a list of them: too long for a line."""
+    return isinstance(given, dict) or (isinstance(given, (list, tuple)) and any(isinstance(x, dict) for x in given))
 
 
 def _worded(problem: ErrorDetails) -> str:

@@ -127,9 +127,9 @@ def _read_row(
             )
     if ends[0] == ends[1]:
         raise ScenarioError(f"{path}: line {line}: {shown(ends[0])} to itself: two vehicles are needed")
-    loss = np.nan
-    if (row["loss"] or "").strip():
-        loss = _probability(path, line, row["loss"] or "")
+    if row["loss"] is None:
+        raise ScenarioError(f"{path}: line {line}: ends before its loss; {len(COLUMNS)} cells are needed")
+    loss = _probability(path, line, row["loss"]) if row["loss"].strip() else np.nan
     return round(time_s * NS_PER_S), number[ends[0]], number[ends[1]], loss
 
 

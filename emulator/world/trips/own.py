@@ -34,7 +34,7 @@ def own_samples(network: Network, program: Program, duration_s: float) -> Sample
     function = load_function("network.kind", network.function, program, USAGE)
     try:
         answer = function(network.seed, network.vehicles, duration_s)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         where = line_of(outside(error, __file__))
         raise ScenarioError(f"{problem}: {in_words(error)}{f' ({where})' if where else ''}") from error
     if not isinstance(answer, Mapping) or not answer:

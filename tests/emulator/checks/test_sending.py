@@ -1,5 +1,6 @@
 """The checks judge frames to single vehicles, also beside broadcasts and under faults."""
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,28 @@ def run_of(folder: Path, **sections: Any) -> RecordedRun:
     for name in ("conservation", "medium", "latency", "isolation"):
         assert found[name] == "valid", (name, found)
     return RecordedRun.open(folder)
+
+
+async def sends_at_once(node: Node) -> None:
+    """v01 sends four frames at one instant to a vehicle that is out of its range; both broadcast."""
+    if node.id == "v01":
+        results = await asyncio.gather(*(node.radio.send("v02", bytes(100)) for _ in range(4)))
+        node.report(attempts=[result.attempts for result in results])
+    async for _ in node.gnss:
+        await node.radio.broadcast(b"here")
+
+
+def test_a_frame_that_a_full_queue_drops_was_not_sent_though_its_addressee_is_out_of_range(tmp_path: Path) -> None:
+    scenario = {
+        "run": {"duration_s": 1.0, "settle_s": 0.0},
+        "network": {"kind": "driven", "vehicles": 2, "driven": {"start_m": [4900, 100], "speed_mps": 0}},
+        "radio": {"queue_frames": 1, "path_loss": {"kind": "log_distance", "exponent": 3.0}, "mac": {}},
+    }
+    result = emulator.simulate(scenario, program=sends_at_once, out=tmp_path / "run")
+    assert result.verdict == "valid", result.checks
+    rows = [row for row in result.trace.to_pylist() if row["attempt"]]
+    assert [row["outcome"] for row in rows if row["seq"]] == ["queue_full"] * 3
+    assert {row["outcome"] for row in rows if not row["seq"]} == {"out_of_range"}
 
 
 @pytest.mark.slow

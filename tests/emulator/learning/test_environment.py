@@ -213,6 +213,22 @@ def test_a_seed_that_no_scenario_can_have_is_refused(seed: Any) -> None:
     env.close()
 
 
+@pytest.mark.parametrize("name", ["observe", "act", "reward"])
+def test_what_is_no_function_or_space_is_refused(name: str) -> None:
+    with pytest.raises(VnetError, match=f"environment: {name} = 3: a function is needed"):
+        make(None, 1.0, **{name: 3})
+    with pytest.raises(VnetError, match="environment: action_space = None: a space of gymnasium, or a function"):
+        space: Any = None
+        emulator.environment(
+            "beacon",
+            observe=see,
+            act=drive_and_tell,
+            reward=speed_of,
+            observation_space=Box(0, 1),
+            action_space=space,
+        )
+
+
 def test_what_is_wrong_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make()
     env.reset()

@@ -44,7 +44,11 @@ def test_a_program_of_its_own_survives_recording(tmp_path: Path) -> None:
         ("[backbone]\nlatency_ms = 0\n", "backbone.latency_ms = 0: must be greater than or equal to 0.001"),
         (
             "[[roadside]]\nposition_m = [0, 0]\nid = 'a'\n[[roadside]]\nposition_m = [1, 0]\nid = 'a'\n",
-            "another unit is named a",
+            "roadside: another unit is named a",
+        ),
+        (
+            "[[roadside]]\nposition_m = [0, 0]\ntx_power_dbm = 30\n",
+            "roadside.0.tx_power_dbm goes with radio.path_loss: without it no radio has a power",
         ),
         (
             "[[roadside]]\nposition_m = [0, 0]\nid = 'a'\nentry = 'm:f'\n"

@@ -339,3 +339,8 @@ def test_some_vehicles_may_run_another_program(tmp_path: Path) -> None:
 )
 def test_what_may_have_been_meant(word: object, meant: str) -> None:
     assert did_you_mean(word, ["kill", "partition", "DoS", "range"]) == meant
+
+
+def test_a_key_with_several_types_is_named_without_them() -> None:
+    with pytest.raises(ScenarioError, match=r"network\.driven\.speed_mps = -1: "):
+        load_scenario(Path("beacon"), ["network.kind=driven", "network.driven.speed_mps=-1"])

@@ -47,6 +47,7 @@ def table(*rows: tuple[float, int, int, float | None]) -> LinkTable:
         (HEAD + "0,a,b,-0.1\n", "line 2: loss = '-0.1': 0 to 1, or nothing out of range, is needed"),
         (HEAD + "0,a,b,1.1\n", "line 2: loss = '1.1': 0 to 1, or nothing out of range, is needed"),
         (HEAD + "0,a,b,nan\n", "line 2: loss = 'nan': 0 to 1"),
+        (HEAD + "0,a,b,0\n0,b,a\n", "line 3: ends before its loss; 4 cells are needed"),
         (HEAD + "0,a,a,0\n", "line 2: 'a' to itself: two vehicles are needed"),
         (HEAD + "0,a,b,0\n0,b,a,0\n0,a,b,1\n", "line 4: a to b twice at one time; leave one out"),
     ],

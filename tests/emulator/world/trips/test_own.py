@@ -37,6 +37,9 @@ def stands_and_enters(seed, vehicles, duration_s):
     return {"unit": [(0, 1, 2, 0.5), (duration_s, 1, 2, 0.5)], "late": [(1, 50, 0, 0), (2, 70, 0, 0)]}
 
 
+def leaves(seed, vehicles, duration_s):
+    raise SystemExit(3)
+
 def stumbles(seed, vehicles, duration_s):
     return {"c0": 1 / 0}
 """
@@ -108,6 +111,7 @@ def test_a_function_that_raises_or_is_not_there_is_named(scenario: Path) -> None
             "shapes.py:stumbles",
             r"network.kind = 'shapes:stumbles': ZeroDivisionError: division by zero \(shapes.py:",
         ),
+        ("shapes.py:leaves", r"network.kind = 'shapes:leaves': SystemExit: 3 \(shapes.py:"),
         ("shapes.py:missing", r"network.kind = 'shapes:missing': module shapes .* has no 'missing'"),
         ("circles.py", r"network.function = 'circles.py': no such file"),
         ("circles", r"network.kind = 'circles': must be"),
