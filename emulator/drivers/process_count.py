@@ -36,6 +36,7 @@ def _usable_cores() -> int:
 
 
 def split_evenly(node_ids: Sequence[str], processes: int) -> list[list[str]]:
-    """Split nodes into consecutive parts, one for each process; their sizes differ by one at most."""
+    """Split nodes into consecutive parts of nearly equal size, one for each process, and none of them empty."""
+    processes = min(processes, len(node_ids))
     ends = [len(node_ids) * part // processes for part in range(processes + 1)]
     return [list(node_ids[start:end]) for start, end in pairwise(ends)]

@@ -22,7 +22,7 @@ from emulator.drivers.emulation import Emulation, ProcessActions
 from emulator.drivers.forked_programs import Ended, ForkedPrograms
 from emulator.drivers.hosted_programs import NONCE, Changes, HostedPrograms, RunOverError, Turn
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.process_count import Processes, process_count, split_evenly
+from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
 from vnet.runtime.debug_target import DebugTarget
 from vnet.runtime.program_path import search_programs_in
@@ -39,7 +39,7 @@ def simulate(
     stop: threading.Event | None = None,
     on_interrupt: Callable[[], None] = lambda: None,
     debug: DebugTarget | None = None,
-    processes: Processes = 1,
+    processes: int = 1,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end; returns the wall-clock seconds, and whether it was interrupted.
 
@@ -51,7 +51,7 @@ def simulate(
     many processes run the programs, and not this one; VnetError is raised if one of them ends before its time.
     """
     node_ids = emulation.world.node_ids
-    groups = split_evenly(node_ids, process_count(processes, len(node_ids)))
+    groups = split_evenly(node_ids, processes)
     emulation.costs.processes = len(groups)
     stop = stop or threading.Event()
     barrier = _Barrier(emulation, groups, before_horizon, stop)

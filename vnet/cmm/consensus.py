@@ -218,22 +218,20 @@ class RatioConsensus:
             }
         self._penalize_new_epochs(shares)
         gate_m, penalties = self._config.gate_m, self._penalties
-        node, epoch, seen = self._node, self.epoch, self._seen
         believed: dict[str, Share] = {}
         added: dict[str, Triple] = {}
         for peer, share in shares.items():
             if penalties and self._penalty(peer) > self._config.ban_penalty:
                 self._rejected["banned"] += 1
                 continue
-            if share.epoch == epoch and node in share.out_neighbours:
-                s_x, s_y, w = share.running_sum
-                seen_x, seen_y, seen_w = seen.get(peer, _NO_MASS)
-                s_x, s_y, w = s_x - seen_x, s_y - seen_y, w - seen_w
+            mass = self._added(peer, share)
+            if mass is not None:
+                s_x, s_y, w = mass
                 if w < 0 or not math.hypot(s_x - w * x, s_y - w * y) <= gate_m * (w + MIN_MASS):
                     self._rejected["implausible_mass"] += 1
                     self._penalize(peer, self._config.ban_penalty, share.epoch)
                     continue
-                added[peer] = s_x, s_y, w
+                added[peer] = mass
             believed[peer] = share
         return believed, added
 

@@ -50,8 +50,6 @@ Belief = tuple[Sequence[float], Three]
 
 Ten = tuple[float, float, float, float, float, float, float, float, float, float]
 """Sums of an origin's increments: Λ C (xx, xy, yx, yy) with P = C Cᵀ, r = η − Λ x, Λ (xx, xy, yy), their number."""
-LEAST_DETERMINANT = 1e-300
-"""In place of a determinant of 0: deviations are then huge."""
 _TINY = 1e-300
 """Least squared deviation: that of an increment which says nothing is 0."""
 _NO_SUMS: Ten = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -110,7 +108,7 @@ def _squared(
     more = 1e-4 * (a + d) + 1e-9
     a += more
     d += more
-    return (d * x * x - 2 * b * x * y + a * y * y) / ((a * d - b * b) or LEAST_DETERMINANT)
+    return (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
 
 
 def priors_agree(priors: Sequence[Five], own: Five) -> list[bool]:
