@@ -168,9 +168,32 @@ def place_to_serve(address: str | None = None, port: int | None = None) -> Serve
     reason = ""
     for first in wanted:
         reason = _why_not(address, first) or _why_not(address, first + 1)
-        if not reason:
+        if not reason and (port is not None or _reserve(address, first)):
             return ServeAt(address, first)
-    raise VnetError(f"--rerun-port {wanted[-1]}: cannot listen at {address}, this port and the next: {reason}")
+    raise VnetError(
+        f"--rerun-port {wanted[-1]}: cannot listen at {address}, this port and the next: "
+        f"{reason or 'other commands of vnet are about to serve there'}"
+    )
+
+
+_reserved: dict[tuple[str, int], socket.socket] = {}
+"""Ports that this process has chosen by itself, until it ends."""
+
+
+def _reserve(address: str, port: int) -> bool:
+    """Keep other commands from choosing this port before it is listened at; False if one has chosen it.
+
+    What marks it is the UDP port of the same number, which nobody else needs and the system frees.
+    """
+    if (address, port) not in _reserved:
+        mark = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            mark.bind((address, port))
+        except OSError:
+            mark.close()
+            return False
+        _reserved[address, port] = mark
+    return True
 
 
 def _why_not(address: str, port: int) -> str:
@@ -200,7 +223,7 @@ def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
     """A recording called `name` that goes to all of `sinks`; closed cleanly at the end of the block.
 
     The server of web pages ends with it; a spawned viewer stays, it is the user's. Raises VnetError if the file
-    cannot be written.
+    cannot be written, or another program listens at the port by now.
     """
     import rerun
 
@@ -212,11 +235,21 @@ def open_recording(sinks: Sinks, name: str) -> Iterator[rerun.RecordingStream]:
             raise VnetError(f"{sinks.save}: cannot write the recording: {error}") from None
         recording.set_log_time_enabled(False)  # emulated time is all that counts
         stack.callback(recording.disconnect)
-        stack.callback(recording.flush, timeout_sec=CLOSE_TIMEOUT_S)
         recording.send_recording_name(name)
+        if sinks.serve is not None:
+            _wait_until_served(recording, sinks.serve)
+        stack.callback(recording.flush, timeout_sec=CLOSE_TIMEOUT_S)
         if sinks.serve is not None:
             stack.enter_context(_looked_at(sinks.serve, sinks.spawn))
         yield recording
+
+
+def _wait_until_served(recording: rerun.RecordingStream, place: ServeAt) -> None:
+    """Raise VnetError if Rerun's server could not listen, which it tells to whom next waits for it alone."""
+    try:
+        recording.flush(timeout_sec=CLOSE_TIMEOUT_S)
+    except RuntimeError as error:
+        raise VnetError(f"--rerun-port {place.port}: cannot listen at {place.address} any more: {error}") from None
 
 
 def _rerun_sinks(sinks: Sinks) -> Iterator[rerun.FileSink | rerun.GrpcServerSink]:
