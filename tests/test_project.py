@@ -3,11 +3,13 @@
 import re
 import subprocess
 import tomllib
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from packaging.specifiers import SpecifierSet
 
 from tests.docs import commands
 from tests.docs.pages import check_workflow
@@ -92,6 +94,14 @@ def test_every_package_that_is_installed_has_an_exact_version() -> None:
     names = {re.split(r"[<>=]", name)[0] for name in wanted}
     normal = {re.sub(r"[-_.]+", "-", name).lower() for name in pinned}
     assert {name for name in names if re.sub(r"[-_.]+", "-", name).lower() not in normal} == set()
+
+
+def test_every_package_that_is_installed_accepts_the_first_python_that_vnet_does() -> None:
+    """Debian 12 has Python 3.11.2: a package that needs 3.11.5 stops `make setup` there."""
+    first = re.fullmatch(r">=([\d.]+)", PROJECT["project"]["requires-python"])
+    assert first is not None
+    needs = {d.name: d.metadata["Requires-Python"] for d in distributions() if d.metadata["Requires-Python"]}
+    assert {n: v for n, v in needs.items() if not SpecifierSet(v).contains(f"{first.group(1)}.0")} == {}
 
 
 @pytest.mark.parametrize(
