@@ -57,6 +57,29 @@ def consistency_figures(recorded: RecordedTables, from_s: float) -> dict[str, An
     }
 
 
+def others_figures(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
+    """Return figures from `from_s` on of the vehicles that run the scenario's program; none where all do.
+
+    others_rmse_m, others_position_rmse_m: roots of mean squares over vehicles and periods. others_anees: mean of
+    the normalized squared errors of the common error, 1 if consistent. others_divergent: number of vehicles that
+    are beyond 10 m, or 5 stated deviations, for 5 s at any time.
+    """
+    if not recorded.scenario.program.exceptions:
+        return {}
+    period_ns, others = recorded.scenario.period_ns, recorded.runs_the_program
+    first = math.ceil(from_s * NS_PER_S / period_ns)
+    common_m = (recorded.vectors("common_error_estimate_m") - recorded.vectors("common_error_m"))[:, others]
+    position_m = (recorded.vectors("estimate_m") - recorded.vectors("position_m"))[:, others]
+    nees = normalized(common_m, recorded.matrices("common_error_covariance_m2")[:, others])
+    far = first_divergences(np.linalg.norm(common_m, axis=2), period_ns)
+    return {
+        "others_rmse_m": _root_mean_square(common_m[first:]),
+        "others_position_rmse_m": _root_mean_square(position_m[first:]),
+        "others_anees": _mean(nees[first:] / 2),
+        "others_divergent": len(far.keys() | first_divergences(np.sqrt(nees), period_ns, DIVERGENT_SIGMAS).keys()),
+    }
+
+
 def normalized(error_m: Array, covariance_m2: Array) -> Array:
     """Return εᵀ P⁻¹ ε (K, N) of errors (K, N, 2); NaN where either is missing or P is not positive definite."""
     (a, b), (_, d) = np.moveaxis(covariance_m2, (2, 3), (0, 1))
@@ -70,6 +93,16 @@ def normalized(error_m: Array, covariance_m2: Array) -> Array:
 def _share(values: Array, limit: float) -> float | None:
     known = values[np.isfinite(values)]
     return float(np.mean(known <= limit)) if len(known) else None
+
+
+def _mean(values: Array) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if len(known) else None
+
+
+def _root_mean_square(errors_m: Array) -> float | None:
+    mean = _mean(np.sum(errors_m**2, axis=2))
+    return None if mean is None else math.sqrt(mean)
 
 
 def _median(values: Array) -> float | None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from emulator.cells.consistency import consistency_figures
+from emulator.cells.consistency import consistency_figures, others_figures
 from emulator.checks.own import PREFIX
 from emulator.drivers.emulation import Emulation
 from emulator.records.divergence import first_divergences
@@ -66,8 +66,8 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
 
     Of the common error at the end of the period (`rmse_m`, `deviation_m`, by component), right after stacking
     (`stacked_…`), of positions; means of the consistency figures; `divergent` vehicles (MODEL 6); bytes a period;
-    what `consistency_figures` and, as `bound_…`, the hears-all bound have. Returned beside is the table of metrics,
-    with the bound's errors in each period as further columns.
+    what `consistency_figures`, `others_figures` and, as `bound_…`, the hears-all bound have. Returned beside is the
+    table of metrics, with the bound's errors in each period as further columns.
     """
     rows = [row for row in emulation.metrics.rows if row.time_ns >= from_s * 1e9]
 
@@ -99,6 +99,7 @@ def measure(emulation: Emulation, from_s: float) -> tuple[dict[str, Any], pa.Tab
         "not_finite": sum(row.not_finite for row in rows),
         "metrics_sha256": emulation.metrics.sha256(),
         **consistency_figures(recorded, from_s),
+        **others_figures(recorded, from_s),
     }
     if bound is not None:
         found = bound.after(math.ceil(from_s * NS_PER_S / emulation.world.period_ns))

@@ -24,12 +24,6 @@ BACK_FACTOR, BACK_LEAST_M = 2.0, 0.3
 LEVEL_PERIODS = 20
 
 
-def honest(recorded: RecordedRun) -> Mask:
-    """Return the nodes (N,) that run the scenario's program; exceptions are not judged by their reports."""
-    excepted = {node for exception in recorded.scenario.program.exceptions for node in exception.nodes}
-    return np.array([node not in excepted for node in recorded.node_ids], dtype=bool)
-
-
 def ups(recorded: RecordedRun) -> Mask:
     """Return the nodes that were up throughout each period (periods, N)."""
     up = np.ones((recorded.periods, len(recorded.node_ids)), dtype=bool)
@@ -85,7 +79,7 @@ def _off_the_mean(recorded: RecordedRun, mean_m: Array, common_m: Array) -> Arra
     known = np.isfinite(common_m[last]).all(axis=(0, 2)) & np.isfinite(mean_m[last]).all(axis=(0, 2))
     off_m = np.full(len(up), np.nan)
     for part in _components(recorded, up, int(recorded.period_starts_ns()[-1])):
-        if (honest(recorded) & known)[part].all():
+        if (recorded.runs_the_program & known)[part].all():
             centre = common_m[last, part].mean(axis=1)[:, None]
             off_m[part] = np.hypot(*np.median(mean_m[last, part] - centre, axis=0).T)
     return off_m
@@ -137,7 +131,7 @@ def _deviation(recorded: RecordedRun, common_m: Array) -> Array:
     for piece in pieces:
         among = up[piece.start] if recorded.moves else everybody
         for part in _components(recorded, among, (piece.start or 0) * period_ns):
-            values = np.where((up[piece] & part & honest(recorded))[..., None], common_m[piece], np.nan)
+            values = np.where((up[piece] & part & recorded.runs_the_program)[..., None], common_m[piece], np.nan)
             known = np.isfinite(values).all(axis=2)
             several = known.sum(axis=1) > 1
             mean = np.nansum(values, axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
@@ -171,7 +165,7 @@ def check_bounded_error(recorded: RecordedRun) -> Finding:
     if not np.isfinite(common_m).any():
         return NotExercised(name, "the program reports no common error")
     error_m = np.hypot(*np.moveaxis(common_m - recorded.vectors("common_error_m"), 2, 0))
-    judged = np.isfinite(error_m) & ups(recorded) & honest(recorded) & ~_deceived(recorded)
+    judged = np.isfinite(error_m) & ups(recorded) & recorded.runs_the_program & ~_deceived(recorded)
     diverged = first_divergences(np.where(judged, error_m, np.nan), recorded.scenario.period_ns)
     rows = [
         {"node": recorded.node_ids[node], "period": period, "error_m": float(error_m[period, node])}

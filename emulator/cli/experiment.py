@@ -130,6 +130,24 @@ def divergence(
         _show(study.report(results), folder / "divergence.md")
 
 
+@app.command()
+def attackers(
+    networks: NetworksOption = None,
+    seeds: SeedsOption = 3,
+    duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 30.0,
+    out: OutOption = None,
+    only: OnlyOption = None,
+) -> None:
+    """What do lies cost the others? Each kind of false frames, of the best-connected vehicles, on equal seeds."""
+    from emulator.experiments import attackers as study
+
+    with one_line_errors():
+        folder = _folder(out, "attackers")
+        cells = study.attack_cells(paper.network_sections(networks), range(1, seeds + 1), duration)
+        results = _run(cells, folder, "attackers", only)
+        _show(study.report(results, duration), folder / "attackers.md")
+
+
 class Study(StrEnum):
     """Studies of `vnet experiment compare`."""
 

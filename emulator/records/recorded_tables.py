@@ -76,6 +76,12 @@ class RecordedTables:
             raise VnetError(f"node {node!r} in trace or events: the states know only {len(self.number)} others")
         return self.number[node]
 
+    @cached_property
+    def runs_the_program(self) -> Mask:
+        """The nodes (N,) that run the scenario's program; those of its exceptions may well report what is false."""
+        excepted = {node for exception in self.scenario.program.exceptions for node in exception.nodes}
+        return np.array([node not in excepted for node in self.node_ids], dtype=bool)
+
     @property
     def moves(self) -> bool:
         """True if vehicles drive, enter and leave; else only their lateral offsets change."""

@@ -1,0 +1,41 @@
+"""The study of attackers: who lies, who counts, and what the report says."""
+
+from __future__ import annotations
+
+import pytest
+
+from emulator.cells.cells import compute
+from emulator.experiments.attackers import ATTACKS, HONEST, attack_cells, report
+from emulator.scenario.scenario import Scenario
+
+TINY = {"n1": {"kind": "generated", "vehicles": 6}}
+
+
+def test_each_attack_has_a_cell_for_each_seed_in_which_the_same_vehicles_count() -> None:
+    cells = attack_cells(TINY, [1, 2])
+    assert [(cell.labels["attack"], cell.labels["seed"]) for cell in cells] == [
+        (name, seed) for name in ATTACKS for seed in (1, 2)
+    ]
+    assert len({cell.digest for cell in cells}) == len(cells), "no two are the same run"
+    assert len({tuple(_excepted(cell.scenario)) for cell in cells}) == 1
+    for cell in cells:
+        lying = [e for e in cell.scenario.program.exceptions if "lie" in e.options]
+        assert len(lying) == ATTACKS[str(cell.labels["attack"])].attackers
+
+
+def _excepted(scenario: Scenario) -> list[str]:
+    return [node for exception in scenario.program.exceptions for node in exception.nodes]
+
+
+@pytest.mark.parametrize(("attack", "harms"), [("offset 50 m", False), ("offset 50 m, no defence", True)])
+def test_figures_are_those_of_the_others(attack: str, harms: bool) -> None:
+    cells = {str(cell.labels["attack"]): cell for cell in attack_cells(TINY, [1], 6.0)}
+    results = [cells[name].labels | compute(cells[name]).figures for name in (HONEST, attack)]
+    honest, lied_to = (result["others_rmse_m"] for result in results)
+    assert (lied_to > 10 * honest) is harms
+    assert (results[1]["others_divergent"] > 0) is harms
+    text = report(results, 6.0)
+    line = next(line for line in text.splitlines() if line.startswith(f"| {attack} "))
+    assert f"{lied_to:.3f}" in line
+    assert f"{lied_to / honest:.2f}" in line
+    assert "6 s, counted from 3 s on; 1 seed" in text
