@@ -138,7 +138,7 @@ def attackers(
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
-    """What do lies cost the others? Each kind of false frames, of the best-connected vehicles, on equal seeds."""
+    """Attackers: the error that each kind of false frames costs the other vehicles, on the same seeds."""
     from emulator.experiments import attackers as study
 
     with one_line_errors():

@@ -33,7 +33,7 @@ UNCOUNTED = 2
 
 @dataclass(frozen=True)
 class Attack:
-    """What the first `attackers` of the best-connected vehicles do, with options of their program."""
+    """An attack: the options of the program that the first `attackers` of the best-connected vehicles run."""
 
     lie: Mapping[str, Any] = field(default_factory=dict)
     attackers: int = 1
@@ -64,7 +64,7 @@ ATTACKS: dict[str, Attack] = {
     "receiver off by 50 m": Attack(attackers=0, fault={"kind": "gnss_jump", "offset_m": [50.0, 0.0]}),
     "offset 50 m, no defence": _lie("offset", 50.0, defence=False),
 }
-"""What is false, by the name that it has in the report; the first is what the others are compared with."""
+"""Attacks by their names in the report; all are compared with the first."""
 
 
 def attack_cells(
