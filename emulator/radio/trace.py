@@ -26,8 +26,8 @@ NOT_ARRIVING = -1
 """Arrival time of a reception that does not arrive."""
 INITIAL_RECEPTIONS = 1 << 22
 """Initial room for receptions: growing means copying, and the system maps zeroed pages only as they are written."""
-INITIAL_FRAMES = 1 << 17
-"""Initial room for frames, for the same reason."""
+INITIAL_FRAMES = 1 << 12
+"""Initial room for frames: a few megabytes would be zeroed at once, as the heap has had them before."""
 
 _FRAME = np.dtype(
     [

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, cho_factor, cho_solve
+import scipy  # its parts are imported when they are first used: `linalg` takes longer than many a run
 
 from vnet.types import Array
 
@@ -86,18 +86,20 @@ class MultipathLaneModel(LaneModel):
     def transition(self, dt_s: float) -> Array:
         """Return F (5, 5) of a vehicle's own state (l, s, v, b_l, b_s) over `dt_s`."""
         keep = np.exp(-dt_s / self.multipath_tau_s)
-        return np.asarray(block_diag(super().transition(dt_s), keep * np.eye(2)))
+        return np.asarray(scipy.linalg.block_diag(super().transition(dt_s), keep * np.eye(2)))
 
     def process_noise(self, dt_s: float) -> Array:
         """Return Q (5, 5) of a vehicle's own state over `dt_s`."""
         keep = np.exp(-dt_s / self.multipath_tau_s)
         return np.asarray(
-            block_diag(super().process_noise(dt_s), self.multipath_sigma_m**2 * (1 - keep**2) * np.eye(2))
+            scipy.linalg.block_diag(
+                super().process_noise(dt_s), self.multipath_sigma_m**2 * (1 - keep**2) * np.eye(2)
+            )
         )
 
     def own_covariance(self) -> Array:
         """Return the covariance (5, 5) of a vehicle's own state before its first fix."""
-        return np.asarray(block_diag(super().own_covariance(), self.multipath_sigma_m**2 * np.eye(2)))
+        return np.asarray(scipy.linalg.block_diag(super().own_covariance(), self.multipath_sigma_m**2 * np.eye(2)))
 
 
 def common_step(sigma_m: float, tau_s: float, walk_m: float | None, dt_s: float) -> tuple[float, float]:
@@ -127,7 +129,9 @@ class KalmanBound:
         self._axes = lane_axes(heading_rad)
         own = self.model.own_covariance()
         self._size = len(own)
-        self._covariance = block_diag(self.model.common_sigma_m**2 * np.eye(2), *[own] * len(heading_rad))
+        self._covariance = scipy.linalg.block_diag(
+            self.model.common_sigma_m**2 * np.eye(2), *[own] * len(heading_rad)
+        )
         self._mean = np.zeros(len(self._covariance))
 
     @property
@@ -167,8 +171,8 @@ class KalmanBound:
         noise = axes @ noise_m2 @ axes.transpose(0, 2, 1)
         for k in range(len(heard)):
             innovation[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += noise[k]
-        factor = cho_factor(innovation, lower=True)
-        gain = cho_solve(factor, projected).T
+        factor = scipy.linalg.cho_factor(innovation, lower=True)
+        gain = scipy.linalg.cho_solve(factor, projected).T
         self._mean += gain @ (measured - common @ self._mean[:2] - sum(self._mean[rows] for rows in parts))
         self._covariance -= gain @ projected
         self._covariance = (self._covariance + self._covariance.T) / 2
