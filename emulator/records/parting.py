@@ -8,6 +8,7 @@ from itertools import takewhile, zip_longest
 from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from emulator.records.recorded_run import OpenedRun
 from emulator.records.reported import value_columns
@@ -48,6 +49,7 @@ def partings(first: OpenedRun, second: OpenedRun) -> list[Parting]:
         _first_entry("frame", _frames(first), _frames(second)),
         _first_entry("reception", _receptions(first), _receptions(second)),
         _first_entry("event", _events(first), _events(second)),
+        _first_vehicle(first, second),
         _first_value(first.states, second.states),
     ]
     return sorted((each for each in found if each is not None), key=lambda each: each.time_ns)
@@ -144,21 +146,46 @@ def _reception(row: Row) -> Entry:
     return time_ns, row["receiver"], text
 
 
+def _first_vehicle(first: OpenedRun, second: OpenedRun) -> Parting | None:
+    """Return the vehicles that one of the runs has not got."""
+    lacking = [[node for node in a.node_ids if node not in b.number] for a, b in ((first, second), (second, first))]
+    if not any(lacking):
+        return None
+    shown = [f"{nodes[0]} and {len(nodes) - 1} more" if nodes[1:] else "".join(nodes) for nodes in lacking]
+    return Parting(0, "vehicle", min(nodes[0] for nodes in lacking if nodes), shown[0], shown[1])
+
+
 def _first_value(first: pa.Table, second: pa.Table) -> Parting | None:
-    """Return the first value that two runs' programs report otherwise, at the beginning of its period."""
+    """Return the first value that programs of vehicles of both runs report otherwise, at its period's beginning."""
     columns = list(dict.fromkeys([*REPORT, *value_columns(first.schema), *value_columns(second.schema)]))
-    for ours, theirs in zip_longest(_values(first, columns), _values(second, columns)):
+    both = pc.unique(first["node"].cast(pa.string()))
+    both = both.filter(pc.is_in(both, pc.unique(second["node"].cast(pa.string()))))
+    for ours, theirs in zip_longest(_values(first, both, columns), _values(second, both, columns)):
         if ours != theirs:
-            row = ours or theirs
-            assert row is not None
-            name = next((name for name in columns if (ours or {}).get(name) != (theirs or {}).get(name)), "")
-            shown = [f"{name} = {each[name]}" if each else "" for each in (ours, theirs)]
-            return Parting(row["time_ns"], "value", row["node"], shown[0], shown[1])
+            return _parting_of(ours, theirs, columns)
     return None
 
 
-def _values(states: pa.Table, columns: Sequence[str]) -> Iterator[Row]:
+def _parting_of(ours: Row | None, theirs: Row | None, columns: Sequence[str]) -> Parting:
+    """Return the parting of two rows that differ; of different vehicles or times, one run has not got the first."""
+    places = [(row["time_ns"], row["node"]) for row in (ours, theirs) if row is not None]
+    time_ns, node = min(places)
+    rows = [
+        row if row is not None and (row["time_ns"], row["node"]) == (time_ns, node) else {}
+        for row in (ours, theirs)
+    ]
+    name = next((name for name in columns if rows[0].get(name) != rows[1].get(name)), "report")
+    shown = [f"{name} = {row.get(name)}" if row else "" for row in rows]
+    return Parting(time_ns, "value", node, shown[0], shown[1])
+
+
+def _values(states: pa.Table, nodes: pa.Array, columns: Sequence[str]) -> Iterator[Row]:
+    """Yield the rows of these nodes, by time and then by name."""
     there = [name for name in columns if name in states.column_names]
-    for row in states.select(["time_ns", "node", *there]).to_pylist():
+    table = states.select(["time_ns", "node", *there])
+    table = table.set_column(1, "node", table["node"].cast(pa.string()))
+    table = table.filter(pc.is_in(table["node"], nodes))
+    order = pc.sort_indices(table.select(["time_ns", "node"]), [("time_ns", "ascending"), ("node", "ascending")])
+    for row in table.take(order).to_pylist():
         shown = {name: str(row.get(name)) for name in columns}
         yield {"time_ns": row["time_ns"], "node": row["node"], **shown}

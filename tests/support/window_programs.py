@@ -151,3 +151,25 @@ async def fails_unheard(node: Node) -> None:
             raise KeyError("the end of a program")
         if fix.time_ns > 2 * NS_PER_S and node.id == "v02":
             raise SystemExit(0)
+
+
+async def cancels_timers(node: Node) -> None:
+    """Set timers and give them up, all at instants at which other tasks' timers are due."""
+
+    async def given_up() -> None:
+        while True:
+            async with asyncio.timeout(0.1):
+                await asyncio.sleep(0)
+            await asyncio.sleep(0.1)
+
+    async def ticks() -> None:
+        while True:
+            await asyncio.sleep(0.1)
+            loser = asyncio.create_task(asyncio.sleep(0.1))
+            await asyncio.sleep(0.05)
+            await asyncio.sleep(0.05)
+            loser.cancel()
+
+    async with asyncio.TaskGroup() as tasks:
+        tasks.create_task(given_up())
+        tasks.create_task(ticks())

@@ -88,7 +88,7 @@ class _Event:
     """Something that is due: `show` makes it happen. Of one `group` only the oldest is an option.
 
     `job` is that of the result that it is, which must be there first. An arrival that is not `awaited` wakes
-    nobody.
+    nobody. A timer that is `cancelled` when it is due is no event any more.
     """
 
     label: str
@@ -97,6 +97,7 @@ class _Event:
     show: Callable[[], None]
     job: Future[Any] | None = None
     awaited: Callable[[], bool] = lambda: True
+    cancelled: Callable[[], bool] = lambda: False
 
 
 @dataclass(slots=True, eq=False)
@@ -175,11 +176,12 @@ class OrderedQueue(ReadyQueue):
         if node is None or self._holds(handle):
             super().append(handle)
         elif isinstance(handle, NumberedTimer):
-            rounds = self._rounds(node)
-            source, group = handle.setter
-            rounds.events.append(
-                _Event(f"timer of {source}", source, group, lambda: self._ready(node, handle, source))
-            )
+            # Whether a cancelled timer ever comes here depends on the other timers of the loop.
+            if not handle.cancelled():
+                source, group = handle.setter
+                event = _Event(f"timer of {source}", source, group, lambda: self._ready(node, handle, source))
+                event.cancelled = handle.cancelled
+                self._rounds(node).events.append(event)
         else:
             running, source, _ = self._running
             self._ready(node, handle, source if running is node else STARTED)
@@ -247,6 +249,7 @@ class OrderedQueue(ReadyQueue):
     def _compose(self, node: Node, rounds: _NodeRounds) -> None:
         if rounds.time_ns != (time_ns := self._now_ns()):
             rounds.time_ns, rounds.decisions = time_ns, 0
+        rounds.events = [event for event in rounds.events if not event.cancelled()]
         if rounds.sleeps:
             for arrival in rounds.events:
                 arrival.show()

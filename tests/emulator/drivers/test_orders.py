@@ -54,6 +54,15 @@ def test_an_order_is_the_same_in_any_division_into_processes_and_from_its_tape(
     assert again.orders.in_order() == reference.orders.in_order()
 
 
+@pytest.mark.parametrize("kind", ["shuffle", "pct"])
+def test_a_timer_that_was_cancelled_is_no_option_wherever_a_vehicle_runs(kind: str) -> None:
+    """A loop that vehicles share meets a cancelled timer behind another one's; a loop of its own drops it."""
+    scenario = scenario_of([], "tests.support.window_programs:cancels_timers", 3, run={"duration_s": 2.0})
+    explored = ordered(scenario, order=kind, order_seed=3, order_steps=500)
+    together, apart = run_together(explored), run_apart(explored)
+    assert together.orders.in_order() == apart.orders.in_order() != []
+
+
 @pytest.mark.slow
 @settings(max_examples=4, deadline=None)
 @given(scenario=scenarios())

@@ -30,7 +30,7 @@ def _excepted(scenario: Scenario) -> list[str]:
 @pytest.mark.parametrize(("attack", "harms"), [("offset 50 m", False), ("offset 50 m, no defence", True)])
 def test_figures_are_those_of_the_others(attack: str, harms: bool) -> None:
     cells = {str(cell.labels["attack"]): cell for cell in attack_cells(TINY, [1], 6.0)}
-    results = [cells[name].labels | compute(cells[name]).figures for name in (HONEST, attack)]
+    results = [{**cells[name].labels, **compute(cells[name]).figures} for name in (HONEST, attack)]
     honest, lied_to = (result["others_rmse_m"] for result in results)
     assert (lied_to > 10 * honest) is harms
     assert (results[1]["others_divergent"] > 0) is harms

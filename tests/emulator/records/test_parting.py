@@ -58,6 +58,27 @@ def test_a_lost_frame_is_a_reception_and_what_follows_is_told(tmp_path: Path) ->
     assert len(told(plain, reception)) == 8
 
 
+def test_vehicles_of_one_run_alone_are_named_and_values_are_those_of_both(tmp_path: Path) -> None:
+    """Campaigns compare shrunk runs, which have fewer vehicles."""
+    program = {"program": {"entry": "agents.beacon:main"}}
+    three = simulated(tmp_path / "a", **program)
+    one = simulated(tmp_path / "b", **program, network={"vehicles": 1})
+    found = partings(three, one)
+    assert [(each.node, each.first, each.second) for each in found if each.kind == "vehicle"] == [
+        ("v02", "v02 and 1 more", "")
+    ]
+    value = next(each for each in found if each.kind == "value")
+    assert value.node == "v01"
+    assert value.first.partition(" = ")[0] == value.second.partition(" = ")[0]
+    assert [each.second for each in partings(one, three) if each.kind == "vehicle"] == ["v02 and 1 more"]
+
+
+def test_a_shorter_run_parts_where_it_ends(tmp_path: Path) -> None:
+    long, short = simulated(tmp_path / "a"), simulated(tmp_path / "b", run={"duration_s": 0.5})
+    value = next((each for each in partings(long, short) if each.kind == "value"), None)
+    assert value is None or (value.time_ns >= 5e8 and value.second == "")
+
+
 V01, V02, V02_LATER = (5, "v01", "frame of v01"), (5, "v02", "frame of v02"), (9, "v02", "frame of v02")
 
 
