@@ -8,7 +8,7 @@ one's own; a failure says when, who, and what had happened to the vehicle before
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from vnet.units import NS_PER_S
 MOST_TOLD = 10
 """Failures whose time and vehicle are told."""
 PERIOD, EVENT = "period", "event"
+_ROUNDING_S = 1e-9
 
 
 @dataclass(frozen=True)
@@ -81,34 +82,59 @@ def _events(run: Run) -> Iterator[Moment]:
 
 
 def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
-    """Judge that a predicate is true at every moment; unknown if it has nothing to say at any."""
-    return _held(run, name, ((m, predicate(m)) for m in moments(run, at)), "does not hold")
+    """Judge that a predicate is true at every moment; unknown if it has nothing to say at any.
+
+    Raises VnetError for a predicate that answers anything but True, False or None; so do the other functions.
+    """
+    asked = [(moment, _answer(name, predicate(moment))) for moment in moments(run, at)]
+    return _held(run, name, asked, True)
 
 
 def never(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
     """Judge that a predicate is true at no moment; unknown if it has nothing to say at any."""
-    asked = ((m, predicate(m)) for m in moments(run, at))
-    return _held(run, name, ((m, None if held is None else not held) for m, held in asked), "holds")
+    asked = [(moment, _answer(name, predicate(moment))) for moment in moments(run, at)]
+    return _held(run, name, asked, False)
 
 
-def eventually(run: Run, name: str, predicate: Predicate, within_s: float = math.inf, at: str = PERIOD) -> Result:
-    """Judge that a predicate becomes true of each vehicle, within so many seconds of its first moment."""
-    first: dict[str, Moment] = {}
+def eventually(
+    run: Run,
+    name: str,
+    predicate: Predicate,
+    within_s: float = math.inf,
+    at: str = PERIOD,
+    nodes: Collection[str] | None = None,
+) -> Result:
+    """Judge that a predicate becomes true of each vehicle, within so many seconds of its coming into the network.
+
+    `nodes` are the vehicles of which it is asked, by default all; one without any moment fails as well. One that is
+    in the network for less than `within_s` before the end of the run counts only if the predicate has come true.
+    """
+    _check_within(name, within_s)
+    entered_s = {m.node: m.time_s for m in reversed(moments(run)) if nodes is None or m.node in nodes}
     reached: dict[str, float] = {}
     for moment in moments(run, at):
-        begun = first.setdefault(moment.node, moment)
-        waited_s = moment.time_s - begun.time_s
-        if moment.node not in reached and waited_s <= within_s + 1e-9 and predicate(moment):
+        waited_s = moment.time_s - entered_s.get(moment.node, math.inf)
+        asked = moment.node not in reached and waited_s <= within_s + _ROUNDING_S
+        if asked and _answer(name, predicate(moment)):
             reached[moment.node] = waited_s
-    late = [moment for node, moment in first.items() if node not in reached]
-    if not first:
-        return Result(name, "unknown", f"no {at} of any vehicle")
+    end_s = _end_ns(run) / NS_PER_S
+    late = [
+        Moment(round(entered_s[node] * NS_PER_S), node)
+        for node in sorted(entered_s.keys() - reached.keys(), key=lambda node: (entered_s[node], node))
+        if math.isinf(within_s) or entered_s[node] + within_s <= end_s + _ROUNDING_S
+    ]
     if late:
         limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
         return _failed(run, name, late, f"never came true{limit}")
+    if not reached:
+        why = f"no vehicle is there for {within_s:g} s" if entered_s else "there is no such vehicle"
+        return Result(name, "unknown", why)
     slowest_s = max(reached.values())
     return Result(
-        name, "valid", f"true of {counted(len(first), 'vehicle')} within {slowest_s:g} s", {"slowest_s": slowest_s}
+        name,
+        "valid",
+        f"true of {counted(len(reached), 'vehicle')} within {slowest_s:g} s",
+        {"slowest_s": slowest_s},
     )
 
 
@@ -128,36 +154,56 @@ def leads_to(
     `moment.node == cause.node`. A cause less than `within_s` before the end of the run counts only if its effect
     came. `effect_at` says at what moments effects are looked for, by default those of causes.
     """
-    causes = [moment for moment in moments(run, at) if cause(moment)]
+    _check_within(name, within_s)
+    causes = [moment for moment in moments(run, at) if _answer(name, cause(moment))]
     effects = moments(run, effect_at or at)
     times_ns = np.array([moment.time_ns for moment in effects], dtype=np.int64)
-    within_ns = round(within_s * NS_PER_S)
-    end_ns = round(len(run.times_s) * run.period_s * NS_PER_S)
+    end_ns = _end_ns(run)
+    within_ns = round(min(within_s * NS_PER_S, end_ns))
     failed, delays_s = [], []
     for moment in causes:
         first, last = np.searchsorted(times_ns, [moment.time_ns, moment.time_ns + within_ns + 1])
-        found = next((each for each in effects[first:last] if effect(each, moment)), None)
+        found = next((each for each in effects[first:last] if _answer(name, effect(each, moment))), None)
         if found is not None:
             delays_s.append(found.time_s - moment.time_s)
-        elif moment.time_ns + within_ns < end_ns:
+        elif math.isinf(within_s) or moment.time_ns + within_ns < end_ns:
             failed.append(moment)
     if failed:
-        return _failed(run, name, failed, f"was not followed within {within_s:g} s", of=len(causes))
+        limit = "" if math.isinf(within_s) else f" within {within_s:g} s"
+        return _failed(run, name, failed, f"was not followed{limit}", of=len(causes))
     if not delays_s:
-        return Result(name, "unknown", "the cause never came true")
+        late = f"{counted(len(causes), 'cause')} came less than {within_s:g} s before the end of the run"
+        return Result(name, "unknown", late if causes else "the cause never came true")
     slowest_s = max(delays_s)
     text = f"{counted(len(delays_s), 'cause')} followed by an effect within {slowest_s:g} s"
     return Result(name, "valid", text, {"slowest_s": slowest_s})
 
 
-def _held(run: Run, name: str, answers: Iterable[tuple[Moment, bool | None]], problem: str) -> Result:
+def _end_ns(run: Run) -> int:
+    return round(len(run.times_s) * run.period_s * NS_PER_S)
+
+
+def _check_within(name: str, within_s: float) -> None:
+    if not within_s >= 0:
+        raise VnetError(f"{name}: within_s = {within_s!r}: 0 or more seconds are needed")
+
+
+def _answer(name: str, answer: object) -> bool | None:
+    """Return what a predicate has answered; numbers, as programs report them, are true or false as in Python."""
+    if answer is None or isinstance(answer, bool | np.bool_ | int | float | np.number):
+        return None if answer is None else bool(answer)
+    raise VnetError(f"{name}: the predicate answered {answer!r}: True, False or None is needed")
+
+
+def _held(run: Run, name: str, answers: Iterable[tuple[Moment, bool | None]], wanted: bool) -> Result:
     asked = [(moment, held) for moment, held in answers if held is not None]
-    failed = [moment for moment, held in asked if not held]
+    failed = [moment for moment, held in asked if held is not wanted]
     if failed:
-        return _failed(run, name, failed, problem, of=len(asked))
+        return _failed(run, name, failed, "does not hold" if wanted else "holds", of=len(asked))
     if not asked:
         return Result(name, "unknown", "the predicate had nothing to say at any moment")
-    return Result(name, "valid", f"true at {counted(len(asked), 'moment')}", {"moments": len(asked)})
+    text = f"{'true' if wanted else 'false'} at {counted(len(asked), 'moment')}"
+    return Result(name, "valid", text, {"moments": len(asked)})
 
 
 def _failed(run: Run, name: str, failed: list[Moment], problem: str, of: int | None = None) -> Result:

@@ -225,7 +225,8 @@ class Campaign:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / SCENARIO_FILE).write_text(dump_scenario(shrunk))
         (folder / "drawn.toml").write_text(schedule_toml(outcome.scenario.fault) + "\n")
-        (folder / TEST_FILE).write_text(regression_test(folder.name, sorted(outcome.trial.failed)))
+        test = regression_test(folder.name, sorted(outcome.trial.failed), self._plan.limit_s)
+        (folder / TEST_FILE).write_text(test)
         return replace(outcome, shrunk=shrunk, again=again, steps=steps, folder=folder)
 
     def _explained(self, outcome: Outcome) -> Outcome:

@@ -10,7 +10,7 @@ import asyncio
 import math
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from functools import partial
@@ -246,11 +246,17 @@ class RunHarness:
         self._promises.append(partial(never, name=name or _name_of(predicate), predicate=predicate, at=at))
 
     def eventually(
-        self, predicate: Predicate, *, within_s: float = math.inf, name: str | None = None, at: str = PERIOD
+        self,
+        predicate: Predicate,
+        *,
+        within_s: float = math.inf,
+        name: str | None = None,
+        at: str = PERIOD,
+        nodes: Collection[str] | None = None,
     ) -> None:
-        """Promise that a predicate becomes true of each vehicle, within so many seconds."""
-        name = name or _name_of(predicate)
-        self._promises.append(partial(eventually, name=name, predicate=predicate, within_s=within_s, at=at))
+        """Promise that a predicate becomes true of each vehicle, or of `nodes`; see `properties.eventually`."""
+        judge = partial(eventually, predicate=predicate, within_s=within_s, at=at, nodes=nodes)
+        self._promises.append(partial(judge, name=name or _name_of(predicate)))
 
     def leads_to(
         self, cause: Predicate, effect: Effect, *, within_s: float, name: str | None = None, at: str = PERIOD

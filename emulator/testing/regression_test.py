@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+
+from emulator.scenario.scenario import load_scenario
+from emulator.testing.trial import TrialPool
 
 TEST_FILE = "test_failure.py"
 TEXT = '''"""Failure {number} of a campaign: {checks}. Written by vnet; `pytest {file}` runs it."""
 
 from pathlib import Path
 
-import emulator
+from emulator.testing.regression_test import failures
 
 
 def test_failure_{name}(tmp_path: Path) -> None:
-    run = emulator.simulate(Path(__file__).with_name("scenario.toml"), out=tmp_path / "run")
-    assert run.verdict != "invalid", [check for check in run.checks if check.verdict == "invalid"]
+    scenario = Path(__file__).with_name("scenario.toml")
+    assert failures(scenario, tmp_path / "run", limit_s={limit_s:g}) == {{}}
 '''
 
 
-def regression_test(number: str, checks: Sequence[str]) -> str:
-    """Return the test of the failure of this number, of these checks."""
+def regression_test(number: str, checks: Sequence[str], limit_s: float) -> str:
+    """Return the test of the failure of this number, of these checks, whose run may take `limit_s` seconds."""
     name = "".join(character if character.isalnum() else "_" for character in number)
-    return TEXT.format(number=number, name=name, checks=", ".join(checks), file=TEST_FILE)
+    return TEXT.format(number=number, name=name, checks=", ".join(checks), file=TEST_FILE, limit_s=limit_s)
+
+
+def failures(scenario: Path, folder: Path, limit_s: float) -> dict[str, str]:
+    """Simulate a scenario as a campaign does, and return the texts of the checks that fail by their names.
+
+    It runs in a process of its own, and its files stay in `folder`. One that takes more than `limit_s` seconds, or
+    ends its process, has failed. Raises VnetError if it cannot be run.
+    """
+    loaded = load_scenario(scenario)
+    pool = TrialPool(limit_s, loaded)
+    try:
+        trial = pool.run(loaded, folder)
+    finally:
+        pool.close()
+    return {name: trial.texts[name] for name in trial.failed}

@@ -48,7 +48,7 @@ def braked(moment: Moment) -> bool:
 
 def test_always_and_never_ask_at_each_period_of_each_vehicle(run: Run) -> None:
     assert always(run, "counts", lambda m: m["count"] >= 0).verdict == "valid"
-    assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).verdict == "valid"
+    assert never(run, "far", lambda m: np.abs(m["position_m"]).max() > 1e7).text == "false at 80 moments"
     failed = always(run, "early", lambda m: m["count"] < 1.0)
     assert failed.verdict == "invalid"
     assert failed.text == "does not hold: first of v01 at 1 s (40 of 80 in all)"
@@ -68,6 +68,44 @@ def test_eventually_is_of_each_vehicle_and_within_a_time(run: Run) -> None:
     assert short.verdict == "invalid" and short.text.startswith("never came true within 1 s: first of v01")
     others = eventually(run, "warned", lambda m: m["warned"])
     assert others.verdict == "invalid" and others.figures["rows"] == [{"node": "v01", "time_s": 0.0}]
+
+
+def test_a_vehicle_without_any_event_is_asked_as_well(run: Run) -> None:
+    """v04 hears v01 as v02 does; v01, which brakes, is never warned."""
+
+    def warned(moment: Moment) -> bool:
+        return moment.event == "warned"
+
+    failed = eventually(run, "warned", lambda m: m.event == "never", at="event")
+    assert failed.verdict == "invalid" and "(4 in all)" in failed.text
+    some = eventually(run, "warned", warned, at="event")
+    assert some.figures["rows"] == [{"node": "v01", "time_s": 0.0}]
+    others = eventually(run, "warned", warned, at="event", nodes=["v02", "v03", "v04"])
+    assert others.text == "true of 3 vehicles within 0.9 s", "from their entry on"
+    assert eventually(run, "warned", warned, 0.8, "event", ["v02", "v03"]).text.startswith(
+        "never came true within 0.8 s: first of v03"
+    )
+    assert eventually(run, "warned", warned, nodes=["v99"]).text == "there is no such vehicle"
+
+
+def test_a_run_that_is_too_short_for_a_property_leaves_it_unknown(run: Run) -> None:
+    too_long = eventually(run, "late", lambda m: False, within_s=2.1)
+    assert (too_long.verdict, too_long.text) == ("unknown", "no vehicle is there for 2.1 s")
+    assert eventually(run, "late", lambda m: False, within_s=2.0).verdict == "invalid"
+    assert eventually(run, "late", lambda m: m["count"] >= 1.0, within_s=100.0).verdict == "valid"
+    causes = leads_to(run, "x", lambda m: m["count"] >= 1.8, lambda m, cause: False, 1.0)
+    assert causes.text == "8 causes came less than 1 s before the end of the run"
+    endless = leads_to(run, "x", lambda m: m["count"] >= 1.8, lambda m, cause: False, float("inf"))
+    assert endless.text.startswith("was not followed: first of v01 at 1.8 s")
+
+
+def test_what_no_property_is_is_refused(run: Run) -> None:
+    with pytest.raises(VnetError, match="soon: within_s = -1: 0 or more seconds are needed"):
+        eventually(run, "soon", lambda m: True, within_s=-1)
+    with pytest.raises(VnetError, match="soon: within_s = nan"):
+        leads_to(run, "soon", lambda m: True, lambda m, cause: True, float("nan"))
+    with pytest.raises(VnetError, match="text: the predicate answered 'no': True, False or None is needed"):
+        always(run, "text", lambda m: "no")  # type: ignore[arg-type, return-value]
 
 
 def test_what_leads_to_what_by_events_of_other_vehicles(run: Run) -> None:

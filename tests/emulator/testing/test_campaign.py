@@ -23,6 +23,7 @@ from emulator.testing import campaign
 from emulator.testing.campaign import run_campaign
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.matrix import column_of, count_verdicts, page
+from emulator.testing.regression_test import TEST_FILE, failures
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.trial import TrialPool
 from tests.support.paths import ROOT
@@ -150,6 +151,20 @@ def test_what_hangs_is_killed_and_the_campaign_goes_on(tmp_path: Path) -> None:
     (row,) = results_of(folder)
     assert row["failed"] == {"hung": "not over within 2 s of wall clock; logs/stacks.txt says where it stood"}
     assert load_scenario(Path(row["folder"]) / "scenario.toml").fault
+    assert "hung" in said_by_pytest(Path(row["folder"]) / TEST_FILE)
+
+
+def said_by_pytest(test: Path) -> str:
+    """The output of pytest on a failure's test, which fails."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(test)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 1, done.stdout
+    return done.stdout
+
+
+def test_a_failure_that_has_gone_away_lets_its_test_pass(tmp_path: Path) -> None:
+    (tmp_path / "scenario.toml").write_text("[network]\nvehicles = 2\n[run]\nduration_s = 1.0\n")
+    assert failures(tmp_path / "scenario.toml", tmp_path / "run", limit_s=60.0) == {}
 
 
 def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
@@ -161,6 +176,7 @@ def test_numbers_that_are_none_and_that_grow_are_found(tmp_path: Path) -> None:
     (row,) = results_of(tmp_path / "growing")
     assert list(row["failed"]) == ["growth"]
     assert row["shrunk"] == "", "it grows without any fault"
+    assert "growth" in said_by_pytest(Path(row["folder"]) / TEST_FILE)
 
 
 def test_an_interrupted_campaign_keeps_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
