@@ -338,8 +338,10 @@ class RunHarness:
 def _name_of(predicate: Callable[..., object]) -> str:
     """Return the name of a function; a lambda has none, and is then given one."""
     name = getattr(predicate, "__name__", "")
+    if not callable(predicate):
+        raise VnetError(f"a promise by {predicate!r}: a function of a moment is needed")
     if not name.isidentifier():
-        raise VnetError("a promise by a lambda needs a name=")
+        raise VnetError('a promise by a lambda needs a name: name="…"')
     return name
 
 

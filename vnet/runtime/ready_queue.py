@@ -201,7 +201,10 @@ class OrderedQueue(ReadyQueue):
         self._rounds(node).jobs.append(_Event(label, label, job, show, job))
 
     def setter(self, node: Node | None, task: asyncio.Task[Any] | None) -> tuple[str, object]:
-        """Return the name of what sets a timer, and the callback that does, whose timers keep their order."""
+        """Return the name of what sets a timer, and the task or the callback that does.
+
+        The timers of either keep their order: what it sets later is due later on a machine, if only by nanoseconds.
+        """
         running, source, callback = self._running
         if node is None or running is not node:
             return STARTED, callback
@@ -214,7 +217,7 @@ class OrderedQueue(ReadyQueue):
             name = name[:LONGEST_NAME]
             rounds.named[name] += 1
             rounds.names[task] = name if rounds.named[name] == 1 else f"{name}#{rounds.named[name]}"
-        return rounds.names[task], callback
+        return rounds.names[task], rounds.names[task]
 
     def _rounds(self, node: Node) -> _NodeRounds:
         if node not in self._nodes:

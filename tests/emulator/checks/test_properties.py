@@ -169,7 +169,7 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
             emu.leads_to(
                 braked, lambda moment, cause: moment.event == "warned", within_s=0.4, at="event", name="warns"
             )
-            with pytest.raises(VnetError, match="needs a name="):
+            with pytest.raises(VnetError, match='needs a name: name="…"'):
                 emu.always(lambda moment: True)
             await emu.run_until(1.0)
             emu.check("own:counts", "own:soon", "own:warns")
