@@ -66,7 +66,8 @@ LOST_NEIGHBOURS = 3
 PASSED_SHARE = 0.8
 """Share of an increment that is passed on which is added: what priors hold by longer ways is not in their lists,
 and with the whole the vehicles are too sure (ANEES 1.25 on N1 in place of 1.16; the error grows by 1 %)."""
-
+COUNTED_SHARE = 0.5
+"""An increment of which less than this share is used is counted among what is rejected."""
 
 _SENT = struct.Struct("<5f")
 _NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -137,7 +138,7 @@ class InformationEstimator:
         self.period_s = period_ns / NS_PER_S
         self.rng = rng
         self._rule = FusionRule(options, rng)
-        self._origins = Origins(self.own.drops_outliers)
+        self._origins = Origins()
         self._frames: dict[str, InformationFrame] = {}
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
@@ -152,7 +153,7 @@ class InformationEstimator:
 
     @property
     def rejected(self) -> Counter[str]:
-        """Number of frames and increments of others that were not used, by reason."""
+        """Number of frames and increments of others that were not used, or for less than half, by reason."""
         return self._admission.rejected
 
     @property
@@ -263,7 +264,7 @@ class InformationEstimator:
         if min(used) == 1:
             return frames
         self._reject("prior", near.count(False))
-        self._reject("increment", used.count(0.0) - near.count(False))
+        self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))
         return {name: frame for (name, frame), share in zip(frames.items(), used, strict=True) if share}
 
     def _reject(self, reason: str, count: int) -> None:
@@ -281,7 +282,7 @@ class InformationEstimator:
         if self._contradicted < LOST_PERIODS:
             return False
         self._contradicted = 0
-        self._origins = Origins(self.own.drops_outliers)
+        self._origins = Origins()
         self.own.restart(median_belief(priors))
         self._prior, self._increment = as_sent(self.own.prior), _NOTHING
         return True
@@ -375,9 +376,8 @@ class InformationEstimator:
         x, y, p, q, r = self.own.plain_moments
         used = self._origins.shares(origins, increments, ((x, y), (p, q, r)), self._now_ns / NS_PER_S)
         if min(used) < 1:
-            self._reject("passed", used.count(0.0))
-            each = zip(increments, used, strict=True)
-            increments = [scaled_by(increment, share) for increment, share in each if share]
+            self._reject("passed", sum(share < COUNTED_SHARE for share in used))
+            increments = [scaled_by(increment, share) for increment, share in zip(increments, used, strict=True)]
         return scaled_down(increments, self._largest_increment)
 
     # What goes out.

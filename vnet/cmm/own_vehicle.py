@@ -55,11 +55,9 @@ class OwnVehicle:
     """The filter of one vehicle on straight lanes.
 
     prior: what was known of c before the latest fix. largest_increment: 0, since all vehicles say alike much.
-    drops_outliers: whether what contradicts this vehicle for long is dropped, or weighed.
     """
 
     largest_increment = 0.0
-    drops_outliers = True
 
     def __init__(self, config: OwnConfig, lanes: LaneMap, rng: np.random.Generator) -> None:
         self._lanes = lanes

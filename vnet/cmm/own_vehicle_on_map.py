@@ -32,11 +32,7 @@ class OwnVehicleOnMap:
 
     prior: what was known of c before the latest fix. owed: negative, what increments have said too much.
     largest_increment: trace in 1/m² of what a lane says of c at once, when a vehicle comes upon it.
-    drops_outliers: false, since honest vehicles contradict each other for long: each has one offset for hundreds of
-    metres, and may be on a wrong lane. So what contradicts is weighed.
     """
-
-    drops_outliers = False
 
     def __init__(self, config: RbpfConfig, roads: RoadMap, rng: np.random.Generator) -> None:
         self._config = config

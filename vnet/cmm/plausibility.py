@@ -165,13 +165,9 @@ def _sum_gate(count: float) -> float:
 
 
 class Origins:
-    """Decaying sums of the deviations of each origin: of its increments, and of its priors.
+    """Decaying sums of the deviations of each origin: of its increments, and of its priors."""
 
-    drops_outliers: whether increments beyond the gates are dropped, or weighed.
-    """
-
-    def __init__(self, drops_outliers: bool = True) -> None:
-        self._drops_outliers = drops_outliers
+    def __init__(self) -> None:
         self._sums: dict[int, tuple[float, Ten]] = {}  # their time, and what they were then
         self._leans: dict[int, tuple[float, float, float]] = {}  # its time, and the mean deviation (x, y)
 
@@ -182,8 +178,9 @@ class Origins:
     def shares(self, codes: Sequence[int], increments: Sequence[Five], belief: Belief, now_s: float) -> list[float]:
         """Return the share (n,) of each increment (n,) of the origins `codes` that is used.
 
-        It is 1 within the gates, for the increment by itself and for the origin's sum. Beyond it is 0, or, if
-        outliers are weighed, the gate relative to the squared deviation: an M-estimator whose influence descends.
+        It is 1 within the gates, for the increment by itself and for the origin's sum, and beyond them the gate
+        relative to the squared deviation: an M-estimator whose influence descends. To drop it would err where few
+        contradict each other for long and are right: three vehicles on nearly parallel lanes, or on a map.
         What is beyond is summed up all the same: who has lied is believed again when it has decayed. Each is
         compared with the belief (x, P) when it came: c itself moves by half a metre in the sum's memory.
         """
@@ -210,8 +207,7 @@ class Origins:
             alone = _squared(m_xx, m_xy, m_yx, m_yy, x, y, a, b, d)
             share = 1.0
             if not (alone < INCREMENT_GATE and (in_sum < SUM_GATE or in_sum < _sum_gate(count))):
-                beyond = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
-                share = 0.0 if self._drops_outliers else beyond
+                share = min(INCREMENT_GATE / max(alone, _TINY), _sum_gate(count) / max(in_sum, _TINY))
             shares.append(share)
         return shares
 

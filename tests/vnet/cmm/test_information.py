@@ -135,19 +135,19 @@ def test_a_lane_that_says_nothing_along_itself_may_not_move_c_along_it() -> None
     assert deviation((0.0, 0.0, 0.0, 0.0, 0.0), belief) == 0
 
 
-def test_a_small_lie_is_found_in_the_sum_and_forgiven_later() -> None:
+def test_a_small_lie_is_found_in_the_sum_counts_for_less_and_is_forgiven_later() -> None:
     origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
     honest, liar = _information((0.3, 0.0), 2.0), _information((3.0, 0.0), 2.0)
     believed = [origins.shares([1, 2], [honest, liar], belief, 0.1 * k) for k in range(50)]
     assert all(good for good, _ in believed)
     assert believed[0][1]  # by itself it is what noise may do
-    assert not any(lie for _, lie in believed[10:])
+    assert max(lie for _, lie in believed[10:]) < 0.5
     assert origins.shares([2], [honest], belief, 90.0) == [True]
 
 
 def test_outliers_are_weighed_by_how_far_they_are_beyond_the_gates() -> None:
-    """On a map an honest vehicle contradicts for long: it counts less and less, and a liar's pull vanishes."""
-    origins, belief = Origins(drops_outliers=False), ((0.0, 0.0), (0.01, 0.0, 0.01))
+    """An honest vehicle may contradict for long: it counts less and less, and a liar's pull vanishes."""
+    origins, belief = Origins(), ((0.0, 0.0), (0.01, 0.0, 0.01))
     said = [_information((off_m, 0.0), 2.0) for off_m in (0.2, 0.6, 1.2, 50.0)]
     for k in range(300):
         shares = np.array(origins.shares([1, 2, 3, 4], said, belief, 0.1 * k))
