@@ -23,7 +23,7 @@ import pyarrow as pa
 
 from emulator.cells.programs import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
-from emulator.checks.own import Result, finding_of, load_checks
+from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_further
@@ -68,7 +68,9 @@ class RunHarness:
         self._open: list[str] = []
         self._folders: list[Path] = []
         self._judgement: Judgement | None = None
-        self._promises: list[Callable[[Run], Result]] = []
+        self._promises: dict[str, Callable[[Run], Result]] = {}
+        self._named: set[str] = set()
+        """Names of the checks that the test has asked for: their failures have been told."""
 
     def _live_run(self) -> SteppedRun:
         quiet_zenoh()
@@ -133,10 +135,14 @@ class RunHarness:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            await asyncio.to_thread(self.end)
-        else:
+        if kind is not None:
             await asyncio.to_thread(self.close)
+            return
+        judgement = await asyncio.to_thread(self.end)
+        promised = {PREFIX + name for name in self._promises} - self._named
+        broken = [each for each in judgement.checks if each.name in promised and each.verdict is Verdict.INVALID]
+        if broken:
+            raise AssertionError(self._complaint(broken))
 
     async def run_until(self, time_s: float) -> None:
         """Let emulated time pass up to `time_s`. Raises VnetError if the run ends before it."""
@@ -238,12 +244,16 @@ class RunHarness:
     # Promises, judged at its end as checks of one's own: `own:NAME`, by default the predicate's name.
 
     def always(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
-        """Promise that a predicate is true at every moment (`emulator.checks.properties.always`)."""
-        self._promises.append(partial(always, name=name or _name_of(predicate), predicate=predicate, at=at))
+        """Promise that a predicate is true at every moment (`emulator.checks.properties.always`).
+
+        A broken promise fails the test when its block is left, if no `check` has before. Raises VnetError for a
+        name that has been taken, and once the run has ended; so do the other promises.
+        """
+        self._promise(name or _name_of(predicate), partial(always, predicate=predicate, at=at))
 
     def never(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
         """Promise that a predicate is true at no moment."""
-        self._promises.append(partial(never, name=name or _name_of(predicate), predicate=predicate, at=at))
+        self._promise(name or _name_of(predicate), partial(never, predicate=predicate, at=at))
 
     def eventually(
         self,
@@ -256,14 +266,33 @@ class RunHarness:
     ) -> None:
         """Promise that a predicate becomes true of each vehicle, or of `nodes`; see `properties.eventually`."""
         judge = partial(eventually, predicate=predicate, within_s=within_s, at=at, nodes=nodes)
-        self._promises.append(partial(judge, name=name or _name_of(predicate)))
+        self._promise(name or _name_of(predicate), judge)
 
     def leads_to(
         self, cause: Predicate, effect: Effect, *, within_s: float, name: str | None = None, at: str = PERIOD
     ) -> None:
         """Promise that each cause is followed by an effect within so many seconds; see `properties.leads_to`."""
-        name = name or _name_of(effect)
-        self._promises.append(partial(leads_to, name=name, cause=cause, effect=effect, within_s=within_s, at=at))
+        self._promise(
+            name or _name_of(effect), partial(leads_to, cause=cause, effect=effect, within_s=within_s, at=at)
+        )
+
+    def _promise(self, name: str, judge: Callable[..., Result]) -> None:
+        if self._judgement is not None:
+            raise VnetError(f"{PREFIX}{name}: the run has ended, and has been judged")
+        if name in self._promises:
+            raise VnetError(f"{PREFIX}{name}: there is a promise of this name")
+        self._promises[name] = partial(judge, name=name)
+
+    def _kept(self) -> Iterator[Result]:
+        """Judge the promises. Raises VnetError for a predicate that raises."""
+        run = Run.open(self.folder)
+        for name, judge in self._promises.items():
+            try:
+                yield judge(run)
+            except VnetError:
+                raise
+            except Exception as error:
+                raise VnetError(f"{PREFIX}{name}: the predicate raised {type(error).__name__}: {error}") from error
 
     # Its end.
 
@@ -273,8 +302,7 @@ class RunHarness:
             self._finish()
             self._judgement, verdict = conclude(self._emulation, self._wall_s, self._run.command)
             if self._promises:
-                run = Run.open(self.folder)
-                findings = [finding_of(judge(run)) for judge in self._promises]
+                findings = [finding_of(result) for result in self._kept()]
                 judge_further(self._emulation, self._judgement, verdict, findings)
         return self._judgement
 
@@ -314,6 +342,7 @@ class RunHarness:
             if name not in known and name not in left_out:
                 raise VnetError(f"no check is called {name!r}; there are: {', '.join([*known, *left_out])}")
         chosen = [check for check in judgement.checks if check.name in names or not names]
+        self._named |= {check.name for check in chosen}
         failed = [check for check in chosen if _fails(check, allow_unknown)]
         failed += [
             CheckResult(name, Verdict.UNKNOWN, f"not exercised: {left_out[name]}")

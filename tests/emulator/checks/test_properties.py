@@ -1,6 +1,7 @@
 """Properties over time: always, never, eventually, leads to, over reported values, events and truth."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -178,3 +179,29 @@ def test_a_test_promises_and_the_run_is_judged_by_it(tmp_path: Path) -> None:
 
     asyncio.run(story())
     assert Run.open(tmp_path / "run").verdict == "invalid"
+
+
+def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: Path) -> None:
+    scenario = make_scenario(
+        {"run": {"duration_s": 1.0, "settle_s": 0.0}, "network": {"vehicles": 2}},
+        {"program": "tests.emulator.checks.test_properties:brakes"},
+    )
+
+    async def story(folder: str, promise: Callable[[RunHarness], None]) -> None:
+        async with RunHarness(scenario, tmp_path / folder) as emu:
+            promise(emu)
+            await emu.run_until(0.5)
+            emu.check("gnss", allow_unknown=True)
+            with pytest.raises(VnetError, match="own:late: the run has ended, and has been judged"):
+                emu.always(lambda moment: True, name="late")
+
+    def twice(emu: RunHarness) -> None:
+        emu.always(lambda moment: False, name="same")
+        with pytest.raises(VnetError, match="own:same: there is a promise of this name"):
+            emu.never(lambda moment: False, name="same")
+
+    with pytest.raises(AssertionError, match="own:same is invalid: does not hold: first of v01 at 0 s"):
+        asyncio.run(story("broken", twice))
+    asyncio.run(story("kept", lambda emu: emu.always(lambda moment: True, name="kept")))
+    with pytest.raises(VnetError, match="own:wrong: the predicate raised ZeroDivisionError: division by zero"):
+        asyncio.run(story("raises", lambda emu: emu.always(lambda moment: bool(1 / 0), name="wrong")))
