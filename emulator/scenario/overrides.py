@@ -31,11 +31,12 @@ def apply_override(data: dict[str, Any], override: str) -> None:
 def wrong_value(path: PurePath, problem: str, overrides: Sequence[str]) -> ScenarioError:
     """Return the error for a problem that begins with its key: of the override of that key, else of the file."""
     found = re.match(r"[^\s:=]+", problem)
-    for override in overrides if found else ():
-        key = override.partition("=")[0].strip()
-        named = found[0] if found else ""
-        if f"{key}.".startswith(f"{named}.") or f"{named}.".startswith(f"{key}."):
-            return OverrideError(problem, key)
+    named = f"{found[0] if found else ''}."
+    keys = [override.partition("=")[0].strip() for override in overrides]
+    of_key = [key for key in keys if named.startswith(f"{key}.")]
+    of_section = [key for key in keys if f"{key}.".startswith(named)]
+    if of_key or len(of_section) == 1:  # of several in a section nobody knows which is to blame
+        return OverrideError(problem, (of_key or of_section)[0])
     return ScenarioError(f"{path}: {problem}")
 
 

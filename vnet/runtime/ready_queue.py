@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
+from vnet.errors import printable
 from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NumberedTimer
 from vnet.runtime.current_node import current_node
@@ -197,7 +198,7 @@ class OrderedQueue(ReadyQueue):
 
     def add_job(self, node: Node, name: str, job: Future[Any], show: Callable[[], None]) -> None:
         """`node` has submitted a job to an executor, whose result `show` sets."""
-        label = f"result of {name[:LONGEST_NAME]}"
+        label = f"result of {printable(name, LONGEST_NAME)}"
         self._rounds(node).jobs.append(_Event(label, label, job, show, job))
 
     def setter(self, node: Node | None, task: asyncio.Task[Any] | None) -> tuple[str, object]:
@@ -214,7 +215,7 @@ class OrderedQueue(ReadyQueue):
         if task not in rounds.names:
             name = getattr(task.get_coro(), "__qualname__", "a task").rsplit("<locals>.", 1)[-1]
             name = "main" if name == "Host._main" else name
-            name = name[:LONGEST_NAME]
+            name = printable(name, LONGEST_NAME)
             rounds.named[name] += 1
             rounds.names[task] = name if rounds.named[name] == 1 else f"{name}#{rounds.named[name]}"
         return rounds.names[task], rounds.names[task]

@@ -1,0 +1,14 @@
+"""Overrides of a scenario: which of them a message names."""
+
+from pathlib import PurePath
+
+from emulator.scenario.overrides import wrong_value
+from vnet.errors import OverrideError
+
+
+def test_of_several_overrides_of_a_section_none_is_blamed_for_what_all_make() -> None:
+    problem, path = "run: tape goes with order", PurePath("s.toml")
+    both = ["run.order=shuffle", "run.tape=t"]
+    assert str(wrong_value(path, problem, both)) == f"s.toml: {problem}"
+    assert isinstance(wrong_value(path, problem, both[1:]), OverrideError)
+    assert isinstance(wrong_value(path, "run.tape = 3: a path", both), OverrideError)
