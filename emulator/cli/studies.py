@@ -69,8 +69,8 @@ def campaign(
         str | None, typer.Option(metavar="ADDRESS", help="Run on the workers of Dask: dask://HOST:PORT.")
     ] = None,
     shrink_steps: Annotated[
-        int, typer.Option(min=0, max=50, metavar="N", help="Runs to shrink a failure with.")
-    ] = 50,
+        int, typer.Option(min=0, max=1000, metavar="N", help="Most runs to shrink a failure with.")
+    ] = 250,
     time_limit: Annotated[
         float, typer.Option(min=1.0, metavar="SECONDS", help="Wall clock that a run may take.")
     ] = 300.0,

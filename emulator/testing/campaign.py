@@ -37,8 +37,8 @@ from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.failure_page import shown_parting, write_failure_page
 from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, regression_test
-from emulator.testing.shrinking import Schedule, shrink
-from emulator.testing.shrinking_runs import order_text, shrink_order, shrink_run, with_faults
+from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
+from emulator.testing.shrinking_runs import MOST_ORDER_STEPS, order_text, shrink_order, shrink_run, with_faults
 from emulator.testing.trial import Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError
@@ -244,14 +244,15 @@ class Campaign:
 
     def _smallest(self, outcome: Outcome, still_fails: Callable[[Scenario], bool]) -> tuple[Scenario, int]:
         """Return the least run found that still fails, and how many were tried: order, faults, vehicles, time."""
-        base, of_order = outcome.scenario, 0
+        base, left = outcome.scenario, self._plan.shrink_steps
         if base.run.order != "fifo":
-            base, of_order = shrink_order(base, outcome.trial.tape, still_fails)
-        schedule, of_faults = shrink(
-            base.fault, lambda schedule: still_fails(with_faults(base, schedule)), self._plan.shrink_steps
+            base, steps = shrink_order(base, outcome.trial.tape, still_fails, min(MOST_ORDER_STEPS, left))
+            left -= steps
+        schedule, steps = shrink(
+            base.fault, lambda schedule: still_fails(with_faults(base, schedule)), min(MOST_STEPS, left)
         )
-        shrunk, of_run = shrink_run(with_faults(base, schedule), still_fails)
-        return shrunk, of_order + of_faults + of_run
+        shrunk, more_steps = shrink_run(with_faults(base, schedule), still_fails, left - steps)
+        return shrunk, self._plan.shrink_steps - left + steps + more_steps
 
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""

@@ -17,7 +17,6 @@ from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
 from emulator.testing.schedules import LEAST_TIME_S, ScheduleConstraints, draw_fault, known_kinds
-from emulator.testing.shrinking import MOST_STEPS
 from vnet.errors import ScenarioError
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
@@ -27,6 +26,8 @@ MOST_FAULTS = 4
 SEEDS = 2**63
 RANDOM, NONE = "random", "none"
 """Faults of all kinds, and none drawn: then the runs differ by their seeds."""
+SHRINK_STEPS = 250
+"""Runs that shrink a failure: of its order, then of its faults, then of its vehicles and seconds."""
 T = TypeVar("T")
 
 
@@ -39,7 +40,7 @@ class Plan:
     seed: int
     kinds: tuple[str, ...]
     limit_s: float = 300.0
-    shrink_steps: int = MOST_STEPS
+    shrink_steps: int = SHRINK_STEPS
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     note: str = ""
     """Change of the scenario that the campaign has made by itself, in one line; "" if none."""

@@ -46,13 +46,16 @@ def shrink_order(
 ) -> tuple[Scenario, int]:
     """Return the scenario with the fewest deviations of its tape that still fail, and how many runs that took.
 
-    FIFO itself is tried first. Where the tape does not fail either, the scenario comes back as it was.
+    FIFO itself is tried first. Where the tape does not fail either, the scenario comes back as it was; so it does
+    if `most` runs are too few to try both.
     """
+    if most < 2:
+        return scenario, 0
     if still_fails(fifo := with_tape(scenario, ())):
         return fifo, 1
     if not tape or not still_fails(with_tape(scenario, tape)):
         return scenario, 2
-    least, steps = fewest(tape, lambda some: still_fails(with_tape(scenario, some)), most)
+    least, steps = fewest(tape, lambda some: still_fails(with_tape(scenario, some)), most - 2)
     return with_tape(scenario, least), steps + 2
 
 
@@ -89,11 +92,11 @@ def _with_and_without_parts(items: Sequence[T], parts: int) -> Iterator[Sequence
         yield [*items[:first], *items[end:]]
 
 
-def shrink_run(scenario: Scenario, still_fails: Fails) -> tuple[Scenario, int]:
-    """Return the run with half the vehicles and time, as often as that fails, and how many runs it took."""
+def shrink_run(scenario: Scenario, still_fails: Fails, most: int) -> tuple[Scenario, int]:
+    """Return the run with half the vehicles and time, as often as that fails, and the number of runs, at most `most`."""
     steps = 0
     for smaller in (_fewer_vehicles, _less_time):
-        while (candidate := smaller(scenario)) is not None:
+        while steps < most and (candidate := smaller(scenario)) is not None:
             steps += 1
             if not still_fails(candidate):
                 break

@@ -33,6 +33,21 @@ def test_what_fails_together_is_left(needed: set[int]) -> None:
     assert tried < 300
 
 
+@pytest.mark.parametrize("most", [0, 1, 2, 5])
+def test_a_campaign_shrinks_with_no_more_runs_than_it_is_allowed(tmp_path: Path, most: int) -> None:
+    scenario = Scenario.model_validate(
+        {
+            "run": {"duration_s": 1.0, "settle_s": 0.0, "order": "shuffle"},
+            "network": {"vehicles": 2},
+            "program": {"entry": "tests.emulator.testing.programs:tells_before_it_measures"},
+        }
+    )
+    plan = Plan.of(scenario, "none", 1, 1, shrink_steps=most, jobs=1)
+    assert run_campaign(plan, tmp_path / "campaign", Console(file=io.StringIO())) == 1
+    (row,) = json.loads((tmp_path / "campaign" / "campaign.json").read_text())["results"]
+    assert row["failed"] and row["steps"] <= most
+
+
 def test_no_more_is_tried_than_is_allowed() -> None:
     tried: list[int] = []
 
