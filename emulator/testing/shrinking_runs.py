@@ -93,7 +93,10 @@ def _with_and_without_parts(items: Sequence[T], parts: int) -> Iterator[Sequence
 
 
 def shrink_run(scenario: Scenario, still_fails: Fails, most: int) -> tuple[Scenario, int]:
-    """Return the run with half the vehicles and time, as often as that fails, and the number of runs, at most `most`."""
+    """Return the run with half the vehicles and time, as often as that fails, and how many runs it took.
+
+    There are `most` of them at most.
+    """
     steps = 0
     for smaller in (_fewer_vehicles, _less_time):
         while steps < most and (candidate := smaller(scenario)) is not None:
