@@ -47,7 +47,7 @@ from vnet.cmm.plausibility import (
     cut_to,
     median_belief,
     moved,
-    priors_agree,
+    prior_shares,
     scaled_by,
     scaled_down,
     spread_limit_m,
@@ -143,7 +143,8 @@ class InformationEstimator:
         self._share = Share(0, (0.0, 0.0, 0.0), frozenset(), frozenset())
         self._now_ns = -period_ns
         self._contradicted = 0
-        self._used_shares: list[float] = []  # of the increments of the frames that are believed
+        self._prior_shares: list[float] = []  # of the frames of this period
+        self._used_shares: list[float] = []  # of their increments
         self._prior = as_sent(self.own.prior)
         self._increment: Five = _NOTHING
         self._largest_increment = 0.0
@@ -209,8 +210,10 @@ class InformationEstimator:
     def agree(self) -> None:
         """Do a round of consensus, and fuse, with the frames of this period."""
         own = plain_moments(*self._prior)
-        frames = self._believed(self._current_frames(), own)
-        own = plain_moments(*self._prior)  # another one if the vehicle has begun again
+        frames = self._current_frames()
+        self._compare(list(frames.values()), own)
+        if self._begins_again([frame.prior for frame in frames.values()]):
+            own, frames = plain_moments(*self._prior), {}  # the new belief is what they know
         heard = list(frames.values())
         # Of all that follows what this vehicle says itself is the first.
         priors, means_m, leaning = self._moderated(heard, own)
@@ -245,39 +248,36 @@ class InformationEstimator:
         self._frames = {}
         return frames
 
-    def _believed(self, frames: dict[str, InformationFrame], own: Five) -> dict[str, InformationFrame]:
-        """Return the frames that are plausible; `own` is the mean and the covariance of the vehicle's own prior."""
-        if not self._options.defence or not frames:
-            return frames
+    def _compare(self, heard: Sequence[InformationFrame], own: Five) -> None:
+        """Find the shares (n,) of their priors and of their increments that are used.
+
+        `own` is the mean and the covariance of the vehicle's own prior.
+        """
+        self._prior_shares = self._used_shares = [1.0] * len(heard)
+        if not self._options.defence or not heard:
+            return
         x, y, *covariance_m2 = own
-        heard = list(frames.values())
-        near = priors_agree([frame.moments for frame in heard], own)
+        self._prior_shares = prior_shares([frame.moments for frame in heard], own)
         codes, increments = [frame.code for frame in heard], [frame.increment for frame in heard]
         belief = (x, y), (covariance_m2[0], covariance_m2[1], covariance_m2[2])
         used = self._origins.shares(codes, increments, belief, self._now_ns / NS_PER_S)
-        used = unless_most_disagree(used)
-        if self._begins_again(near, [frame.prior for frame in heard]):
-            self._used_shares = []  # the new belief is what they know
-            return {}
-        used = [share if is_near else 0.0 for is_near, share in zip(near, used, strict=True)]
-        self._used_shares = [share for share in used if share]
-        if min(used) == 1:
-            return frames
-        self._reject("prior", near.count(False))
-        self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))
-        return {name: frame for (name, frame), share in zip(frames.items(), used, strict=True) if share}
+        self._used_shares = unless_most_disagree(used)
+        if min(self._prior_shares) < 1 or min(self._used_shares) < 1:
+            self._reject("prior", sum(share < COUNTED_SHARE for share in self._prior_shares))
+            self._reject("increment", sum(share < COUNTED_SHARE for share in self._used_shares))
 
     def _reject(self, reason: str, count: int) -> None:
         """Count what is not used."""
         if count:
             self.rejected[reason] += count
 
-    def _begins_again(self, near: list[bool], priors: Sequence[Five]) -> bool:
+    def _begins_again(self, priors: Sequence[Five]) -> bool:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long.
 
         Returns whether it did.
         """
-        contradicted = len(near) >= LOST_NEIGHBOURS and 2 * near.count(False) > len(near)
+        far = sum(share < 1 for share in self._prior_shares)
+        contradicted = len(priors) >= LOST_NEIGHBOURS and 2 * far > len(priors)
         self._contradicted = self._contradicted + 1 if contradicted else 0
         if self._contradicted < LOST_PERIODS:
             return False
@@ -343,7 +343,7 @@ class InformationEstimator:
         """Return the weights (1 + n,) of the priors.
 
         They have means (1 + n,) and covariances with traces (1 + n,). The weight of who is always to one side,
-        `leaning` (n,), goes to the vehicle itself.
+        `leaning` (n,), goes to the vehicle itself, and of who is far off in part.
         """
         self._rule.notice([frame.largest_degree for frame in frames.values()], len(self._share.heard))
         degrees = [len(frame.heard) for frame in frames.values()]
@@ -351,8 +351,8 @@ class InformationEstimator:
         weights: list[float] = of_rule.tolist()
         if self._options.defence:
             leaning = leaning or [False] * len(frames)
-            each = zip(weights[1:], leaning, strict=True)
-            others = [0.0 if leans else (1 - SELF_SHARE) * weight for weight, leans in each]
+            each = zip(weights[1:], self._prior_shares if frames else [], leaning, strict=True)
+            others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
             weights = [1 - sum(others), *others]
         self._weights = weights
         self._weighed = list(frames)

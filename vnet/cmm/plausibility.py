@@ -111,18 +111,21 @@ def _squared(
     return (d * x * x - 2 * b * x * y + a * y * y) / (a * d - b * b)
 
 
-def priors_agree(priors: Sequence[Five], own: Five) -> list[bool]:
-    """Tell which priors are near one's own: rᵀ S⁻¹ r < `PRIOR_GATE`, r being the difference of the means.
+def prior_shares(priors: Sequence[Five], own: Five) -> list[float]:
+    """Return the share (n,) of its weight that each prior has: 1 within `PRIOR_GATE`, beyond it gate : rᵀ S⁻¹ r.
 
-    S is the sum of both covariances. Each is the mean (x, y) and the covariance (xx, xy, yy).
+    r is the difference of the means, S the sum of both covariances. Each prior, and one's `own`, is the mean (x, y)
+    and the covariance (xx, xy, yy). Were a prior dropped, a vehicle that sees along one lane only, and begins two
+    deviations off, would never believe those who are right.
     """
     own_x, own_y, own_xx, own_xy, own_yy = own
-    agrees = []
+    shares = []
     for mean_x, mean_y, xx, xy, yy in priors:
         x, y = mean_x - own_x, mean_y - own_y
         a, b, d = xx + own_xx, xy + own_xy, yy + own_yy
-        agrees.append(d * x * x - 2 * b * x * y + a * y * y < PRIOR_GATE * (a * d - b * b))
-    return agrees
+        squared, gate = d * x * x - 2 * b * x * y + a * y * y, PRIOR_GATE * (a * d - b * b)
+        shares.append(1.0 if squared < gate else gate / max(squared, _TINY))
+    return shares
 
 
 def spread_limit_m(priors: Sequence[Five]) -> tuple[tuple[float, float], float]:

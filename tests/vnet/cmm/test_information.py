@@ -24,7 +24,7 @@ from vnet.cmm.plausibility import (
     deviation,
     median_belief,
     moved,
-    priors_agree,
+    prior_shares,
     scaled_down,
     spread_limit_m,
     unless_most_disagree,
@@ -206,12 +206,15 @@ def test_only_so_many_origins_are_kept() -> None:
     assert len(origins) <= 1024
 
 
-def test_priors_agree_within_what_both_claim() -> None:
-    priors = [(off_m, 0.0, 0.5, 0.0, 0.5) for off_m in (0.0, 1.5, 9.0)]
-    assert priors_agree(priors, priors[0]) == [True, True, False]
+def test_priors_count_in_full_within_what_both_claim_and_a_liars_pull_vanishes() -> None:
+    priors = [(off_m, 0.0, 0.5, 0.0, 0.5) for off_m in (0.0, 1.5, 4.0, 40.0)]
+    shares = prior_shares(priors, priors[0])
+    assert shares == pytest.approx([1.0, 1.0, 4 / 4.0**2, 4 / 40.0**2])
+    pulls_m = [share * off_m for share, (off_m, *_) in zip(shares, priors, strict=True)]
+    assert pulls_m[3] < pulls_m[2] < pulls_m[1], "the further off, the less it draws"
 
 
-def test_priors_agree_as_the_distance_of_mahalanobis_says() -> None:
+def test_priors_are_weighed_by_the_distance_of_mahalanobis() -> None:
     rng = np.random.default_rng(1)
     roots, means = rng.normal(size=(200, 2, 2)), 2 * rng.normal(size=(200, 2))
     covariances_m2 = roots @ roots.transpose(0, 2, 1)
@@ -219,9 +222,9 @@ def test_priors_agree_as_the_distance_of_mahalanobis_says() -> None:
     off_m = means - own_m
     squared = np.einsum("ni,nij,nj->n", off_m, np.linalg.inv(covariances_m2 + own_m2), off_m)
     priors = [tuple(row) for row in np.hstack([means, covariances_m2.reshape(-1, 4)[:, [0, 1, 3]]]).tolist()]
-    agrees = priors_agree(priors, (0.3, -0.2, 0.2, 0.1, 0.3))
-    assert agrees == (squared < PRIOR_GATE).tolist()
-    assert {True, False} == set(agrees)
+    shares = prior_shares(priors, (0.3, -0.2, 0.2, 0.1, 0.3))
+    assert_allclose(shares, np.minimum(1.0, PRIOR_GATE / squared))
+    assert min(shares) < 1 == max(shares)
 
 
 def test_the_median_belief_is_not_moved_by_one_liar() -> None:
