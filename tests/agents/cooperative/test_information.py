@@ -235,6 +235,18 @@ def test_vehicles_that_are_wrong_begin_again_where_the_others_are(count: int) ->
     assert network.errors_m().max() < 0.7
 
 
+def test_who_begins_three_deviations_off_believes_the_only_two_it_hears() -> None:
+    """They are too few for it to begin again, and its own lane does not tell it."""
+    network = Network(8, reach=1)
+    network.run(30)
+    matrix = np.linalg.inv(np.diag([5.8, 0.1]))  # its lane leads east
+    network.estimators[0].own.restart(Information.of(COMMON_M + [7.5, 0.0], matrix))
+    network.run(1)
+    assert network.errors_m()[0] > 2
+    network.run(80)
+    assert network.errors_m()[0] < 1.0
+
+
 def test_a_restarted_vehicle_learns_from_the_others() -> None:
     network = Network(6)
     network.run(30)
