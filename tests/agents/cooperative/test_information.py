@@ -240,7 +240,7 @@ def test_who_begins_three_deviations_off_believes_the_only_two_it_hears() -> Non
     network = Network(8, reach=1)
     network.run(30)
     matrix = np.linalg.inv(np.diag([5.8, 0.1]))  # its lane leads east
-    network.estimators[0].own.restart(Information.of(COMMON_M + [7.5, 0.0], matrix))
+    network.estimators[0].own.restart(Information.of(COMMON_M + np.array([7.5, 0.0]), matrix))
     network.run(1)
     assert network.errors_m()[0] > 2
     network.run(80)
