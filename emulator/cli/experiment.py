@@ -17,6 +17,7 @@ from emulator.cli.help import group
 from emulator.cli.options import pair
 from emulator.experiments import paper
 from emulator.records.paper_values import PAPER_RMSE_M
+from emulator.scenario.limits import DAY_S
 from emulator.terminal.console import one_line_errors, tell
 from vnet.errors import VnetError
 
@@ -116,7 +117,9 @@ def tempering(
 def divergence(
     networks: NetworksOption = None,
     seeds: SeedsOption = 100,
-    duration: Annotated[float, typer.Option(min=1, metavar="SECONDS", help="Emulated length of each run.")] = 30.0,
+    duration: Annotated[
+        float, typer.Option(min=1, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
+    ] = 30.0,
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
@@ -134,7 +137,9 @@ def divergence(
 def attackers(
     networks: NetworksOption = None,
     seeds: SeedsOption = 3,
-    duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 30.0,
+    duration: Annotated[
+        float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
+    ] = 30.0,
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
@@ -164,7 +169,8 @@ def compare(
     networks: NetworksOption = None,
     seeds: SeedsOption = 10,
     duration: Annotated[
-        float | None, typer.Option(min=1, metavar="SECONDS", help="Emulated length: 100, with churn 900.")
+        float | None,
+        typer.Option(min=1, max=DAY_S, metavar="SECONDS", help="Emulated length: 100, with churn 900."),
     ] = None,
     common: Annotated[
         Path | None, typer.Option(metavar="FILE", help="A recorded common error in place of a drawn one.")
@@ -209,7 +215,9 @@ def city(
         bool, typer.Option("--refuse-impossible", metavar="", help="Refuse trips that no vehicle can drive.")
     ] = False,
     seeds: SeedsOption = 3,
-    duration: Annotated[float, typer.Option(min=2, metavar="SECONDS", help="Emulated length of each run.")] = 300.0,
+    duration: Annotated[
+        float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
+    ] = 300.0,
     out: OutOption = None,
     only: OnlyOption = None,
     live: LiveOption = False,
@@ -274,7 +282,7 @@ def consensus(networks: NetworksOption = None, seeds: SeedsOption = 3, out: OutO
 
 @app.command()
 def capacity(
-    seconds: Annotated[float, typer.Option(min=1, help="Emulated seconds of each network.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=1, max=DAY_S, help="Emulated seconds of each network.")] = 5.0,
     seeds: SeedsOption = 2,
     out: OutOption = None,
 ) -> None:

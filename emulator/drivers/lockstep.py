@@ -23,6 +23,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.lockstep_process import LockstepProcess
 from emulator.drivers.news_feed import NewsFeed
 from emulator.drivers.protocol import ProtocolError, check_yield, wire_packet
 from emulator.scenario.lookahead import lookahead_ns
@@ -31,45 +32,6 @@ from vnet.node import Fix
 from vnet.radio import Packet
 from vnet.runtime.mail import Mail
 from vnet.transport import wire
-
-
-class _Process:
-    """One event loop: its nodes, what they last said, and what waits for its next wake-up.
-
-    `order` is its place among all processes. `plan` numbers its planned wake-up: earlier ones are void.
-    """
-
-    def __init__(self, nodes: Sequence[str], order: int) -> None:
-        self.id = nodes[0]
-        self.nodes = tuple(nodes)
-        self.order = order
-        self.plan = -1
-        self.seq = 0
-        self.granted_ns = 0
-        self.next_timer_ns: int | None = None
-        self.waiting_radio: Sequence[str] = ()
-        self.waiting_gnss: Sequence[str] = ()
-        self.steps: Sequence[wire.Step] = ()
-        self.packets: dict[str, list[Packet]] = {node: [] for node in self.nodes}
-        self.next_fix = dict.fromkeys(self.nodes, 0)
-        self.paused: set[str] = set()
-        self.affected: set[str] = set()
-        self.clocks: list[wire.ClockError] = []
-
-    @property
-    def running(self) -> list[str]:
-        """Nodes that are not paused."""
-        return [node for node in self.nodes if node not in self.paused]
-
-    def take_packets(self) -> dict[str, list[Packet]]:
-        """Return the packets of nodes that run, and have any."""
-        due = {node: self.packets[node] for node in self.running if self.packets[node]}
-        self.packets.update({node: [] for node in due})
-        return due
-
-    def take_clocks(self) -> list[wire.ClockError]:
-        changed, self.clocks = self.clocks, []
-        return changed
 
 
 class Lockstep:
@@ -89,7 +51,7 @@ class Lockstep:
         self._groups = {nodes[0]: tuple(nodes) for nodes in processes}
         self._order = {process_id: order for order, process_id in enumerate(self._groups)}
         self._process_of = {node: nodes[0] for nodes in processes for node in nodes}
-        self._processes: dict[str, _Process] = {}
+        self._processes: dict[str, LockstepProcess] = {}
         self._permanent = permanent
         self._actions: list[ProcessActions] = []
         self._woken: set[str] = set()
@@ -98,7 +60,8 @@ class Lockstep:
         self._plans = count()
         self._listens = np.zeros(len(emulation.world.node_ids), dtype=bool)
         """Nodes (N,) that an arrival wakes."""
-        self._yielded: list[_Process] = []
+        self._yielded: list[LockstepProcess] = []
+        self._deaths: list[tuple[LockstepProcess, dict[str, Any]]] = []
         self._news = NewsFeed(emulation)
         self._crowded: set[str] = set()
         """Nodes for which more packets wait than a mailbox holds."""
@@ -165,18 +128,24 @@ class Lockstep:
     def died(self, process_id: str, **details: Any) -> None:
         """A process has ended: its nodes are down from the beginning of the window on, and nothing is owed by it.
 
-        What it did within the window is lost with it; at quiet instants since it has told nothing.
+        What it did within the window is lost with it; at quiet instants since it has told nothing. `step` tells of
+        those of a window in the order of processes, whichever the system has told of first.
         """
-        process = self._processes.get(process_id)
-        if process is None:  # a fault was faster
-            return
-        self._remove(process_id)
-        self.owed.pop(process_id, None)
-        for node in process.nodes:
-            self._emulation.died(self.now_ns, node, **details)
+        if process := self._processes.get(process_id):  # else a fault was faster
+            self._remove(process_id)
+            self.owed.pop(process_id, None)
+            self._deaths.append((process, details))
+
+    def tell_deaths(self) -> None:
+        """Tell of the processes that have died since, where no `step` follows."""
+        for process, details in sorted(self._deaths, key=lambda death: death[0].order):
+            for node in process.nodes:
+                self._emulation.died(self.now_ns, node, **details)
+        self._deaths.clear()
 
     def step(self) -> dict[str, wire.Grant]:
         """Do what was yielded, go to the next window, and say who is granted it; none at the end, or if held."""
+        self.tell_deaths()
         self._settle()
         return self._go_on()
 
@@ -308,8 +277,8 @@ class Lockstep:
 
     # Processes, and when they run next.
 
-    def _add(self, process_id: str) -> _Process:
-        process = _Process(self._groups[process_id], self._order[process_id])
+    def _add(self, process_id: str) -> LockstepProcess:
+        process = LockstepProcess(self._groups[process_id], self._order[process_id])
         self._processes[process_id] = process
         return process
 
@@ -319,7 +288,7 @@ class Lockstep:
             self._listens[self._emulation.number[node]] = False
         self._news.take(() if process is None else process.nodes)
 
-    def _plan(self, process: _Process) -> None:
+    def _plan(self, process: LockstepProcess) -> None:
         """Note what a process waits for: an arrival, or a time that is known."""
         for node in process.nodes:
             self._listens[self._emulation.number[node]] = False
@@ -330,7 +299,7 @@ class Lockstep:
         if wake_ns is not None:
             heappush(self._wakes, (wake_ns, process.order, process.plan, process.id))
 
-    def _known_wake_ns(self, process: _Process) -> int | None:
+    def _known_wake_ns(self, process: LockstepProcess) -> int | None:
         """Return when a process runs next without an arrival: at a timer, at a fix, or now if it was woken."""
         if process.id in self._woken and (self._permanent or process.running):
             return self.now_ns  # a program may end while all are paused
@@ -375,7 +344,7 @@ class Lockstep:
                     self._apply_clock_error(process, clock)
             self._plan(process)
 
-    def _apply_clock_error(self, process: _Process, clock: wire.ClockError) -> None:
+    def _apply_clock_error(self, process: LockstepProcess, clock: wire.ClockError) -> None:
         if clock.is_wrong or clock.node in process.affected:
             process.clocks.append(clock)
             process.affected.add(clock.node)
@@ -401,7 +370,7 @@ class Lockstep:
         processes = self._processes
         return {each: self._grant_one(processes[each], time_ns) for each, time_ns in wakes.items()}
 
-    def _grant_one(self, process: _Process, time_ns: int) -> wire.Grant:
+    def _grant_one(self, process: LockstepProcess, time_ns: int) -> wire.Grant:
         self._woken.discard(process.id)
         process.granted_ns = time_ns
         fixes = [(node, fix) for node in process.running for fix in self._take_fixes(process, node)]
@@ -422,7 +391,7 @@ class Lockstep:
         process.seq += 1
         return grant
 
-    def _take_fixes(self, process: _Process, node: str) -> list[Fix]:
+    def _take_fixes(self, process: LockstepProcess, node: str) -> list[Fix]:
         """Return the fixes that are due: a window ends with the period, so none is due within it."""
         world = self._emulation.world
         last = self.now_ns // world.period_ns
@@ -438,7 +407,7 @@ class Lockstep:
         fixes = [self._emulation.gnss.fix(period, number) for period in periods]
         return [fix for fix in fixes if fix is not None]
 
-    def _quiet_grant(self, process: _Process, grant: wire.Grant) -> wire.Grant:
+    def _quiet_grant(self, process: LockstepProcess, grant: wire.Grant) -> wire.Grant:
         """Return the grant with the bound of quiet instants, and the fixes of the next period if it lies before."""
         period = self.now_ns // self._emulation.world.period_ns + 1
         due_ns = period * self._emulation.world.period_ns

@@ -108,7 +108,7 @@ def _scenario(
     faults = [] if attack.fault is None else [{**always, **attack.fault}]
     return Scenario.model_validate(
         {
-            "run": {"name": "cell", "seed": seed, "duration_s": duration_s},
+            "run": {"name": "cell", "seed": seed, "duration_s": duration_s, "settle_s": min(5.0, duration_s / 2)},
             "network": dict(network),
             "radio": {"range_m": PAPER_RANGE_M, "loss": 0.1},
             "program": {"entry": COOPERATIVE, "options": options, "exceptions": exceptions},

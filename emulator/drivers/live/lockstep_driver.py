@@ -87,6 +87,12 @@ class LockstepDriver(Driver):
 
     async def run(self) -> None:
         """Grant and await yields, window by window."""
+        try:
+            await self._run()
+        finally:
+            self._lockstep.tell_deaths()
+
+    async def _run(self) -> None:
         lockstep = self._lockstep
         await self._before_horizon(lockstep)
         grants = lockstep.start()

@@ -169,6 +169,19 @@ def test_a_process_that_died_owes_nothing_and_its_nodes_are_down() -> None:
     assert died == [("v01", "SIGSEGV"), ("v02", "SIGSEGV")]
 
 
+def test_deaths_of_one_window_are_told_in_the_order_of_processes() -> None:
+    lockstep, emulation = barrier(processes=[["v01"], ["v02"], ["v03"], ["v04"]])
+    grants = lockstep.start()
+    lockstep.receive("v02", yielded(grants["v02"], 10 * MS))
+    for process_id in ("v04", "v01", "v03"):
+        lockstep.died(process_id)
+    assert times(lockstep.step()) == {"v02": 10 * MS}
+    lockstep.died("v02")
+    lockstep.tell_deaths()
+    died = [event.node for event in emulation.folder.events if event.kind == "died"]
+    assert died == ["v01", "v03", "v04", "v02"]
+
+
 def test_faults_act_before_anything_else_of_their_instant() -> None:
     lockstep, emulation = barrier([fault("kill", 0.5, 0.3, "v02"), fault("pause", 0.5, 0.2, "v03")])
     yield_all(lockstep, lockstep.start(), **dict.fromkeys(IDS, 500 * MS))

@@ -39,3 +39,7 @@ def test_figures_are_those_of_the_others(attack: str, harms: bool) -> None:
     assert f"{lied_to:.3f}" in line
     assert f"{lied_to / honest:.2f}" in line
     assert "6 s, counted from 3 s on; 1 seed" in text
+
+
+def test_the_shortest_run_that_the_command_takes_can_be_made() -> None:
+    assert {cell.scenario.run.duration_s for cell in attack_cells(TINY, [1], 2.0)} == {2.0}

@@ -118,7 +118,7 @@ def test_in_lockstep_a_yield_after_the_death_of_its_process_is_refused(monkeypat
 
         play = Play(LockstepDriver, answer)
         await play.driver.run()
-        assert play.stage.events("died", "refused", "stalled") == [("died", "v02"), ("refused", "v02")]
+        assert play.stage.events("died", "refused", "stalled") == [("refused", "v02"), ("died", "v02")]
         assert [node for node, _ in play.sent(wire.Grant)].count("v04") == 6
 
     in_virtual_time(run(), monkeypatch)
