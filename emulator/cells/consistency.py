@@ -70,13 +70,14 @@ def others_figures(recorded: RecordedTables, from_s: float) -> dict[str, Any]:
     first = math.ceil(from_s * NS_PER_S / period_ns)
     common_m = (recorded.vectors("common_error_estimate_m") - recorded.vectors("common_error_m"))[:, others]
     position_m = (recorded.vectors("estimate_m") - recorded.vectors("position_m"))[:, others]
-    nees = normalized(common_m, recorded.matrices("common_error_covariance_m2")[:, others])
-    far = first_divergences(np.linalg.norm(common_m, axis=2), period_ns)
+    squares = normalized(common_m, recorded.matrices("common_error_covariance_m2")[:, others])
+    divergent = first_divergences(np.linalg.norm(common_m, axis=2), period_ns)
+    divergent |= first_divergences(np.sqrt(squares), period_ns, DIVERGENT_SIGMAS)
     return {
         "others_rmse_m": _root_mean_square(common_m[first:]),
         "others_position_rmse_m": _root_mean_square(position_m[first:]),
-        "others_anees": _mean(nees[first:] / 2),
-        "others_divergent": len(far.keys() | first_divergences(np.sqrt(nees), period_ns, DIVERGENT_SIGMAS).keys()),
+        "others_anees": _mean(squares[first:] / 2),
+        "others_divergent": len(divergent),
     }
 
 

@@ -28,7 +28,7 @@ from emulator.world.trips.drive import whole_motion
 from emulator.world.trips.files import check_trips_name, write_trips
 from emulator.world.trips.generate import LEFT, RIGHT, generate_motion
 from emulator.world.trips.motion import Motion
-from vnet.errors import ScenarioError
+from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array
 
 RATE_HZ = 10.0
@@ -143,6 +143,8 @@ def datum(
     with one_line_errors():
         if others is not None:
             check_trips_name(others)
+            if others.exists() and any(others.samefile(read) for read in (trips_file, map_file) if read.exists()):
+                raise VnetError(f"--others {others}: is read by this command; name another file")
         motion = whole_motion(trips_file, pair("--origin", origin), RATE_HZ, RULES)
         roads = read_roads(map_file, pair("--origin", origin) or motion.origin_deg)
         lanes = roads.lane_map(drive_on.value)
@@ -156,8 +158,11 @@ def datum(
             raise ScenarioError(f"{map_file}: {error}") from None
         _print_datum(result, int(used.sum()))
         if others is not None:
-            rest = calibration.calibrate(found.of(~used))
-            print(f"# the other vehicles alone: datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}")
+            try:
+                rest = calibration.calibrate(found.of(~used))
+                print(f"# the other vehicles alone: datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}")
+            except ScenarioError as error:
+                print(f"# the other vehicles alone: {error}")
             _others(others, motion, used, RATE_HZ)
 
 

@@ -110,6 +110,9 @@ def test_datum_without_enough_trips_is_refused(driven: tuple[Path, Path]) -> Non
     assert status == 2 and "at least 10 are needed" in text and text.count("\n") <= 3
     assert "none.csv: cannot be read: No such file" in vnet_map("datum", driven[0], "none.csv")[1]
     assert "*.csv or *.parquet" in vnet_map("datum", *driven, "--others", "rest.txt")[1]
+    before = driven[1].read_bytes()
+    assert "is read by this command" in vnet_map("datum", *driven, "--others", driven[1])[1]
+    assert driven[1].read_bytes() == before
 
 
 def test_problems_of_a_map_are_found() -> None:
