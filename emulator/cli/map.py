@@ -160,9 +160,10 @@ def datum(
         if others is not None:
             try:
                 rest = calibration.calibrate(found.of(~used))
-                print(f"# the other vehicles alone: datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}")
+                alone = f"datum_m = {_metres(rest.datum_m)}, aside_m = {rest.aside_m:.2f}"
             except ScenarioError as error:
-                print(f"# the other vehicles alone: {error}")
+                alone = str(error)
+            print(f"# the other vehicles alone: {alone}")
             _others(others, motion, used, RATE_HZ)
 
 
