@@ -274,8 +274,10 @@ class InformationEstimator:
     def _begins_again(self, priors: Sequence[Five]) -> bool:
         """Begin again at the median of what the others know, if most have contradicted this vehicle for long.
 
-        Returns whether it did.
+        Returns whether it did. A period in which nothing is heard says neither.
         """
+        if not priors:
+            return False
         far = sum(share < 1 for share in self._prior_shares)
         contradicted = len(priors) >= LOST_NEIGHBOURS and 2 * far > len(priors)
         self._contradicted = self._contradicted + 1 if contradicted else 0
@@ -285,6 +287,7 @@ class InformationEstimator:
         self._origins = Origins()
         self.own.restart(median_belief(priors))
         self._prior, self._increment = as_sent(self.own.prior), _NOTHING
+        self._prior_shares = self._used_shares = []
         return True
 
     def _moderated(
@@ -351,7 +354,7 @@ class InformationEstimator:
         weights: list[float] = of_rule.tolist()
         if self._options.defence:
             leaning = leaning or [False] * len(frames)
-            each = zip(weights[1:], self._prior_shares if frames else [], leaning, strict=True)
+            each = zip(weights[1:], self._prior_shares, leaning, strict=True)
             others = [0.0 if leans else (1 - SELF_SHARE) * share * weight for weight, share, leans in each]
             weights = [1 - sum(others), *others]
         self._weights = weights

@@ -8,7 +8,7 @@ one's own; a failure says when, who, and what had happened to the vehicle before
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -86,14 +86,12 @@ def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Resul
 
     Raises VnetError for a predicate that answers anything but True, False or None; so do the other functions.
     """
-    asked = [(moment, _answer(name, predicate(moment))) for moment in moments(run, at)]
-    return _held(run, name, asked, True)
+    return _held(run, name, predicate, at, True)
 
 
 def never(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
     """Judge that a predicate is true at no moment; unknown if it has nothing to say at any."""
-    asked = [(moment, _answer(name, predicate(moment))) for moment in moments(run, at)]
-    return _held(run, name, asked, False)
+    return _held(run, name, predicate, at, False)
 
 
 def eventually(
@@ -110,9 +108,10 @@ def eventually(
     in the network for less than `within_s` before the end of the run counts only if the predicate has come true.
     """
     _check_within(name, within_s)
-    entered_s = {m.node: m.time_s for m in reversed(moments(run)) if nodes is None or m.node in nodes}
+    present = moments(run)
+    entered_s = {m.node: m.time_s for m in reversed(present) if nodes is None or m.node in nodes}
     reached: dict[str, float] = {}
-    for moment in moments(run, at):
+    for moment in present if at == PERIOD else moments(run, at):
         waited_s = moment.time_s - entered_s.get(moment.node, math.inf)
         asked = moment.node not in reached and waited_s <= within_s + _ROUNDING_S
         if asked and _answer(name, predicate(moment)):
@@ -195,7 +194,8 @@ def _answer(name: str, answer: object) -> bool | None:
     raise VnetError(f"{name}: the predicate answered {answer!r}: True, False or None is needed")
 
 
-def _held(run: Run, name: str, answers: Iterable[tuple[Moment, bool | None]], wanted: bool) -> Result:
+def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> Result:
+    answers = ((moment, _answer(name, predicate(moment))) for moment in moments(run, at))
     asked = [(moment, held) for moment, held in answers if held is not None]
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:

@@ -39,6 +39,9 @@ OnlyOption = Annotated[
     typer.Option("--only", metavar="LABEL=VALUE", help="Only such cells, for example --only network=n2."),
 ]
 SeedsOption = Annotated[int, typer.Option(min=1, metavar="N", help="Seeds 1 … N.")]
+DurationOption = Annotated[
+    float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
+]
 
 
 @app.command()
@@ -137,9 +140,7 @@ def divergence(
 def attackers(
     networks: NetworksOption = None,
     seeds: SeedsOption = 3,
-    duration: Annotated[
-        float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
-    ] = 30.0,
+    duration: DurationOption = 30.0,
     out: OutOption = None,
     only: OnlyOption = None,
 ) -> None:
@@ -215,9 +216,7 @@ def city(
         bool, typer.Option("--refuse-impossible", metavar="", help="Refuse trips that no vehicle can drive.")
     ] = False,
     seeds: SeedsOption = 3,
-    duration: Annotated[
-        float, typer.Option(min=2, max=DAY_S, metavar="SECONDS", help="Emulated length of each run.")
-    ] = 300.0,
+    duration: DurationOption = 300.0,
     out: OutOption = None,
     only: OnlyOption = None,
     live: LiveOption = False,

@@ -20,9 +20,9 @@ from emulator.experiments.statistics import shown_interval
 from emulator.experiments.tables import MISSING, markdown_table, paired_ratio, with_error
 from emulator.records.paper_values import PAPER_RANGE_M
 from emulator.scenario.scenario import Scenario
+from emulator.world.neighbours import links_within
 from emulator.world.world import build_world
 from vnet.counted import counted
-from vnet.types import Array
 
 ATTACKER = "agents.cooperative.attacker:main"
 LENGTH_S = 30.0
@@ -85,13 +85,8 @@ def _best_connected(section: Mapping[str, Any]) -> list[str]:
     """Return the vehicles of a network that have most others in range, the first of them first."""
     data = {"network": dict(section), "radio": {"range_m": PAPER_RANGE_M}, "program": {"entry": COOPERATIVE}}
     world = build_world(Scenario.model_validate(data))
-    degree = _degrees(world.at(0).position_m)
+    degree = links_within(world.at(0).position_m, PAPER_RANGE_M).out_degrees()
     return [world.node_ids[number] for number in np.argsort(-degree, kind="stable")[:UNCOUNTED]]
-
-
-def _degrees(position_m: Array) -> Array:
-    apart_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
-    return np.asarray((apart_m <= PAPER_RANGE_M).sum(axis=1))
 
 
 def _scenario(

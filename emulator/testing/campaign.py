@@ -251,8 +251,9 @@ class Campaign:
         schedule, steps = shrink(
             base.fault, lambda schedule: still_fails(with_faults(base, schedule)), min(MOST_STEPS, left)
         )
-        shrunk, more_steps = shrink_run(with_faults(base, schedule), still_fails, left - steps)
-        return shrunk, self._plan.shrink_steps - left + steps + more_steps
+        left -= steps
+        shrunk, steps = shrink_run(with_faults(base, schedule), still_fails, left)
+        return shrunk, self._plan.shrink_steps - (left - steps)
 
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""

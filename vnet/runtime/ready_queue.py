@@ -17,6 +17,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -180,8 +181,8 @@ class OrderedQueue(ReadyQueue):
             # Whether a cancelled timer ever comes here depends on the other timers of the loop.
             if not handle.cancelled():
                 source, group = handle.setter
-                event = _Event(f"timer of {source}", source, group, lambda: self._ready(node, handle, source))
-                event.cancelled = handle.cancelled
+                show = partial(self._ready, node, handle, source)
+                event = _Event(f"timer of {source}", source, group, show, cancelled=handle.cancelled)
                 self._rounds(node).events.append(event)
         else:
             running, source, _ = self._running
