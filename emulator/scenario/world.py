@@ -77,7 +77,7 @@ class Gnss(Section):
 class Lateral(Section):
     """`[world.lateral]`: how far a vehicle's centre strays from its lane's centre line."""
 
-    half_width_m: float = Field(0.85, gt=0, le=FAR_M)
+    half_width_m: float = Field(0.85, gt=0, le=WILD_M)
     """Largest lateral offset; programs know it from the map."""
     sigma_m: float = Field(0.4, ge=0, le=WILD_M)
     """Standard deviation of the offset, before it is reflected at the half-width."""

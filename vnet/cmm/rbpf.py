@@ -36,6 +36,8 @@ START_FACTOR = 10
 """So many times the particles at first: few of those that the prior spreads over metres survive the first fixes."""
 START_S = 0.45
 """Time (s) with more particles: the first fixes of the neighbours come within it."""
+LEAST_NOISE_M2 = 1e-4
+"""Least variance of a fix in each axis: particles tell no more, and an exact fix would have no density."""
 ACROSS_SHARE = 0.01
 """Variance of the acceleration across a straight lane, relative to that along it: vehicles hold their lane."""
 
@@ -94,6 +96,13 @@ class Observation:
     covariance_m2: Array
     heading_rad: float | None
     age_s: float = 0.0
+
+    @property
+    def inexact_covariance_m2(self) -> Array:
+        """The noise covariance (2, 2), of a receiver that is not exact."""
+        if self.covariance_m2.diagonal().min() >= LEAST_NOISE_M2:
+            return self.covariance_m2
+        return self.covariance_m2 + LEAST_NOISE_M2 * np.eye(2)
 
 
 class Rbpf:
@@ -172,7 +181,7 @@ class Rbpf:
         covariance = predicted_covariance(
             tracks.covariance[rows], moving, tracks.acceleration_m2_s4[rows], elapsed_s
         )
-        whitening = _whitening(covariance[:, :2, :2] + np.array([fix.covariance_m2 for fix in fixes]))
+        whitening = _whitening(covariance[:, :2, :2] + np.array([fix.inexact_covariance_m2 for fix in fixes]))
         gain = covariance[:, :, :2] @ whitening.transpose(0, 2, 1)
         is_all = len(rows) == len(tracks)
         mean = tracks.mean if is_all else tracks.mean[rows]
@@ -231,7 +240,7 @@ class Rbpf:
         mean[:2] = observation.position_m[:, None] - self.particles.at(np.array([observation.age_s]))
         speed_m_s = self.config.driving_m_s if self.map_evidence.drives else REST_SPEED_M_S
         covariance = np.zeros((4, 4))
-        covariance[:2, :2] = observation.covariance_m2
+        covariance[:2, :2] = observation.inexact_covariance_m2
         covariance[2:, 2:] = np.eye(2) * speed_m_s**2
         variance_m2 = np.trace(self.estimate_covariance_m2) + np.trace(observation.covariance_m2)
         expected_m = observation.position_m - self.estimate_m

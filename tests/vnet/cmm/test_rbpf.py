@@ -70,6 +70,17 @@ def test_with_a_known_common_error_it_is_the_textbook_kalman_filter(missing: lis
     assert position_covariance == pytest.approx(covariance[:2, :2], abs=1e-9)
 
 
+def test_an_exact_receiver_gives_finite_estimates() -> None:
+    lane = LaneMap(np.zeros((1, 2)), np.zeros(1), 0.85)
+    rbpf = Rbpf(RbpfConfig(particles=50), lane, np.random.default_rng(1))
+    for at_m in (5.0, 5.01, 5.02):
+        rbpf.step(DT_S, {"v": Observation(np.array([at_m, 1.0]), np.zeros((2, 2)), 0.0)})
+    assert np.isfinite(rbpf.estimate_covariance_m2).all()
+    position_m, covariance_m2 = rbpf.position_m("v")
+    assert position_m + rbpf.estimate_m == pytest.approx([5.02, 1.0], abs=0.05)
+    assert np.isfinite(covariance_m2).all()
+
+
 def test_one_gain_serves_all_particles() -> None:
     rbpf = Rbpf(RbpfConfig(particles=50), NOWHERE, np.random.default_rng(1))
     rng = np.random.default_rng(2)
