@@ -79,7 +79,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     solver: Literal["auto", "daqp", "osqp"] = "auto"
     """Solver of the weights' quadratic program; `auto` is DAQP with `exchange = "information"` and OSQP else."""
     fusion_interval_s: Positive = 0.2
-    """Time between two fusions."""
+    """Time between two fusions; not with `exchange = "information"`, which fuses in each period."""
     particles: Annotated[int, Meta(ge=0, le=100_000)] = 0
     """Number of hypotheses of the common error that a vehicle keeps; 0 means 200. With `exchange = "information"`
     there are four times as many while lanes compete, and none once one is left; 0 means 1000 there."""
@@ -103,11 +103,13 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
     start_sigma_m: Deviation = 0.0
     """Standard deviation of the first particles; 0 means `common_sigma_m`."""
     one_sided: bool = False
-    """If true, lanes are bounded on their right only, as in the paper."""
+    """If true, lanes are bounded on their right only, as in the paper; not with `exchange = "information"`."""
     separate_map_update: bool = False
-    """If true, the map weights the particles after fusion, for all vehicles and in full, as in the paper."""
+    """If true, the map weights the particles after fusion, for all vehicles and in full, as in the paper;
+    not with `exchange = "information"`."""
     two_frames: bool = False
-    """If true, estimates follow in a frame of their own, once the fixes have been filtered, as in the paper."""
+    """If true, estimates follow in a frame of their own, once the fixes have been filtered, as in the paper; not
+    with `exchange = "information"`."""
     hears: dict[str, list[str]] = {}
     """Neighbours of each vehicle (ids by id), if `consensus = "exact"`: only their frames are fused."""
     slots: Annotated[int, Meta(ge=1, le=1000)] = 2
@@ -123,6 +125,11 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
         if parsed.hears and parsed.consensus != "exact":
             raise parsing.refuse("hears", parsed.hears, 'allowed with consensus = "exact" only')
         return parsed
+
+    @property
+    def sends_twice(self) -> bool:
+        """Whether estimates follow in a frame of their own: with `exchange = "information"` all is in the first."""
+        return self.two_frames and self.exchange != "information"
 
     @property
     def chosen_solver(self) -> Literal["daqp", "osqp"]:

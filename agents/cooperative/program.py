@@ -70,7 +70,7 @@ async def cooperate(node: Node, options: Options, estimator: Estimator | Informa
         estimator.read(packets, clock.now_ns)
 
         estimator.filter(fix)
-        if options.two_frames and await _broadcast(node, estimator, fix):
+        if options.sends_twice and await _broadcast(node, estimator, fix):
             await clock.sleep_until(fix.time_ns + round(REPORTING_SHARE * node.period_ns))
             estimator.read(node.radio.drain(), clock.now_ns)
         estimator.agree()
@@ -94,7 +94,7 @@ def listening_share(name: str, options: Options) -> float:
     """
     last_slot_share = SENDING_SHARE * (options.slots - 1) / options.slots
     first_share = max(LISTENING_SHARE, last_slot_share + GRACE_SHARE)
-    turn = 0.0 if options.two_frames else int(name, 16) * TURNS // 256**NAME_BYTES / TURNS
+    turn = 0.0 if options.sends_twice else int(name, 16) * TURNS // 256**NAME_BYTES / TURNS
     return first_share + turn * (TURNS_SHARE - first_share)
 
 

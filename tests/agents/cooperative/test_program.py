@@ -359,5 +359,7 @@ def test_vehicles_compute_in_turn_after_the_last_slot_and_long_before_the_next_f
 
 
 def test_vehicles_that_send_what_they_have_computed_compute_at_once() -> None:
-    options = Options.parse({"two_frames": True})
-    assert len({listening_share(short_name(f"v{number}"), options) for number in range(20)}) == 1
+    for exchange, shares in (("estimates", 1), ("information", 4)):  # with information nothing is left to send
+        options = Options.parse({"two_frames": True, "exchange": exchange})
+        names = [short_name(f"v{number}") for number in range(20)]
+        assert len({listening_share(name, options) for name in names}) == shares
