@@ -160,14 +160,17 @@ def _in_one_and_in_all(runs: int, cases: Sequence[Sequence[str]]) -> str:
 
 
 def estimator(runs: int) -> str:
-    """CPU of the estimator a vehicle and period in seconds 5 to 10, with 50 and with 1000 vehicles: less a beacon's.
+    """CPU of the estimator a vehicle and period in seconds 5 to 10, with 50 and 1000 vehicles: less a beacon's.
 
     The same seconds for both, because lanes compete in the first, and more turns where runs are short.
     """
-    medians = []
-    for count, turns in ((50, 3 * runs), (1000, runs)):
-        medians.append(median_of(turns, lambda count=count: _cpu_us(count, 5, *COOPERATE) - _cpu_us(count, 5)))  # type: ignore[misc]
-    return " / ".join(f"{median:.0f}" for median in medians) + " µs"
+    few = median_of(3 * runs, lambda: _estimator_us(50))
+    many = median_of(runs, lambda: _estimator_us(1000))
+    return f"{few:.0f} / {many:.0f} µs"
+
+
+def _estimator_us(count: int) -> float:
+    return _cpu_us(count, 5, *COOPERATE) - _cpu_us(count, 5)
 
 
 def density(runs: int) -> str:

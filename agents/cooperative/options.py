@@ -128,7 +128,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def sends_twice(self) -> bool:
-        """Whether estimates follow in a frame of their own: with `exchange = "information"` all is in the first."""
+        """True if estimates follow in a second frame: with `exchange = "information"` all is in the first."""
         return self.two_frames and self.exchange != "information"
 
     @property
