@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import Generic, Protocol, TypeVar
 
 from agents.cooperative.frame import FrameError, short_name
+from agents.cooperative.vehicle_cache import add_vehicle
 from vnet import Packet
 
 STALE_PERIODS = 3
@@ -61,6 +62,7 @@ class Admission(Generic[F]):
 
     def __init__(self, name: str, period_ns: int, decode: Callable[[bytes], F], several: bool = False) -> None:
         """Frames are decoded by `decode`; with `several`, a sender may send several with the same fix."""
+        add_vehicle(self)
         self._decode = decode
         self.rejected: Counter[str] = Counter()
         self.ids: dict[str, str] = {}

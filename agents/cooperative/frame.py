@@ -19,6 +19,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.types import Array
 
 VERSION = 3
@@ -152,7 +153,7 @@ def encode(frame: CooperativeFrame) -> bytes:
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
-@lru_cache(maxsize=256)  # where many vehicles share a process, a frame is decoded once and not by each receiver
+@VehicleCache  # where many vehicles share a process, a frame is decoded once and not by each receiver
 def decode(payload: bytes) -> CooperativeFrame:
     """Decode a frame.
 

@@ -13,7 +13,6 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -34,6 +33,7 @@ from agents.cooperative.information_frame import (
 )
 from agents.cooperative.options import Options
 from agents.cooperative.passing import Passing
+from agents.cooperative.vehicle_cache import VehicleCache
 from vnet import Fix, Packet
 from vnet.cmm.consensus import Share, tracked_mean
 from vnet.cmm.information import Five, Information, plain_moments
@@ -79,7 +79,7 @@ def as_sent(information: Information) -> Five:
     return a, b, d, x, y
 
 
-@lru_cache(maxsize=256)  # a vehicle hears the same others for many periods
+@VehicleCache  # a vehicle hears the same others for many periods
 def _out_neighbours_by_name(heard: frozenset[str], out_neighbours: frozenset[str]) -> Mapping[str, bool]:
     """Return whether each of `heard` is one of `out_neighbours`, for as many as a frame can name."""
     return MappingProxyType({name: name in out_neighbours for name in sorted(heard)[:MAX_HEARD]})

@@ -13,7 +13,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import chain
 from types import MappingProxyType
 
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.cooperative.frame import COMMON_LIMIT_M, MAX_WEIGHT, NAME_BYTES, FrameError, name_of_code
+from agents.cooperative.vehicle_cache import VehicleCache
 from vnet.cmm.consensus import Share
 from vnet.cmm.information import Five, plain_moments
 from vnet.types import Array
@@ -149,7 +150,7 @@ def encode(frame: InformationFrame) -> bytes:
     return body + _CHECKSUM.pack(zlib.crc32(body))
 
 
-@lru_cache(maxsize=1024)  # a vehicle hears the same others for many periods
+@VehicleCache  # a vehicle hears the same others for many periods
 def _packed_names(names: tuple[str, ...], flags: tuple[bool, ...]) -> bytes:
     """Return names, and flags as bits, the first the highest of the first byte."""
     size = (len(flags) + 7) // 8
@@ -169,7 +170,7 @@ def room(heard: int, max_payload: int) -> int:
     return min(PASSED_LIMIT, max(0, left // PASSED.itemsize))
 
 
-@lru_cache(maxsize=4096)  # a vehicle hears the same others for many periods
+@VehicleCache  # a vehicle hears the same others for many periods
 def _heard(names_and_flags: bytes, count: int) -> tuple[Mapping[str, bool], frozenset[str], frozenset[str]]:
     """Return whether each name heard is an out-neighbour, the out-neighbours, and the names."""
     names, width = names_and_flags[: count * NAME_BYTES].hex(), 2 * NAME_BYTES
@@ -179,7 +180,7 @@ def _heard(names_and_flags: bytes, count: int) -> tuple[Mapping[str, bool], froz
     return MappingProxyType(heard), frozenset(name for name in heard if heard[name]), frozenset(heard)
 
 
-@lru_cache(maxsize=4096)  # where many vehicles share a process, a frame is decoded once and not by each receiver
+@VehicleCache  # where many vehicles share a process, a frame is decoded once and not by each receiver
 def decode(payload: bytes) -> InformationFrame:
     """Decode a frame.
 
@@ -247,7 +248,7 @@ def _check(prior: Five, increment: list[float], running_sum: tuple[float, float,
         raise FrameError("absurd")
 
 
-@lru_cache(maxsize=4096)  # most that hear a vehicle pass its increment on
+@VehicleCache  # most that hear a vehicle pass its increment on
 def passed_increment(record: bytes) -> tuple[int, Five]:
     """Return the origin's code and the increment of a record of `PASSED`.
 
