@@ -62,9 +62,9 @@ def make_scenario(minutes: float, seed: int) -> Scenario:
 
 def slope_kb_per_min(event: Event) -> float:
     """Growth rate of a process's memory, by least squares over the last two thirds of its samples."""
-    time_s, rss_kb = (np.array(event.details[name], dtype=float) for name in ("time_s", "rss_kb"))
+    time_s, private_kb = (np.array(event.details[name], dtype=float) for name in ("time_s", "private_kb"))
     kept = slice(len(time_s) // 3, None)
-    return float(np.polyfit(time_s[kept], rss_kb[kept], 1)[0]) * 60
+    return float(np.polyfit(time_s[kept], private_kb[kept], 1)[0]) * 60
 
 
 def report(folder: Path) -> None:
@@ -73,7 +73,7 @@ def report(folder: Path) -> None:
     verdict = json.loads((folder / "verdict.json").read_text())
     series = [e for e in events if e.kind == "memory" and len(e.details["time_s"]) >= 9]
     slopes = {str(e.node): slope_kb_per_min(e) for e in series if e.node != "emulator"}
-    largest = max((max(e.details["rss_kb"]) for e in series if e.node != "emulator"), default=0)
+    largest = max((max(e.details["private_kb"]) for e in series if e.node != "emulator"), default=0)
     started = [e.details["fault"] for e in events if e.kind == "fault_started"]
     ended = [e.details["fault"] for e in events if e.kind == "fault_ended"]
     late = next((e.details for e in events if e.kind == "late_deliveries"), {})

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
-from emulator.checks.registry import CHECKS, Check
+from emulator.checks.registry import CHECKS, Check, Subject
 
 INTRODUCTION = """
 Every check of a run, from the table by which `vnet check` judges it. [checks.md](../checks.md) says how the
-verdicts add up. LABEL is the name of a fault, such as `kill-0`.
+verdicts add up. LABEL is the name of a fault, such as `kill-0`. A check *of the run* may be invalid; one *of the machine* is a note,
+or unknown, and never invalid.
 """
 FROM_THE_FOLDER = (
     [
@@ -19,6 +20,7 @@ FROM_THE_FOLDER = (
         "a row differs; the first is shown, from both runs",
         "the second run failed",
         "the run ran once",
+        Subject.RUN.value,
     ],
     [
         "`trace_sha256`",
@@ -26,6 +28,7 @@ FROM_THE_FOLDER = (
         "it is not",
         "",
         "",
+        Subject.RUN.value,
     ],
 )
 """Rows of the checks that compare files instead of judging a run."""
@@ -42,8 +45,8 @@ def page() -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    return table(["check", "claims", "invalid", "unknown", "not applicable"], rows)
+    return table(["check", "claims", "invalid", "unknown", "not applicable", "class"], rows)
 
 
 def _row(check: Check) -> list[str]:
-    return [f"`{check.name}`", check.claims, check.invalid, check.unknown, check.not_applicable]
+    return [f"`{check.name}`", check.claims, check.invalid, check.unknown, check.not_applicable, check.subject.value]

@@ -250,7 +250,12 @@ EVENTS = {
         "this host did not hand in all logs and files of its vehicles at the end",
     ),
     "log_left_out": ("vehicle", "`bytes`", "how much of the beginning of its log is still on its host"),
-    "memory": ("process", "`time_s`, `rss_kb`", "what it held, as two lists"),
+    "memory": ("process", "`time_s`, `private_kb`", "private memory in KiB, as two lists"),
+    "memory_exceeded": (
+        "process",
+        "`nodes`, `memory_mb`, `limit_mb`",
+        "its private memory exceeded `run.memory_limit_mb`, which ended the run",
+    ),
     "transport_gap": ("", "`count`", "real time: how often something went missing on the way"),
     "late_deliveries": (
         "",

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from emulator.checks.own import PREFIX, load_checks, own_findings, recorded_findings
-from emulator.checks.registry import CHECKS
+from emulator.checks.registry import CHECKS, Subject
 from emulator.checks.replay import ONCE, check_replay
 from emulator.radio.trace import sha256_of_table
 from emulator.records.recorded_run import OpenedRun, RecordedRun
@@ -42,7 +42,7 @@ def judge(recorded: RecordedRun, own: Iterable[Finding] = ()) -> Judgement:
 
 def _downgrade_if_overloaded(checks: list[CheckResult]) -> list[CheckResult]:
     """Make invalid checks of timing unknown if the machine did not keep up."""
-    of_machine = {check.name for check in CHECKS if check.of_machine}
+    of_machine = {check.name for check in CHECKS if check.subject is Subject.MACHINE}
     sensitive = {check.name for check in CHECKS if check.realtime_sensitive}
     if all(check.verdict is Verdict.VALID for check in checks if check.name in of_machine):
         return checks

@@ -1,5 +1,9 @@
 """The table of all checks: the function of each, what it claims, and what its verdicts mean.
 
+Each check is of one of two classes, its `subject`. A check of the run judges trace, states and events, and may be
+invalid. A check of the machine (memory, wall clock, processor, disk) is never invalid: it adds a note, or is unknown
+where the run cannot be trusted. A machine that is slow or small does not make a right run wrong.
+
 A check is added by one entry of `CHECKS` and its function. `judge` runs the table in its order,
 docs/reference/checks.md is generated from it, and the page of a campaign has a column for whatever was judged.
 """
@@ -7,7 +11,7 @@ docs/reference/checks.md is generated from it, and the page of a campaign has a 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from emulator.checks.channel import (
@@ -28,6 +32,7 @@ from emulator.checks.faults import (
     check_pause_respected,
 )
 from emulator.checks.latency import check_latency
+from emulator.checks.memory_growth import FLOOR_KB, RISING_TENTHS
 from emulator.checks.own_rules import check_own_rules
 from emulator.checks.radio import check_fading, check_medium
 from emulator.checks.run import (
@@ -60,6 +65,13 @@ class WithoutPositions(Enum):
     NOT_APPLICABLE = "not applicable"
 
 
+class Subject(Enum):
+    """The class of a check: the subject of its verdict."""
+
+    RUN = "of the run"
+    MACHINE = "of the machine"
+
+
 @dataclass(frozen=True)
 class Check:
     """One check: its function and its row of the reference page.
@@ -78,10 +90,11 @@ class Check:
     without_positions: WithoutPositions = WithoutPositions.NOT_APPLICABLE
     realtime_sensitive: bool = False
     """True if a machine that did not keep up can make it invalid; the verdict is then unknown."""
-    of_machine: bool = False
-    """True if the check itself tells whether the machine kept up."""
+    subject: Subject = Subject.RUN
+    """The class of the check; one of the machine cannot be invalid."""
 
     def __post_init__(self) -> None:
+        assert self.subject is Subject.RUN or not self.invalid, "a check of the machine is never invalid"
         if not self.name:
             object.__setattr__(self, "name", self.function.__name__.removeprefix("check_"))
 
@@ -94,14 +107,23 @@ class Check:
         """Judge a run."""
         if len(recorded.states) or self.without_positions is WithoutPositions.JUDGE:
             found = self.function(recorded)
-            yield from found if isinstance(found, Iterable) else [found]
+            yield from map(self._within_class, found if isinstance(found, Iterable) else [found])
         elif self.without_positions is WithoutPositions.UNKNOWN:
             yield CheckResult(self.name, Verdict.UNKNOWN, NO_PERIOD)
         elif not self.per_fault:
             yield NotExercised(self.name, NO_PERIOD)
 
 
+    def _within_class(self, finding: Finding) -> Finding:
+        """Return a finding as the class of the check allows it: what would be invalid of the machine is unknown."""
+        is_invalid = isinstance(finding, CheckResult) and finding.verdict is Verdict.INVALID
+        if self.subject is Subject.MACHINE and is_invalid:
+            return replace(finding, verdict=Verdict.UNKNOWN)
+        return finding
+
+
 RADIO, FAULTS, REPORTS, RUN = "The radio", "Faults", "What vehicles report", "The run"
+MACHINE = "The machine"
 ONE_IN_A_MILLION = "outside a band that sound runs leave once in a million"
 BEHIND = "the machine did not keep up"
 
@@ -321,11 +343,11 @@ CHECKS: list[Check] = [
     ),
     Check(
         check_transport,
-        RUN,
+        MACHINE,
         "No message between agents and emulator went missing.",
         unknown="a gap in sequence numbers, or a delivery that never arrived",
         without_positions=WithoutPositions.JUDGE,
-        of_machine=True,
+        subject=Subject.MACHINE,
     ),
     Check(
         check_agents_alive,
@@ -363,22 +385,25 @@ CHECKS: list[Check] = [
     ),
     Check(
         check_memory,
-        RUN,
-        "An agent's process holds in the last third of its life at most 1.05 times the memory of the second "
-        "third, by the series in events `memory` {node, time_s, rss_kb}. The emulator's own process keeps the "
-        "trace and is not judged.",
-        invalid="it grew more",
-        not_applicable="not measured by vnet simulate, or measured for less than 15 s",
+        MACHINE,
+        "The private memory of agents' processes, in events `memory` {node, time_s, private_kb}. A note names those "
+        f"in which it grows steadily: it rises in {RISING_TENTHS} of the last ten tenths of the second half of a "
+        f"process's life, and by {FLOOR_KB:g} KiB or more in all. The emulator's own process keeps the trace and is "
+        "not judged.",
+        unknown="a process exceeded `run.memory_limit_mb`, which ended the run",
+        not_applicable="not measured by vnet simulate, or measured for less than 30 s",
         without_positions=WithoutPositions.JUDGE,
+        subject=Subject.MACHINE,
     ),
     Check(
         check_kept_up,
-        RUN,
-        "In real time, at most 0.1 % of deliveries are over 20 ms late.",
+        MACHINE,
+        "In real time, at most 0.1 % of deliveries are over 20 ms late: the lower end of the 95 % confidence "
+        "interval of their share (Clopper and Pearson) is not above it.",
         unknown="more are, or none was timed",
         not_applicable="lockstep: nothing can be late",
         without_positions=WithoutPositions.JUDGE,
-        of_machine=True,
+        subject=Subject.MACHINE,
     ),
 ]
 """All checks that a recorded run is judged by, in the order of a verdict."""

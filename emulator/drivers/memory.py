@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # slow to import, and hosts write no events
     from emulator.records.run_folder import RunFolder
 
-SAMPLES = 40
-"""A run, so many times; a process that is started again begins a new series."""
+SAMPLES = 20
+"""Samples in a run, ten of them in its second half; a process that is started again begins a new series."""
+UNCHANGED_KB = 16
+"""KiB by which resident memory must have changed until private memory is read again, which takes 30 times as long."""
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
 
 
@@ -23,22 +25,43 @@ def resident_kb(pid: int | str = "self") -> int | None:
         return None
 
 
+def private_kb(pid: int | str = "self") -> int | None:
+    """Memory that a process shares with no other, in KiB; None if it has just ended, or the system does not say."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
+        sizes = {name: int(size.split()[0]) for name, size in (line.split(":") for line in lines)}
+        return sizes["Private_Clean"] + sizes["Private_Dirty"]
+    except (OSError, KeyError, IndexError, ValueError):
+        return None
+
+
 class MemoryWatch:
-    """Samples the resident memory of processes; `write` puts it into the run's events."""
+    """Samples the private memory of processes; `write` puts it into the run's events."""
 
     def __init__(self, duration_ns: int) -> None:
         self._every_ns = max(1, duration_ns // SAMPLES)
         self._next_ns = 0
         self._series: dict[tuple[str, int], list[tuple[float, int]]] = {}
+        self._resident_kb: dict[int, int] = {}
 
     def look(self, time_ns: int, pids: Mapping[str, int]) -> None:
         """Take a sample of each process (name to pid), if it is time to."""
         if time_ns < self._next_ns:
             return
-        self._next_ns = time_ns + self._every_ns
+        self._next_ns = (time_ns // self._every_ns + 1) * self._every_ns
         for name, pid in pids.items():
-            if (size_kb := resident_kb(pid)) is not None:
+            if (size_kb := self._private_kb(name, pid)) is not None:
                 self._series.setdefault((name, pid), []).append((time_ns / 1e9, size_kb))
+
+    def _private_kb(self, name: str, pid: int) -> int | None:
+        """Return the private memory of a process; what was read before if its resident memory is as it was."""
+        now_kb, before = resident_kb(pid), self._series.get((name, pid))
+        if now_kb is None:
+            return None
+        if before and abs(now_kb - self._resident_kb[pid]) < UNCHANGED_KB:
+            return before[-1][1]
+        self._resident_kb[pid] = now_kb
+        return private_kb(pid)
 
     def series(self) -> Iterator[tuple[str, list[float], list[int]]]:
         """The samples of each process: its name, times in s and sizes in KiB."""
@@ -46,6 +69,6 @@ class MemoryWatch:
             yield name, [time_s for time_s, _ in samples], [size_kb for _, size_kb in samples]
 
     def write(self, folder: RunFolder, time_ns: int) -> None:
-        """One event `memory` a process: `time_s` and `rss_kb` of its samples."""
-        for name, time_s, rss_kb in self.series():
-            folder.event(time_ns, "memory", name, time_s=time_s, rss_kb=rss_kb)
+        """One event `memory` a process: `time_s` and `private_kb` of its samples."""
+        for name, time_s, sizes_kb in self.series():
+            folder.event(time_ns, "memory", name, time_s=time_s, private_kb=sizes_kb)

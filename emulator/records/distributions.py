@@ -53,3 +53,15 @@ def _binomial_quantile(quantile: float, trials: int, probability: float) -> int:
         else:
             least = middle + 1
     return least
+
+
+def lowest_share(count: int, total: int, tail: float = 0.025) -> float:
+    """Return the lower end of the confidence interval of a share, `count` of `total` (Clopper and Pearson 1934).
+
+    A true share below it gives `count` or more with a probability of at most `tail`.
+    """
+    if count == 0:
+        return 0.0
+    from scipy.special import betaincinv
+
+    return float(betaincinv(count, total - count + 1, tail))

@@ -75,7 +75,7 @@ class RecordedRun(RecordedTables):
     @cached_property
     def closed_ns(self) -> int:
         """Instant at which emulated time ended."""
-        cut = [event.time_ns for event in self.event("interrupted", "stalled")]
+        cut = [event.time_ns for event in self.event("interrupted", "stalled", "memory_exceeded")]
         return min([self.scenario.duration_ns, *cut])
 
     @cached_property

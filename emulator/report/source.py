@@ -40,7 +40,7 @@ COLUMNS = {
     ),
 }
 """The columns that reports need."""
-CUT = ("interrupted", "stalled")
+CUT = ("interrupted", "stalled", "memory_exceeded")
 """Events that end a run before its time."""
 T = TypeVar("T")
 

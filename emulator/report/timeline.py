@@ -45,7 +45,7 @@ DELAYS_IN_VIEW = 60
 
 FAILURE, WARNING, EVENT, PROCESS = "failure", "warning", "event", "process"
 KINDS = {
-    **dict.fromkeys(("crashed", "died", "exception", "spun", "stalled", "host_gone"), FAILURE),
+    **dict.fromkeys(("crashed", "died", "exception", "spun", "stalled", "memory_exceeded", "host_gone"), FAILURE),
     **dict.fromkeys(("log", "refused", "left_out", "transport_gap", "late_deliveries"), WARNING),
     **dict.fromkeys(("restarted", "entered", "left", "finished", "interrupted"), PROCESS),
     **dict.fromkeys(("emulator_restarted", "router_restarted"), PROCESS),

@@ -34,7 +34,7 @@ OUTCOMES = {
 }
 """Style and sign of each outcome; signs tell them apart where there are no colours."""
 BAD_EVENTS = ("died", "crashed", "exception", "spun", "stalled", "rule_failed", "refused", "transport_gap",
-              "observer_ended", "host_gone", "interrupted")  # fmt: skip
+              "observer_ended", "host_gone", "memory_exceeded", "interrupted")  # fmt: skip
 HEIGHTS = "▁▂▃▄▅▆▇"  # and not the full block, which would run into the row above
 SMALLEST_FACTOR = 4.0
 """Between the foot and the top of a sparkline, so that what is steady does not look wild."""

@@ -131,8 +131,8 @@ def _counted(judgement: Judgement, verbose: bool) -> Text:
 
 
 def _is_told(check: CheckResult) -> bool:
-    """Return whether a check is told to everybody: one that is not valid, or the user's own."""
-    return check.verdict is not Verdict.VALID or check.name.startswith(PREFIX)
+    """Return whether a check is told to everybody: one that is not valid, has a note, or is the user's own."""
+    return check.verdict is not Verdict.VALID or check.text.startswith("note: ") or check.name.startswith(PREFIX)
 
 
 def _listed(checks: Sequence[CheckResult]) -> Table:

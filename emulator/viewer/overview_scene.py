@@ -47,7 +47,7 @@ CLOUDS_EVERY_S = 1.0
 LARGEST_MATRIX = 400
 """Vehicles of which a matrix is drawn."""
 WARNINGS = {"fault_started", "died", "crashed", "exception", "spun", "stalled", "rule_failed", "refused",
-            "interrupted", "observer_ended", "host_gone"}  # fmt: skip
+            "interrupted", "observer_ended", "host_gone", "memory_exceeded"}  # fmt: skip
 LOG_LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "critical": "CRITICAL"}
 """Rerun's names of the levels of a program's log."""
 LONGEST_DETAIL = 60

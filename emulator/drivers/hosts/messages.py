@@ -195,7 +195,7 @@ class LeftOut(Message, frozen=True):
 
 
 class Figures(Message, frozen=True):
-    """CPU time of each process in ns, and resident memory: process id, times in s and KiB of each series."""
+    """CPU time of each process in ns, and private memory: process id, times in s and KiB of each series."""
 
     cpu_ns: dict[str, int]
     memory: Sequence[tuple[str, Sequence[float], Sequence[int]]]

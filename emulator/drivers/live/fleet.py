@@ -304,9 +304,9 @@ class Fleet:
         for process_id, figure in cpu_ns.items():
             self._check_node(host, process_id)
             self.cpu_ns[process_id] = figure
-        for process_id, time_s, rss_kb in memory:
+        for process_id, time_s, size_kb in memory:
             self._check_node(host, process_id)
-            self._folder.event(self._time_ns(), "memory", process_id, time_s=list(time_s), rss_kb=list(rss_kb))
+            self._folder.event(self._time_ns(), "memory", process_id, time_s=list(time_s), private_kb=list(size_kb))
 
     def take_token(self, name: str, alive: bool) -> None:
         """Take note that the connection of a host has appeared or is gone."""

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,12 @@ import pytest
 from docs.generate import checks as check_page
 from emulator.checks import registry
 from emulator.checks.judge import NotExercised, RecordedRun, Verdict, check_run, judge
-from emulator.checks.registry import CHECKS, Check, WithoutPositions
+from emulator.checks.registry import CHECKS, Check, Subject, WithoutPositions
 from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.simulate import simulate
 from emulator.records.run_folder import RunFolder
-from emulator.records.verdicts import Finding, result, unknown
+from emulator.records.verdicts import CheckResult, Finding, result, unknown
 from emulator.scenario.scenario import Scenario
 from emulator.testing.matrix import count_verdicts
 from emulator.world.world import build_world
@@ -122,4 +123,19 @@ def test_names_are_unique_and_documented() -> None:
     names = [check.name for check in CHECKS]
     assert len(names) == len(set(names))
     assert all(check.claims for check in CHECKS)
-    assert {"transport", "kept_up"} == {check.name for check in CHECKS if check.of_machine}
+    assert {"transport", "kept_up", "memory"} == {c.name for c in CHECKS if c.subject is Subject.MACHINE}
+
+
+def test_a_check_of_the_machine_is_never_invalid(tmp_path: Path) -> None:
+    recorded = RecordedRun.open(simulated(tmp_path / "run"))
+    for check in CHECKS:
+
+        def finds(recorded: RecordedRun, name: str = check.name) -> Finding:
+            return CheckResult(name, Verdict.INVALID, "as bad as can be")
+
+        found = list(replace(check, function=finds).findings(recorded))
+        expected = Verdict.UNKNOWN if check.subject is Subject.MACHINE else Verdict.INVALID
+        assert [finding.verdict for finding in found if isinstance(finding, CheckResult)] == [expected]
+        assert not (check.subject is Subject.MACHINE and check.invalid)
+    with pytest.raises(AssertionError):
+        Check(check_frame_size, registry.MACHINE, "", invalid="too long", subject=Subject.MACHINE)

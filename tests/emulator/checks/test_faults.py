@@ -490,21 +490,32 @@ def test_a_death_that_a_fault_wanted_is_none() -> None:
         assert verdict(replace(recorded, events=[*recorded.events, died]), "agents_alive") is expected
 
 
-@pytest.mark.parametrize(
-    ("growth_kb_per_s", "node", "expected"),
-    [(0.0, "v01", Verdict.VALID), (500.0, "v01", Verdict.INVALID), (500.0, "emulator", None)],
-)
-def test_memory_is_judged_by_its_growth(growth_kb_per_s: float, node: str, expected: Verdict | None) -> None:
+@pytest.mark.parametrize("node", ["v01", "emulator"])
+def test_growing_memory_is_a_note_of_agents_alone(node: str) -> None:
     recorded = with_fault("loss")
     time_s = [2.0 * n for n in range(30)]
-    rss_kb = [90_000 + round(growth_kb_per_s * t) for t in time_s]
-    measured = Event(60_000_000_000, "memory", node, {"time_s": time_s, "rss_kb": rss_kb})
-    judged = replace(recorded, events=[*recorded.events, measured])
-    if expected is None:
-        assert isinstance(result(judged, "memory"), NotExercised)
+    private_kb = [90_000 + round(500 * t) for t in time_s]
+    measured = Event(60_000_000_000, "memory", node, {"time_s": time_s, "private_kb": private_kb})
+    found = result(replace(recorded, events=[*recorded.events, measured]), "memory")
+    if node == "emulator":
+        assert isinstance(found, NotExercised)
     else:
-        assert verdict(judged, "memory") is expected
+        assert isinstance(found, CheckResult) and found.verdict is Verdict.VALID
+        assert "v01 by 500.0 kB a second, 1,800 MB an hour" in found.text
+        assert found.figures["growing"] == [{"node": "v01", "kb_per_s": 500.0, "kb_per_hour": 1_800_000.0}]
     assert isinstance(result(recorded, "memory"), NotExercised)
+
+
+def test_a_process_over_its_memory_limit_leaves_the_run_unknown() -> None:
+    recorded = with_fault("loss")
+    details = {"nodes": ["v01", "v02"], "memory_mb": 812.5, "limit_mb": 800.0}
+    exceeded = Event(1_500_000_000, "memory_exceeded", "v01", details)
+    judged = judge(replace(recorded, events=[*recorded.events, exceeded]))
+    assert judged.verdict is not Verdict.VALID
+    told = {check.name: check for check in judged.checks}
+    for name in ("memory", "progress"):
+        assert told[name].verdict is Verdict.UNKNOWN
+        assert "v01, v02" in told[name].text and "812.5 MB" in told[name].text
 
 
 def test_in_real_time_what_was_sent_near_a_change_may_be_replayed_later() -> None:

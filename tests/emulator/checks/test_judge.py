@@ -149,7 +149,14 @@ def test_a_trace_of_another_run_is_refused_in_one_line(recorded: RecordedRun) ->
 def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: RecordedRun) -> None:
     settings = recorded.scenario.run.model_copy(update={"pacing": "realtime"})
     scenario = recorded.scenario.model_copy(update={"run": settings})
-    for count, total, expected in ((0, 0, Verdict.UNKNOWN), (1, 5000, Verdict.VALID), (9, 5000, Verdict.UNKNOWN)):
+    for count, total, expected in (
+        (0, 0, Verdict.UNKNOWN),
+        (1, 776, Verdict.VALID),
+        (9, 776, Verdict.UNKNOWN),
+        (9, 5000, Verdict.VALID),
+        (30, 5000, Verdict.UNKNOWN),
+        (1100, 1_000_000, Verdict.UNKNOWN),
+    ):
         late = Event(0, "late_deliveries", None, {"count": count, "total": total, "p99_ms": 1.0})
         timed = replace(recorded, scenario=scenario, events=[*recorded.events, late])
         assert verdict(timed, "kept_up") is expected

@@ -125,11 +125,11 @@ def test_what_the_program_reports_has_curves_and_maps_and_comes_before_the_check
 
 
 def test_samples_of_memory_are_no_news(beacon: Path) -> None:
-    event = {"time_ns": 0, "kind": "memory", "node": "v01", "time_s": [0.0], "rss_kb": [1000]}
+    event = {"time_ns": 0, "kind": "memory", "node": "v01", "time_s": [0.0], "private_kb": [1000]}
     with (beacon / "events.jsonl").open("a") as file:
         file.write(json.dumps(event) + "\n")
     page = page_of(beacon)
-    assert "rss_kb" not in page.text and "ended" in page.words
+    assert "private_kb" not in page.text and "ended" in page.words
 
 
 def test_checks_that_failed_come_first(beacon: Path) -> None:
