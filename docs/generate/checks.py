@@ -10,8 +10,8 @@ from emulator.checks.registry import CHECKS, Check, Subject
 
 INTRODUCTION = """
 Every check of a run, from the table by which `vnet check` judges it. [checks.md](../checks.md) says how the
-verdicts add up. LABEL is the name of a fault, such as `kill-0`. A check *of the run* may be invalid; one *of the machine* is a note,
-or unknown, and never invalid.
+verdicts add up. LABEL is the name of a fault, such as `kill-0`. A check
+*of the run* may be invalid; one *of the machine* is a note, or unknown, and never invalid.
 """
 FROM_THE_FOLDER = (
     [
@@ -49,4 +49,5 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _row(check: Check) -> list[str]:
-    return [f"`{check.name}`", check.claims, check.invalid, check.unknown, check.not_applicable, check.subject.value]
+    verdicts = [check.invalid, check.unknown, check.not_applicable]
+    return [f"`{check.name}`", check.claims, *verdicts, check.subject.value]

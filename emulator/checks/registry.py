@@ -1,8 +1,8 @@
 """The table of all checks: the function of each, what it claims, and what its verdicts mean.
 
 Each check is of one of two classes, its `subject`. A check of the run judges trace, states and events, and may be
-invalid. A check of the machine (memory, wall clock, processor, disk) is never invalid: it adds a note, or is unknown
-where the run cannot be trusted. A machine that is slow or small does not make a right run wrong.
+invalid. A check of the machine (memory, wall clock, processor, disk) is never invalid: it adds a note, or is
+unknown where the run cannot be trusted. A machine that is slow or small does not make a right run wrong.
 
 A check is added by one entry of `CHECKS` and its function. `judge` runs the table in its order,
 docs/reference/checks.md is generated from it, and the page of a campaign has a column for whatever was judged.
@@ -32,7 +32,7 @@ from emulator.checks.faults import (
     check_pause_respected,
 )
 from emulator.checks.latency import check_latency
-from emulator.checks.memory_growth import FLOOR_KB, RISING_TENTHS
+from emulator.checks.memory_growth import FLOOR_KIB, RISING_TENTHS
 from emulator.checks.own_rules import check_own_rules
 from emulator.checks.radio import check_fading, check_medium
 from emulator.checks.run import (
@@ -113,13 +113,11 @@ class Check:
         elif not self.per_fault:
             yield NotExercised(self.name, NO_PERIOD)
 
-
     def _within_class(self, finding: Finding) -> Finding:
         """Return a finding as the class of the check allows it: what would be invalid of the machine is unknown."""
-        is_invalid = isinstance(finding, CheckResult) and finding.verdict is Verdict.INVALID
-        if self.subject is Subject.MACHINE and is_invalid:
-            return replace(finding, verdict=Verdict.UNKNOWN)
-        return finding
+        if self.subject is Subject.RUN or isinstance(finding, NotExercised):
+            return finding
+        return replace(finding, verdict=Verdict.UNKNOWN) if finding.verdict is Verdict.INVALID else finding
 
 
 RADIO, FAULTS, REPORTS, RUN = "The radio", "Faults", "What vehicles report", "The run"
@@ -386,10 +384,10 @@ CHECKS: list[Check] = [
     Check(
         check_memory,
         MACHINE,
-        "The private memory of agents' processes, in events `memory` {node, time_s, private_kb}. A note names those "
-        f"in which it grows steadily: it rises in {RISING_TENTHS} of the last ten tenths of the second half of a "
-        f"process's life, and by {FLOOR_KB:g} KiB or more in all. The emulator's own process keeps the trace and is "
-        "not judged.",
+        "The private memory of agents' processes, in events `memory` {node, time_s, private_kb}. A note names "
+        f"those in which it grows steadily: it rises in at least {RISING_TENTHS} of the ten tenths of the second "
+        f"half of a process's life, and by at least {FLOOR_KIB:g} KiB in all. The emulator's own process keeps the "
+        "trace and is not judged.",
         unknown="a process exceeded `run.memory_limit_mb`, which ended the run",
         not_applicable="not measured by vnet simulate, or measured for less than 30 s",
         without_positions=WithoutPositions.JUDGE,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from emulator.checks.memory_growth import is_long_enough, steady_growth_kb_per_s
+from emulator.checks.memory_growth import is_long_enough, steady_growth_kib_per_s
 from emulator.records.distributions import lowest_share
 from emulator.records.failures import in_words, kinds_of
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
@@ -24,6 +24,7 @@ from vnet.units import NS_PER_S
 LATE_SHARE_LIMIT = 0.001
 """Largest share of deliveries that may be late in real time."""
 LIVENESS_NS = NS_PER_S
+KB_PER_KIB = 1.024
 START_UP_NS = 5 * NS_PER_S
 """Time that a restarted process may take, in real time, until its program reports."""
 
@@ -306,7 +307,9 @@ def check_memory(recorded: RecordedRun) -> Finding:
     judged = [e for e in measured if is_long_enough(e.details["time_s"])]
     if not judged:
         return NotExercised(name, "no process was measured for 30 s")
-    rates = {e.node: steady_growth_kb_per_s(e.details["time_s"], e.details["private_kb"]) for e in judged}
+    rates = {
+        e.node: KB_PER_KIB * steady_growth_kib_per_s(e.details["time_s"], e.details["private_kb"]) for e in judged
+    }
     growing = {node: rate for node, rate in sorted(rates.items(), key=lambda one: -one[1]) if rate}
     text = f"{counted(len(judged), 'process', 'processes')} of steady memory"
     figures: dict[str, Any] = {"processes": len(judged)}

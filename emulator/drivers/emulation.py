@@ -419,6 +419,11 @@ class Emulation:
             self.engine.drain()
             self.driving.close()
 
+    def memory_exceeded(self, time_ns: int, process_id: str, memory_mb: float, nodes: Sequence[str]) -> None:
+        """Write the event of the process of these nodes that holds more than `run.memory_limit_mb`."""
+        limits = {"memory_mb": memory_mb, "limit_mb": self.scenario.run.memory_limit_mb}
+        self.folder.event(time_ns, "memory_exceeded", process_id, nodes=list(nodes), **limits)
+
     def close_periods(self, time_ns: int) -> None:
         """Record the periods that end by then; nobody has anything more to report of them.
 

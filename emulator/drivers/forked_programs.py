@@ -83,6 +83,8 @@ class ForkedPrograms:
         detach: Callable[[], None],
     ) -> None:
         self._nodes = [welcome.node for welcome in welcomes]
+        self.pid = 0
+        """Its process id."""
         self.owes = False
         """True while it has been given a turn that it has not answered."""
         self._is_gone = False
@@ -93,10 +95,10 @@ class ForkedPrograms:
             self._connection, its = Pipe()
             with warnings.catch_warnings():  # of Python 3.12 about a display's thread, which this does not need
                 warnings.simplefilter("ignore", DeprecationWarning)
-                self._pid = os.fork()
+                self.pid = os.fork()
         except OSError as error:
             raise VnetError(f"process {len(others) + 1} for programs: {error.strerror}") from None
-        if self._pid == 0:
+        if self.pid == 0:
             for connection in (self._connection, *(other._connection for other in others)):
                 connection.close()  # so that each process sees when its other end is gone
             _be(its, welcomes, programs, folder, detach)
@@ -126,7 +128,7 @@ class ForkedPrograms:
         return said.answer
 
     def _raise_ended(self) -> NoReturn:
-        _, status = os.waitpid(self._pid, 0)
+        _, status = os.waitpid(self.pid, 0)
         self._is_gone = True
         code = os.waitstatus_to_exitcode(status)
         how = signal.Signals(-code).name if code < 0 else f"status {code}"
@@ -141,8 +143,8 @@ class ForkedPrograms:
         self._connection.close()
         if not self._is_gone:
             self._is_gone = True
-            os.kill(self._pid, signal.SIGKILL)
-            os.waitpid(self._pid, 0)
+            os.kill(self.pid, signal.SIGKILL)
+            os.waitpid(self.pid, 0)
 
 
 def _write(stream: TextIO, text: str) -> None:

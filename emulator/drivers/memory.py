@@ -13,7 +13,9 @@ if TYPE_CHECKING:  # slow to import, and hosts write no events
 SAMPLES = 20
 """Samples in a run, ten of them in its second half; a process that is started again begins a new series."""
 UNCHANGED_KB = 16
-"""KiB by which resident memory must have changed until private memory is read again, which takes 30 times as long."""
+"""Change of resident memory in KiB from which on private memory is read again: that takes 30 times as long."""
+KB_PER_MB = 1e6 / 1024
+"""KiB of a megabyte."""
 _PAGE_KB = os.sysconf("SC_PAGE_SIZE") // 1024
 
 
@@ -33,6 +35,17 @@ def private_kb(pid: int | str = "self") -> int | None:
         return sizes["Private_Clean"] + sizes["Private_Dirty"]
     except (OSError, KeyError, IndexError, ValueError):
         return None
+
+
+def first_over(limit_mb: float | None, pids: Mapping[str, int]) -> tuple[str, float] | None:
+    """Return the first process (name to pid) that holds more private memory than the limit, and its megabytes."""
+    if limit_mb is None:
+        return None
+    limit_kb = limit_mb * KB_PER_MB
+    for name, pid in pids.items():
+        if (resident_kb(pid) or 0) > limit_kb and (size_kb := private_kb(pid) or 0) > limit_kb:
+            return name, round(size_kb / KB_PER_MB, 1)
+    return None
 
 
 class MemoryWatch:

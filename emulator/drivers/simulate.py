@@ -7,6 +7,7 @@ same trace, and a test holds them to it.
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -18,10 +19,11 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from emulator.drivers.collector import rare_collections
-from emulator.drivers.emulation import Emulation, ProcessActions
+from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
 from emulator.drivers.forked_programs import Ended, ForkedPrograms
 from emulator.drivers.hosted_programs import NONCE, Changes, HostedPrograms, RunOverError, Turn
 from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.memory import first_over
 from emulator.drivers.process_count import split_evenly
 from emulator.drivers.signals import signals_handled, tell_from_handler
 from vnet.runtime.debug_target import DebugTarget
@@ -68,8 +70,9 @@ def simulate(
         ):
             simulation.run()
     except KeyboardInterrupt:
-        interrupted = True
-        emulation.folder.event(simulation.now_ns, "interrupted")
+        interrupted = not barrier.is_over_limit
+        if interrupted:
+            emulation.folder.event(simulation.now_ns, "interrupted")
         emulation.finish(simulation.now_ns)
     return time.monotonic() - started, interrupted
 
@@ -122,6 +125,22 @@ class _Barrier:
         self._changes: dict[str, list[Changes]] = {process_id: [] for process_id in self._groups}
         """Changes of the programs of processes, until these are granted their next window."""
         self.stop = stop
+        self.is_over_limit = False
+        """True once a process holds more than `run.memory_limit_mb`."""
+        self.pids = {nodes[0]: os.getpid() for nodes in groups}
+        if emulation.scenario.run.memory_limit_mb is not None:
+            emulation.watch(self._look_at_memory)
+
+    def _look_at_memory(self, view: PeriodView) -> None:
+        over = first_over(self._emulation.scenario.run.memory_limit_mb, self.pids)
+        if over is not None and not self.is_over_limit:
+            self.is_over_limit = True
+            self._emulation.memory_exceeded(self.now_ns, *over, sorted(self._groups[over[0]]))
+
+    @property
+    def is_ending(self) -> bool:
+        """True if the run is to end at the next barrier."""
+        return self.stop.is_set() or self.is_over_limit
 
     @property
     def now_ns(self) -> int:
@@ -143,7 +162,7 @@ class _Barrier:
 
         Raises KeyboardInterrupt if the run is to stop.
         """
-        if self.stop.is_set():
+        if self.is_ending:
             raise KeyboardInterrupt
         for process_id, message in yields.items():
             self._lockstep.receive(process_id, message)
@@ -204,7 +223,7 @@ class _Together:
     def run(self) -> None:
         """From the first grant to the last. Raises KeyboardInterrupt."""
         emulation, hosted = self._emulation, self._hosted
-        hosted.only_programs_raise = lambda: not self._barrier.stop.is_set() and self.no_signal_raises()
+        hosted.only_programs_raise = lambda: not self._barrier.is_ending and self.no_signal_raises()
         try:
             hosted.run()
         except KeyboardInterrupt:
@@ -245,6 +264,7 @@ class _Apart:
                     others=list(processes.values()),
                     detach=self._emulation.driving.detach,
                 )
+                self._barrier.pids[process_id] = processes[process_id].pid
             self._grant_all()
         except KeyboardInterrupt:
             self._end(self.now_ns)

@@ -78,6 +78,9 @@ class Run(Section):
     """Rounds of callbacks that a process may take at one instant; more ends its spinning programs. Lockstep."""
     files_max_mb: float = Field(10.0, ge=0, le=1_000_000)
     """Megabytes of a vehicle's files (`node.folder`) that are kept in the run's folder, and 1000 files at most."""
+    memory_limit_mb: float | None = Field(None, gt=0, le=1_000_000_000)
+    """Megabytes of private memory that a process of programs may hold; more ends the run as unknown. No limit if
+    left out. In a simulation the process may be the emulator's own, with its trace."""
     keep_payloads: bool = False
     """Keep the payloads of all frames in `payloads.parquet`; until the end of the run they are in memory."""
     control_hz: float = Field(10.0, ge=10, le=100)

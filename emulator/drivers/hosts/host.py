@@ -26,7 +26,7 @@ from emulator.drivers.hosts.messages import HostHello, HostWelcome, Item, Order
 from emulator.drivers.hosts.relay import Relay
 from emulator.drivers.hosts.up import Up
 from emulator.drivers.launch import Launcher
-from emulator.drivers.memory import MemoryWatch
+from emulator.drivers.memory import MemoryWatch, first_over
 from emulator.drivers.signals import signals_handled
 from emulator.drivers.zygote import Zygote
 from emulator.records.code_digest import vnet_digest
@@ -300,6 +300,9 @@ class HostProcess:
     def _look(self, order: messages.Look) -> None:
         self._cpu.look(self._launcher.pids)
         self._memory.look(order.time_ns, self._launcher.pids)
+        if over := first_over(order.memory_limit_mb, self._launcher.pids):
+            self._relay.add(messages.MemoryExceeded(*over))
+            self._relay.hurry()
 
     def _be_patient(self, order: messages.Patience) -> None:
         self._patience_until = time.monotonic() + order.within_s

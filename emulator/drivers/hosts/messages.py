@@ -105,9 +105,10 @@ class Signal(Message, frozen=True):
 
 
 class Look(Message, frozen=True):
-    """Measure CPU time and memory of the processes at this emulated time."""
+    """Measure CPU time and memory of the processes at this emulated time, and tell if one exceeds the limit."""
 
     time_ns: int
+    memory_limit_mb: float | None = None
 
 
 class Patience(Message, frozen=True):
@@ -201,6 +202,13 @@ class Figures(Message, frozen=True):
     memory: Sequence[tuple[str, Sequence[float], Sequence[int]]]
 
 
+class MemoryExceeded(Message, frozen=True):
+    """A process holds more private memory than the limit."""
+
+    process_id: str
+    memory_mb: float
+
+
 class HandingIn(Message, frozen=True):
     """The order to hand in has come: what follows may take its time."""
 
@@ -209,7 +217,9 @@ class HandedIn(Message, frozen=True):
     """All has been handed in."""
 
 
-Item = FromNode | FromUnit | Token | Ended | LogTail | Part | LeftOut | Figures | HandingIn | HandedIn
+Item = (
+    FromNode | FromUnit | Token | Ended | LogTail | Part | LeftOut | Figures | MemoryExceeded | HandingIn | HandedIn
+)
 
 
 class News(Message, frozen=True):

@@ -99,6 +99,7 @@ class Fleet:
         self.on_backbone: Callable[[str, bytes], None] = lambda unit, payload: None
         self.on_token: Callable[[str, bool], None] = lambda node, alive: None
         self.on_ended: Callable[[str, Exit], None] = lambda process_id, how: None
+        self.on_memory: Callable[[str, float], None] = lambda process_id, memory_mb: None
         self.on_lost: Callable[[Sequence[str], str], None] = lambda process_ids, how: None
 
     # In the place of a launcher.
@@ -160,7 +161,7 @@ class Fleet:
     def look(self, time_ns: int) -> None:
         """Have CPU time and memory of the processes measured."""
         for host in self._hosts.values():
-            self._order(host, messages.Look(time_ns))
+            self._order(host, messages.Look(time_ns, self._scenario.run.memory_limit_mb))
 
     # To the hosts.
 
@@ -289,6 +290,9 @@ class Fleet:
                 host.retrieval.tell_left_out(self._time_ns(), item)
             case messages.Figures(cpu_ns, memory):
                 self._take_figures(host, cpu_ns, memory)
+            case messages.MemoryExceeded(process_id, memory_mb):
+                self._check_node(host, process_id)
+                self.on_memory(process_id, memory_mb)
             case messages.HandingIn():
                 host.is_handing_in = True
                 self._changes.set()

@@ -12,8 +12,9 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import ExitStack, nullcontext
+from typing import Any
 
 import zenoh
 
@@ -34,7 +35,7 @@ from emulator.drivers.live.realtime_driver import RealTimeDriver
 from emulator.drivers.live.reconnection import Reconnection
 from emulator.drivers.live.supervisor import SHUT_DOWN_S, Supervisor
 from emulator.drivers.live.waiting import ChangeSignal, Stalled
-from emulator.drivers.memory import MemoryWatch
+from emulator.drivers.memory import MemoryWatch, first_over
 from emulator.drivers.signals import cancelled_by_signals
 from emulator.drivers.status import Course
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, LOCKSTEP_ENVIRONMENT, Zygote
@@ -52,6 +53,8 @@ FULL_PATIENCE_S = 5.0
 """Seconds for which a run that came to its end does."""
 RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
+MEMORY_LOOK_S = 0.2
+"""Seconds of wall clock after which processes are compared with `run.memory_limit_mb` again."""
 EMULATOR_PROCESS = "emulator"
 
 
@@ -241,7 +244,7 @@ class LiveSession:
             self._feed.begin()
             self._driver = self._make_driver(processes)
             with preempting_nobody() if self._in_lockstep else nullcontext():
-                await self._driver.run()
+                await self._within_memory(self._driver.run())
             completed = True
         except Stalled:
             self._emulation.finish(self._time_ns())
@@ -258,6 +261,28 @@ class LiveSession:
             self._memory.write(folder, self._time_ns())
             self._refusals.write_totals()
         return wall_s, interrupted
+
+    async def _within_memory(self, running: Coroutine[Any, Any, None]) -> None:
+        """Await the run; raise Stalled, with an event, as soon as a process exceeds `run.memory_limit_mb`."""
+        limit_mb = self._emulation.scenario.run.memory_limit_mb
+        if limit_mb is None:
+            return await running
+        run, nodes = asyncio.ensure_future(running), frozenset(self._emulation.world.node_ids)
+        exceeded: list[tuple[str, float]] = []
+        if self._fleet is not None:
+            self._fleet.on_memory = lambda *over: exceeded.append(over)
+        try:
+            while not (await asyncio.wait([run], timeout=MEMORY_LOOK_S))[0]:
+                if self._fleet is not None:
+                    self._fleet.look(self._time_ns())
+                pids = {name: pid for name, pid in self._launcher.pids.items() if name in nodes}
+                if over := exceeded[0] if exceeded else first_over(limit_mb, pids):
+                    self._emulation.memory_exceeded(self._time_ns(), *over, self._members.nodes_with(over[0]))
+                    raise Stalled
+        finally:
+            run.cancel()
+            await asyncio.wait([run])
+        return run.result()
 
     def _make_driver(self, processes: Sequence[Sequence[str]]) -> Driver:
         reconnection = Reconnection(

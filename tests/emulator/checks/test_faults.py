@@ -501,8 +501,8 @@ def test_growing_memory_is_a_note_of_agents_alone(node: str) -> None:
         assert isinstance(found, NotExercised)
     else:
         assert isinstance(found, CheckResult) and found.verdict is Verdict.VALID
-        assert "v01 by 500.0 kB a second, 1,800 MB an hour" in found.text
-        assert found.figures["growing"] == [{"node": "v01", "kb_per_s": 500.0, "kb_per_hour": 1_800_000.0}]
+        assert "v01 by 512.0 kB a second, 1,843 MB an hour" in found.text
+        assert found.figures["growing"] == [{"node": "v01", "kb_per_s": 512.0, "kb_per_hour": 1_843_200.0}]
     assert isinstance(result(recorded, "memory"), NotExercised)
 
 

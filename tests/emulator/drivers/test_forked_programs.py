@@ -141,7 +141,7 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     emulation = emulate(tmp_path / "run")
     welcomes = [emulation.welcome("v01", b"")]
     process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None)
-    os.waitid(os.P_PID, process._pid, os.WEXITED | os.WNOWAIT)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     try:
         with pytest.raises(VnetError, match="no room for programs"):
             process.give(None)
