@@ -172,6 +172,8 @@ class _RealTimeAgent:
         self._expected = 0
         self._missed: list[tuple[int, int]] = []
         self._lateness = [0] * lateness.LATENESS_BINS
+        self._late: list[tuple[int, int]] = []
+        """Batches with a late packet that the emulator has not been told of, and when they came."""
         self._sends: dict[tuple[str, int], int] = {}
         """Frames to single vehicles without a result, by node and number, and the `seq` with which they went."""
         self._unseen: dict[MessageRef, int] = {}
@@ -267,8 +269,11 @@ class _RealTimeAgent:
         now_ns = arrived_ns - self._origin_ns
         self._host.apply_clock_error(batch.clocks, self._loop)
         self._host.busy.add(batch.busy)
-        for packet in () if batch.held else batch.packets:
-            self._lateness[lateness.lateness_bin(now_ns - packet.received_ns)] += 1
+        late_ns = [] if batch.held else [now_ns - packet.received_ns for packet in batch.packets]
+        for each_ns in late_ns:
+            self._lateness[lateness.lateness_bin(each_ns)] += 1
+        if max(late_ns, default=0) >= lateness.LATENESS_LIMIT_NS:
+            self._late.append((batch.seq, now_ns))
         self._host.mail.deliver(Mail.of(batch.packets, batch.fixes))
         self._take_results(batch)
         if batch.messages:
@@ -321,10 +326,11 @@ class _RealTimeAgent:
                 wire.Lateness(self._lateness),
                 final,
                 self._take_overdue(),
+                self._late,
             )
         )
         self._seq += 1
-        self._missed = []
+        self._missed, self._late = [], []
         self._attachment.publish(traffic)
 
     async def _acknowledge(self) -> None:

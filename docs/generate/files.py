@@ -76,6 +76,9 @@ Where programs have sent [frames to single vehicles](../radio.md#frames-to-one-v
 a frame has one row, that of its addressee, with another `copy`, and there are three more columns: `attempt`, the
 number of the transmission (0 for a broadcast), `ack_on_air_ns`, the start of the acknowledgement (null without
 one), and `acked`, whether the sender received that.
+
+Where, in real time, the machine delivered over 20 ms late, `arrival_ns` is when the packet came, and there is one
+more column, `late_ns`, the machine's part of it; the radio's own arrival is `arrival_ns - late_ns`.
 """
 WORLD_ABOUT = """
 An archive of numpy arrays, `np.load("world.npz")`, for `n` vehicles, `l` lanes, `k` periods and `r` receivers.

@@ -146,7 +146,7 @@ def _found(name: str, count: int, text: str, nothing: str) -> CheckResult:
 
 
 def _delayed(recorded: RecordedRun, planned: PlannedFault) -> int:
-    return int((recorded.arrived & (recorded.arrival_ns > bounds(recorded, planned).latest_ns)).sum())
+    return int((recorded.arrived & (recorded.due_ns > bounds(recorded, planned).latest_ns)).sum())
 
 
 def _overflowed(recorded: RecordedRun, planned: PlannedFault) -> int:
@@ -198,7 +198,7 @@ def _silenced(recorded: RecordedRun, planned: PlannedFault) -> int:
 
 
 def _missed(recorded: RecordedRun, planned: PlannedFault) -> Mask:
-    return np.asarray(recorded.outcome_is("receiver_down") & recorded.acting(planned, recorded.arrival_ns))
+    return np.asarray(recorded.outcome_is("receiver_down") & recorded.acting(planned, recorded.due_ns))
 
 
 @effect.register

@@ -133,10 +133,10 @@ def check_down_respected(recorded: RecordedRun) -> Finding:
         return NotExercised(name, "no node was down" if recorded.plan else NO_FAULTS)
     sure = ~recorded.is_unsure(recorded.sent_ns)
     speaking = sure & recorded.is_down(recorded.sender, recorded.sent_ns)
-    judged = recorded.arrived & ~recorded.is_unsure(recorded.arrival_ns)
+    judged = recorded.arrived & ~recorded.is_unsure(recorded.due_ns)
     if recorded.closed_ns < recorded.scenario.duration_ns:  # frames in flight were decided at once
-        judged &= recorded.arrival_ns < recorded.closed_ns
-    receiver_down = recorded.is_down(recorded.receiver, recorded.arrival_ns)
+        judged &= recorded.due_ns < recorded.closed_ns
+    receiver_down = recorded.is_down(recorded.receiver, recorded.due_ns)
     hearing = judged & receiver_down & recorded.outcome_is("delivered")
     # A frame to one vehicle is not received either where its radio is down as the frame ends.
     excused = receiver_down | ((recorded.attempt > 0) & recorded.is_down(recorded.receiver, _left_ns(recorded)))

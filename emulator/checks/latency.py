@@ -163,12 +163,12 @@ def _delays(recorded: RecordedRun, plan: list[PlannedFault]) -> tuple[Array, Arr
 def check_latency(recorded: RecordedRun) -> Finding:
     """Check that arrivals are neither earlier nor later than airtime, latency, queue, jitter and faults explain."""
     name = "latency"
-    timed = recorded.arrived & (recorded.arrival_ns >= 0)
+    timed = recorded.arrived & (recorded.due_ns >= 0)
     if not timed.any():
         return nothing_seen(name, recorded, "nothing arrived")
     allowed = bounds(recorded)
-    early = timed & (recorded.arrival_ns < allowed.earliest_ns)
-    late = timed & (recorded.arrival_ns > allowed.latest_ns)
+    early = timed & (recorded.due_ns < allowed.earliest_ns)
+    late = timed & (recorded.due_ns > allowed.latest_ns)
     broken = int(early.sum() + late.sum())
     figures: dict[str, Any] = {"arrivals": int(timed.sum()), "early": int(early.sum()), "late": int(late.sum())}
     mean = _mean_latency(recorded, allowed, timed)
@@ -193,7 +193,7 @@ def _mean_latency(recorded: RecordedRun, allowed: Bounds, timed: Mask) -> dict[s
         return {}
     from_ns = recorded.on_air_ns if recorded.shares_air else recorded.sent_ns
     access_ms = 0.0 if recorded.shares_air else radio.access_jitter_ms
-    mean_ns = float(np.mean((recorded.arrival_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
+    mean_ns = float(np.mean((recorded.due_ns - from_ns)[rows] - allowed.airtime_ns[rows]))
     receivers: IntArray = np.unique(recorded.emission[rows], return_counts=True)[1]
     tick_ms = radio.delivery_tick_us / 1_000
     expected_ms = radio.latency_ms + (access_ms + radio.jitter_ms + tick_ms) / 2

@@ -35,6 +35,9 @@ class _Sent(NamedTuple):
     lost: list[tuple[int, int]]
 
 
+_NOTHING_SENT = _Sent([], [], [])
+
+
 class RealTime:
     """A run on the wall clock: traffic is taken when it comes, and what is due goes out in batches.
 
@@ -103,6 +106,9 @@ class RealTime:
         if message.seq > expected:
             self._lost[process_id].append((expected, message.seq - 1))
         self._frames_seq[process_id] = message.seq + 1
+        for seq, arrived_ns in message.late:
+            sent = self._unacknowledged[process_id].get(seq, _NOTHING_SENT)
+            self._delay(sent.deliveries, min(arrived_ns, now_ns))
         self._acknowledge(process_id, message)
         if message.lateness is not None:
             process = process_id, self._emulation.incarnation[process_id]
@@ -142,6 +148,12 @@ class RealTime:
                 self._lost[process_id] += missed.lost
         for seq in [seq for seq in waiting if seq < message.received_seq]:
             del waiting[seq]
+
+    def _delay(self, deliveries: Sequence[Delivery], arrived_ns: int) -> None:
+        """Correct the arrivals of those deliveries of a batch that came over 20 ms late."""
+        for delivery in deliveries:
+            if arrived_ns - delivery.packet.received_ns >= lateness.LATENESS_LIMIT_NS:
+                self._emulation.engine.delay(delivery, arrived_ns)
 
     def _lose(self, deliveries: Sequence[Delivery]) -> None:
         for delivery in deliveries:

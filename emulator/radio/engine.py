@@ -443,6 +443,10 @@ class Engine:
         self._counts[Outcome.delivered] -= 1
         self._counts[Outcome.transport] += 1
 
+    def delay(self, delivery: Delivery, arrival_ns: int) -> None:
+        """Correct the arrival of a delivery that the machine brought late (real time only); call once for each."""
+        self._trace.delay(delivery.row, arrival_ns)
+
     def drain(self) -> None:
         """End the run: complete every transmission and reception, without waking a program."""
         self._mac.run(None)

@@ -48,6 +48,8 @@ _FRAME = np.dtype(
 )
 ACKNOWLEDGED = ("attempt", "ack_on_air_ns", "acked")
 """Columns of the trace where programs send frames to single vehicles."""
+LATE = "late_ns"
+"""Column of the trace where deliveries were over 20 ms late, in real time: the machine's part of the latency."""
 CHOSEN = ("gain_db", "bitrate_mbps")
 """Columns of the trace where programs choose powers or bit rates."""
 _RECEPTION = np.dtype(
@@ -140,6 +142,7 @@ class Trace:
         self.acknowledges = False
         """True if a program has sent a frame to a single vehicle."""
         self._altered: dict[int, int] = {}
+        self._late_ns: dict[int, int] = {}
 
     def __len__(self) -> int:
         return self._receptions.count
@@ -225,6 +228,11 @@ class Trace:
         self._receptions.records["arrival_ns"][row] = arrival_ns
         self.decide([row], Outcome.receiver_down)
 
+    def delay(self, row: int, arrival_ns: int) -> None:
+        """Set the true arrival of a row that the machine delivered late."""
+        self._late_ns[row] = arrival_ns - int(self._receptions.records["arrival_ns"][row])
+        self._receptions.records["arrival_ns"][row] = arrival_ns
+
     def rows(self, index: NDArray[np.intp] | slice) -> NDArray[np.void]:
         """Return the rows at `index` as records of type `ROW`."""
         receptions = self._receptions.records[index]
@@ -245,7 +253,8 @@ class Trace:
         are `rssi_dbm` and `snr_db`, null for a frame that was never on air. Where programs have chosen a power or a
         bit rate, there are `gain_db`, the frame's power above the scenario's, and `bitrate_mbps`. Where they have
         sent frames to single vehicles, there are `attempt` (0 for a broadcast), `ack_on_air_ns`, the start of the
-        acknowledgement (null without one), and `acked`, whether the sender received that.
+        acknowledgement (null without one), and `acked`, whether the sender received that. Where the machine
+        delivered late, in real time, there is `late_ns`, its part of the latency.
         """
         rows = self.rows(slice(None))
         order = np.lexsort((rows["copy"], rows["receiver"], rows["seq"], rows["sender"], rows["sent_ns"]))
@@ -277,9 +286,16 @@ class Trace:
                 **({"on_air_ns": on_air, "left_ns": pa.array(rows["left_ns"])} if self._knows_air else {}),
                 **({} if chosen is None else {name: pa.array(chosen[name]) for name in CHOSEN}),
                 **({} if exchanged is None else _exchanges(exchanged)),
+                **({LATE: pa.array(self._late(order))} if self._late_ns else {}),
                 **({} if powers is None else {name: _in_db(powers[name]) for name in UNHASHED}),
             }
         )
+
+    def _late(self, order: NDArray[np.intp]) -> IntArray:
+        """Return how late the machine delivered each row, in the order of the table."""
+        late_ns = np.zeros(len(self), np.int64)
+        late_ns[list(self._late_ns)] = list(self._late_ns.values())
+        return late_ns[order]
 
     def sha256(self) -> str:
         """Return the hash of the content; see `sha256_of_table`."""

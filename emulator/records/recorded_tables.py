@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from emulator.radio.connectivity import connectivity_of
 from emulator.radio.dot11p import airtimes_ns
 from emulator.radio.outcomes import Stage, decided_at
+from emulator.radio.trace import LATE
 from emulator.records.busy import busy_windows
 from emulator.records.positions import Places
 from emulator.records.recorded_world import RecordedWorld
@@ -154,6 +155,13 @@ class RecordedTables:
         return self.column("arrival_ns")
 
     @cached_property
+    def due_ns(self) -> IntArray:
+        """Instant of each row's arrival by the radio: in real time `arrival_ns` without the machine's part."""
+        if self.scenario.run.pacing != "realtime":
+            return self.arrival_ns
+        return self.arrival_ns - self._optional(LATE, 0)
+
+    @cached_property
     def shares_air(self) -> bool:
         """True if the trace tells when frames were on air."""
         return "on_air_ns" in self.trace.column_names
@@ -187,20 +195,20 @@ class RecordedTables:
     @cached_property
     def attempt(self) -> IntArray:
         """Number of the transmission of a frame to a single vehicle, from 1 on; 0 for broadcasts."""
-        return self._exchanged("attempt", 0)
+        return self._optional("attempt", 0)
 
     @cached_property
     def ack_on_air_ns(self) -> IntArray:
         """Begin of the acknowledgement of each row's frame; -1 without one."""
-        return self._exchanged("ack_on_air_ns", -1)
+        return self._optional("ack_on_air_ns", -1)
 
     @cached_property
     def acked(self) -> Mask:
         """Mask of the rows whose frame's sender received an acknowledgement."""
-        return self._exchanged("acked", 0) > 0
+        return self._optional("acked", 0) > 0
 
-    def _exchanged(self, name: str, default: int) -> IntArray:
-        """Return a column that the trace has where frames are sent to single vehicles, or else the default."""
+    def _optional(self, name: str, default: int) -> IntArray:
+        """Return a column that only some traces have, or else the default."""
         if name not in self.trace.column_names:
             return np.full(len(self.trace), default)
         return np.asarray(pc.fill_null(self.trace[name].cast(pa.int64()), default).to_numpy(), np.int64)

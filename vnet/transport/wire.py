@@ -203,6 +203,7 @@ class Frames(Message, frozen=True):
     """Real time: traffic since the last message; acknowledges batches up to `received_seq` without `missed`.
 
     `unseen` are messages of the backbone to which batches have referred and that have not come within a second.
+    `late` are batches with a packet over 20 ms late: their `seq`, and the time of the run at which they came.
     """
 
     nonce: bytes
@@ -213,6 +214,7 @@ class Frames(Message, frozen=True):
     lateness: Lateness | None = None
     final: bool = False
     unseen: Sequence[MessageRef] = ()
+    late: Sequence[tuple[Count, TimeNs]] = ()
 
 
 class Final(Message, frozen=True):

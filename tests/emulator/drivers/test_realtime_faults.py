@@ -192,3 +192,29 @@ def test_frames_that_come_after_an_interruption_are_no_part_of_the_run() -> None
     assert emulation.engine.counts[Outcome.pending] == 0
     assert len(emulation.engine.trace) == 0
     assert "v02" not in realtime.awaited
+
+
+def test_the_true_latency_of_a_late_delivery_is_in_the_trace() -> None:
+    realtime, emulation = started()
+    realtime.receive(10 * MS, "v01", wire.Frames(b"n", 0, 1, [], wire.Traffic([wire.Frame("v01", b"x")])))
+    batches = {node: batch for node, batch in realtime.due(60 * MS).items() if batch.packets}
+    arrived_ns = {node: batch.packets[0].received_ns for node, batch in batches.items()}
+    # v02 was late by 40 ms, v03 by 19 ms; v04 speaks of the future, and of a batch that it has never been sent
+    says = {
+        "v02": [(batches["v02"].seq, arrived_ns["v02"] + 40 * MS)],
+        "v03": [(batches["v03"].seq, arrived_ns["v03"] + 19 * MS)],
+        "v04": [(batches["v04"].seq, 2**62), (99, 70 * MS)],
+    }
+    for node, late in says.items():
+        realtime.receive(80 * MS, node, wire.Frames(b"n", 0, batches[node].seq + 1, [], wire.Traffic(), late=late))
+    emulation.finish(emulation.duration_ns)
+    rows = {row["receiver"]: row for row in emulation.engine.trace.to_table().to_pylist()}
+    assert rows["v02"]["arrival_ns"] == arrived_ns["v02"] + 40 * MS
+    assert rows["v03"]["arrival_ns"] == arrived_ns["v03"]
+    assert rows["v04"]["arrival_ns"] == 80 * MS
+    assert {node: row["arrival_ns"] - row["late_ns"] for node, row in rows.items()} == arrived_ns
+
+
+def test_a_trace_without_late_deliveries_has_no_column_for_them() -> None:
+    _, emulation = started()
+    assert "late_ns" not in emulation.engine.trace.to_table().column_names

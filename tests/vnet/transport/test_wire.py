@@ -90,6 +90,7 @@ agent_messages = st.one_of(
         st.none() | st.builds(wire.Lateness, histograms),
         st.booleans(),
         refs,
+        st.lists(st.tuples(times, times), max_size=2),
     ),
     st.builds(wire.Final, st.binary(), traffic),
     st.builds(wire.StackDump, st.binary(), names, st.none() | times),

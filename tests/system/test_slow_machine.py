@@ -1,0 +1,53 @@
+"""The shipped scenarios on a machine made small and slow: the same verdict or unknown, never invalid."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.support.paths import ROOT
+from tests.system.conftest import PATIENT, TIMEOUT_S, VNET, Finished, Vnet
+
+SCENARIOS = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"))
+DURATION_S = {"faults.toml": 20, "city.toml": 4, "dense.toml": 2}
+"""Emulated seconds; those of the others are 3. The faults of `faults.toml` have healed by then."""
+LITTLE_MB = 12
+"""Private memory in MB in which a cooperative agent does not fit."""
+
+
+def make_slow() -> None:
+    """Give this process, and all that it starts, one processor and the lowest priority."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    os.nice(19)
+
+
+def run_slowly(folder: Path, *words: str) -> Finished:
+    command = [*VNET, "run", *words, "--out", str(folder), "--no-report", *PATIENT]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, timeout=TIMEOUT_S, preexec_fn=make_slow
+    )
+    return Finished(done.returncode, done.stdout, done.stderr, folder)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_slow_machine_gives_the_same_verdict(vnet: Vnet, tmp_path: Path, name: str) -> None:
+    words = [f"scenarios/{name}", "--duration", str(DURATION_S.get(name, 3))]
+    fast, slow = vnet("simulate", *words), run_slowly(tmp_path / "slow", *words)
+    assert slow.status == fast.status == 0, slow.stderr + slow.stdout
+    assert slow.fingerprint == fast.fingerprint
+
+
+@pytest.mark.parametrize("name", ["twelve.toml", "faults.toml"])
+def test_a_small_machine_is_unknown(tmp_path: Path, name: str) -> None:
+    small = run_slowly(tmp_path / "small", f"scenarios/{name}", "--set", f"run.memory_limit_mb={LITTLE_MB}")
+    assert small.status == 3, small.stderr + small.stdout
+    assert "invalid" not in {check["verdict"] for check in small.verdict["checks"]}
+    assert small.events_of("memory_exceeded")
+
+
+def test_real_time_on_a_slow_machine_is_valid_or_unknown(tmp_path: Path) -> None:
+    words = ["scenarios/twelve.toml", "--duration", "4", "--pacing", "realtime"]
+    slow = run_slowly(tmp_path / "slow", *words)
+    assert slow.status in (0, 3), slow.stderr + slow.stdout
+    assert "invalid" not in {check["verdict"] for check in slow.verdict["checks"]}
