@@ -12,7 +12,7 @@ from tests.system.conftest import PATIENT, TIMEOUT_S, VNET, Finished, Vnet
 SCENARIOS = sorted(path.name for path in (ROOT / "scenarios").glob("*.toml"))
 DURATION_S = {"faults.toml": 20, "city.toml": 4, "dense.toml": 2}
 """Emulated seconds; those of the others are 3. The faults of `faults.toml` have healed by then."""
-LITTLE_MB = 12
+LITTLE_MB = 8
 """Private memory in MB in which a cooperative agent does not fit."""
 
 
