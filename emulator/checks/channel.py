@@ -395,7 +395,7 @@ def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
     ends_ns = recorded.period_starts_ns() + recorded.scenario.period_ns
     for node in np.flatnonzero(np.isfinite(heard).any(axis=0)).tolist():
         mine = recorded.outcome_is("delivered", "transport") & (recorded.receiver == node)
-        delivered = np.searchsorted(np.sort(recorded.arrival_ns[mine]), ends_ns, side="right")
+        delivered = np.searchsorted(np.sort(recorded.due_ns[mine]), ends_ns, side="right")
         for period in np.flatnonzero((claimed[:, node] > delivered) & np.isfinite(heard[:, node])).tolist():
             claim = {"node": recorded.node_ids[node], "period": period, "heard": int(claimed[period, node])}
             claims.append({**claim, "delivered": int(delivered[period])})

@@ -162,6 +162,21 @@ def test_deliveries_that_were_never_timed_leave_real_time_unknown(recorded: Reco
         assert verdict(timed, "kept_up") is expected
 
 
+@pytest.mark.parametrize("pacing", ["realtime", "lockstep"])
+def test_lateness_of_the_machine_is_not_the_radios(tmp_path: Path, pacing: str) -> None:
+    recorded = four(tmp_path, "agents.cooperative:main")
+    settings = recorded.scenario.run.model_copy(update={"pacing": pacing})
+    late_ns = np.where(recorded.outcome_is("delivered"), 150_000_000, 0)
+    arrival = pa.array(recorded.arrival_ns + late_ns, mask=recorded.arrival_ns < 0)
+    index = recorded.trace.column_names.index("arrival_ns")
+    trace = recorded.trace.set_column(index, "arrival_ns", arrival).append_column("late_ns", pa.array(late_ns))
+    scenario = recorded.scenario.model_copy(update={"run": settings})
+    late = replace(recorded, scenario=scenario, trace=trace)
+    expected = Verdict.VALID if pacing == "realtime" else Verdict.INVALID
+    assert verdict(late, "latency") is expected
+    assert verdict(late, "isolation") is expected
+
+
 HEADER = "id,x_m,y_m,heading_rad"
 
 
