@@ -12,6 +12,8 @@ if TYPE_CHECKING:  # slow to import, and hosts write no events
 
 SAMPLES = 20
 """Samples in a run, ten of them in its second half; a process that is started again begins a new series."""
+LEAST_NS = 1_500_000_000
+"""Least time between two samples, in emulated ns: that of a run of 30 s, the shortest that is judged."""
 UNCHANGED_KB = 16
 """Change of resident memory in KiB from which on private memory is read again: that takes 30 times as long."""
 KB_PER_MB = 1e6 / 1024
@@ -52,7 +54,7 @@ class MemoryWatch:
     """Samples the private memory of processes; `write` puts it into the run's events."""
 
     def __init__(self, duration_ns: int) -> None:
-        self._every_ns = max(1, duration_ns // SAMPLES)
+        self._every_ns = max(LEAST_NS, duration_ns // SAMPLES)
         self._next_ns = 0
         self._series: dict[tuple[str, int], list[tuple[float, int]]] = {}
         self._resident_kb: dict[int, int] = {}

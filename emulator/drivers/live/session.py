@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -55,7 +54,6 @@ RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
 MEMORY_LOOK_S = 0.2
 """Seconds of wall clock after which processes are compared with `run.memory_limit_mb` again."""
-EMULATOR_PROCESS = "emulator"
 
 
 async def run_live(
@@ -357,5 +355,4 @@ class LiveSession:
         self._cpu.look(self._launcher.pids)
         if self._fleet is not None:
             self._fleet.look(view.instant.time_ns)
-        processes = {**self._launcher.pids, EMULATOR_PROCESS: os.getpid()}
-        self._memory.look(view.instant.time_ns, processes)
+        self._memory.look(view.instant.time_ns, self._launcher.pids)
