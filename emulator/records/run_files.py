@@ -52,7 +52,7 @@ from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
 from emulator.world.driven.vehicles import Log
 from emulator.world.world import build_world
-from vnet.bounded import read_bounded
+from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable
 
 LARGEST_EVENTS_BYTES = 1 << 28
@@ -97,7 +97,7 @@ class RunFiles:
     def scenario_text(self) -> str:
         """The text of scenario.toml."""
         path = self.folder / SCENARIO_FILE
-        return self._read(path, lambda: read_bounded(path, LARGEST_BYTES).decode("utf-8", "replace"))
+        return self._read(path, lambda: read_regular(path, LARGEST_BYTES).decode("utf-8", "replace"))
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -129,7 +129,7 @@ class RunFiles:
     def events(self) -> list[Event]:
         """The events, in the order in which they were written; a last line that was cut off is left out."""
         path = self.folder / EVENTS_FILE
-        return self._read(path, lambda: _parse_events(path, read_bounded(path, LARGEST_EVENTS_BYTES)))
+        return self._read(path, lambda: _parse_events(path, read_regular(path, LARGEST_EVENTS_BYTES)))
 
     @cached_property
     def world(self) -> RecordedWorld:

@@ -1,0 +1,280 @@
+"""Checks of a finished run's folder, which `vnet check` makes beside those of the run: its files fit together.
+
+A folder of an earlier format has no manifest, and was written without these checks: where one of them finds
+something there, the run is *unknown* and not *invalid*.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from emulator.checks.channel import received_twice
+from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
+from emulator.records.backbone_table import backbone_figures
+from emulator.records.costs import Costs, PayloadSizes, run_cost
+from emulator.records.driven_table import driving_figures
+from emulator.records.manifest import differing_files, read_manifest
+from emulator.records.metrics import rows_of, summarize
+from emulator.records.period_figures import PeriodFigures
+from emulator.records.radio_metrics import delivery_ratio
+from emulator.records.recorded_run import OpenedRun, RecordedRun
+from emulator.records.reported import reported_figures
+from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
+from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
+from vnet.counted import counted
+
+FIRST_WITH_MANIFEST = 3
+"""Format of the first folders that have a manifest."""
+FILES = "files"
+OWN = "own:"
+NOT_OF_THE_RUN = (FILES, "replay", "trace_sha256")
+"""Checks that compare files, and have other findings once the run is over."""
+
+
+@dataclass(frozen=True)
+class FolderCheck:
+    """One check of a folder, and its row of the reference page; fields as those of `registry.Check`."""
+
+    name: str
+    function: Callable[[OpenedRun], Finding]
+    claims: str
+    invalid: str
+    not_applicable: str = ""
+
+
+def kept(unkept: Sequence[str]) -> Finding:
+    """Say at the end of a run whether all its files were written."""
+    if unkept:
+        return unknown(FILES, f"not kept: {'; '.join(unkept)}", unkept=list(unkept))
+    return result(FILES, 0, "all files were written", "")
+
+
+def check_files(recorded: OpenedRun) -> Finding:
+    """Check that each file is the one whose digest the manifest has."""
+    digests = read_manifest(recorded.folder)
+    if digests is None:
+        if recorded.record.format < FIRST_WITH_MANIFEST:
+            return NotExercised(FILES, f"a folder of format {recorded.record.format} has no manifest")
+        return CheckResult(FILES, Verdict.INVALID, f"there is no {MANIFEST_FILE}")
+    if unkept := [check for check in recorded.record.checks if check.name == FILES and check.figures.get("unkept")]:
+        return unkept[0]
+    differing = differing_files(recorded.folder, digests)
+    first = next((f"{name} {what}" for name, what in differing.items()), "")
+    rows = [{"file": name, "what": what} for name, what in differing.items()]
+    text = f"{counted(len(digests), 'file')} as they were written"
+    return result(FILES, len(rows), text, f"{counted(len(rows), 'file')} other than written: {first}", rows)
+
+
+def verdict_figures(recorded: RecordedRun, rows: Sequence[PeriodFigures]) -> dict[str, Any]:
+    """Return the figures of verdict.json that follow from the other files; `rows` are those of the metrics."""
+    scenario = recorded.scenario
+    count = len(recorded.node_ids) or len(recorded.world.node_ids if recorded.world is not None else ())
+    return {
+        "emulated_s": min(len(rows) * scenario.period_ns, scenario.duration_ns) / 1e9,
+        "seed": scenario.run.seed,
+        "vehicles": count - len(scenario.roadside),
+        "roadside_units": len(scenario.roadside),
+        "packet_delivery_ratio": delivery_ratio(recorded),
+        "figures": summarize(rows),
+        "driving": driving_figures(recorded.driven, recorded.events),
+        "backbone": backbone_figures(recorded.backbone),
+        "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
+    }
+
+
+def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
+    """Check that verdict.json has the figures that the other files give, and the verdict that its checks give."""
+    name = "verdict_file"
+    record = recorded.record
+    kept_figures = _plain(record)
+    computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
+    wrong = [
+        {"figure": path, "kept": ours, "computed": theirs}
+        for each, value in computed.items()
+        for path, ours, theirs in differences(kept_figures[each], _plain(value), each)
+    ]
+    wrong += _wrong_counts(recorded)
+    wrong += _wrong_checks(recorded, judgement)
+    if record.verdict is not (summed := record.judgement.verdict):
+        wrong.append({"figure": "verdict", "kept": record.verdict.value, "computed": summed.value})
+    text = f"{VERDICT_FILE} has what the other files give"
+    first = f", first {wrong[0]['figure']}" if wrong else ""
+    return result(
+        name, len(wrong), text, f"{counted(len(wrong), 'figure')} other than the files give{first}", wrong
+    )
+
+
+def _of_the_course(recorded: OpenedRun) -> Iterator[tuple[str, Any]]:
+    """Yield what events and figures say of the run's wall clock."""
+    wall_s = [event.details.get("wall_s") for event in recorded.event("ended")]
+    start_up_s = [event.details.get("start_up_s") for event in recorded.event("started")]
+    yield "wall_s", wall_s[-1] if wall_s else None
+    yield "start_up_s", start_up_s[0] if start_up_s else None
+
+
+def _wrong_counts(recorded: OpenedRun) -> list[dict[str, Any]]:
+    """Return the numbers of frames and receptions that are not those of the trace."""
+    wrong: dict[str, tuple[Any, Any]] = {}
+    outcomes, counts = np.unique(recorded.trace["outcome"].to_numpy(), return_counts=True)
+    rows = dict(zip(outcomes.tolist(), counts.tolist(), strict=True))
+    record = recorded.record
+    alone = (
+        bool(recorded.places.ever_lonely.any()) or not recorded.places.most_in_range
+        if len(recorded.states)
+        else True
+    )
+    for outcome, count in record.frames_by_outcome.items():
+        if outcome == "out_of_range":
+            if not alone and count != (due := _out_of_range(recorded)):
+                wrong["frames_by_outcome.out_of_range"] = count, due
+        elif count != rows.get(outcome, 0):
+            wrong[f"frames_by_outcome.{outcome}"] = count, rows.get(outcome, 0)
+    for outcome in rows.keys() - record.frames_by_outcome.keys():
+        wrong[f"frames_by_outcome.{outcome}"] = None, rows[outcome]
+    if record.cost is not None and not alone:
+        first = np.unique(_transmissions(recorded), return_index=True)[1]
+        first = first[recorded.copy[first] == 0]
+        sizes = recorded.column("size_bytes")[first]
+        due_cost = run_cost(Costs(), recorded.node_ids, recorded.sender[first], sizes, len(recorded.node_ids))
+        by_node = {vehicle.node: vehicle.payload for vehicle in due_cost.vehicles}
+        told: list[tuple[str, PayloadSizes, PayloadSizes | None]] = [
+            ("cost.payload", record.cost.payload, due_cost.payload)
+        ]
+        told += [(f"cost of {each.node}", each.payload, by_node.get(each.node)) for each in record.cost.vehicles]
+        wrong |= {what: (asdict(ours), theirs and asdict(theirs)) for what, ours, theirs in told if ours != theirs}
+    return [{"figure": what, "kept": ours, "computed": theirs} for what, (ours, theirs) in wrong.items()]
+
+
+def _transmissions(recorded: RecordedRun) -> Any:
+    """Return one number (rows,) for each transmission of a frame."""
+    return recorded.emission * (int(recorded.attempt.max(initial=0)) + 1) + recorded.attempt
+
+
+def _out_of_range(recorded: RecordedRun) -> int:
+    """Return how many receptions of the frames of the trace were out of range."""
+    broadcast = ~received_twice(recorded) & (recorded.attempt == 0)
+    frames = len(np.unique(recorded.emission[broadcast]))
+    single = int(((recorded.attempt > 0) & recorded.outcome_is("out_of_range")).sum())
+    return frames * (len(recorded.node_ids) - 1) - int(broadcast.sum()) + single
+
+
+def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, Any]]:
+    """Return the checks of verdict.json that are not those that the files give; own ones stand as recorded."""
+    record, program = recorded.record, recorded.scenario.program
+    if record.format < FIRST_WITH_MANIFEST:
+        return []
+    ours = _by_name(record.judgement)
+    theirs = _by_name(judgement)
+    wrong = []
+    for name, check in ours.items():
+        if name.startswith(OWN):
+            if not program.checks:
+                wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
+        elif name not in theirs:
+            wrong.append({"figure": name, "kept": "a check", "computed": "no such check"})
+        elif differing := next(differences(_plain(check), _plain(theirs[name]), name), None):
+            wrong.append(dict(zip(("figure", "kept", "computed"), differing, strict=True)))
+    missing = [name for name in theirs if name not in ours and not name.startswith(OWN)]
+    return [*wrong, *({"figure": name, "kept": None, "computed": "a check"} for name in missing)]
+
+
+def _by_name(judgement: Judgement) -> dict[str, Finding]:
+    """Return the findings on a run by name, without those that compare files."""
+    findings: list[Finding] = [*judgement.checks, *judgement.not_exercised]
+    return {finding.name: finding for finding in findings if finding.name not in NOT_OF_THE_RUN}
+
+
+def differences(ours: Any, theirs: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
+    """Yield path and both values wherever two values as JSON has them differ by more than rounding."""
+    if isinstance(ours, Mapping) and isinstance(theirs, Mapping):
+        for name in {**ours, **theirs}:
+            yield from differences(ours.get(name), theirs.get(name), f"{path}.{name}")
+    elif isinstance(ours, list) and isinstance(theirs, list) and len(ours) == len(theirs):
+        for index, (mine, other) in enumerate(zip(ours, theirs, strict=True)):
+            yield from differences(mine, other, f"{path}.{index}")
+    elif isinstance(ours, float) or isinstance(theirs, float):
+        numbers = isinstance(ours, (int, float)) and isinstance(theirs, (int, float))
+        if not numbers or not math.isclose(ours, theirs, rel_tol=1e-9, abs_tol=1e-9):
+            yield path, ours, theirs
+    elif ours != theirs:
+        yield path, ours, theirs
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON holds it."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = {name: getattr(value, name) for name in value.__dataclass_fields__}
+    if isinstance(value, Mapping):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+FOLDER_CHECKS = (
+    FolderCheck(
+        FILES,
+        check_files,
+        f"Each file is the one whose SHA-256 `{MANIFEST_FILE}` has. At the end of a run: all files were written; "
+        "if the disk refused one, the run is unknown.",
+        "a file has other contents, is missing, or is not in the manifest",
+        "a folder of format 1 or 2, which has no manifest",
+    ),
+    FolderCheck(
+        "truth",
+        checked_world,
+        "Positions, headings, common errors, fixes (with the faults of receivers) and `world.npz` are those that "
+        "the scenario and its seed give, to 1e-6 m.",
+        "another position, heading, common error or fix",
+        "the world comes from files, from a function of yours, or from programs that drive",
+    ),
+    FolderCheck(
+        "metrics",
+        check_metrics,
+        "The metrics of each period are those of the states, and `metrics_sha256` is their hash.",
+        "another figure",
+        "no period was completed",
+    ),
+    FolderCheck(
+        "outcomes",
+        check_outcomes,
+        "The radio is given the frames of the trace once more: each has the same receivers, outcomes, causes and "
+        "arrivals, and each fault the same copies.",
+        "another reception",
+        "real time, an order of events other than FIFO, a run that was cut short, frames to single vehicles, "
+        "powers or bit rates of programs, rules of your own, `StaleMessages`, and, with a MAC or copies, frames "
+        "that nobody was in range of",
+    ),
+)
+"""Checks of a folder by themselves; `verdict_file` comes last, as it compares what all others have found."""
+VERDICT_FILE_CHECK = FolderCheck(
+    "verdict_file",
+    lambda recorded: NotExercised("verdict_file", "judged with all others"),
+    f"`{VERDICT_FILE}` has the figures, the numbers of frames and vehicles, and the checks that the other files "
+    "give.",
+    "another figure, or a check that the files do not give",
+)
+
+
+def judge_folder(recorded: OpenedRun, judgement: Judgement) -> None:
+    """Add the findings of the checks of a folder to those of its run."""
+    findings = [check.function(recorded) for check in FOLDER_CHECKS]
+    findings.append(check_verdict_file(recorded, judgement))
+    for finding in findings:
+        judgement.put(_of_earlier_format(finding) if recorded.record.format < FIRST_WITH_MANIFEST else finding)
+
+
+def _of_earlier_format(finding: Finding) -> Finding:
+    """Return a finding on a folder of an earlier vnet, which did not make this check: it makes no run invalid."""
+    if isinstance(finding, NotExercised) or finding.verdict is not Verdict.INVALID:
+        return finding
+    return CheckResult(
+        finding.name, Verdict.UNKNOWN, f"{finding.text}; the folder is of an earlier format", finding.figures
+    )
