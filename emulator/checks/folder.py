@@ -12,11 +12,12 @@ from dataclasses import asdict, dataclass, is_dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.checks.channel import received_twice
 from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
 from emulator.records.backbone_table import backbone_figures
-from emulator.records.costs import Costs, PayloadSizes, run_cost
+from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
 from emulator.records.driven_table import driving_figures
 from emulator.records.manifest import differing_files, read_manifest
 from emulator.records.metrics import rows_of, summarize
@@ -26,12 +27,14 @@ from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
+from emulator.scenario.fault_families import SenderFault
 from vnet.counted import counted
 
 FIRST_WITH_MANIFEST = 3
 """Format of the first folders that have a manifest."""
 FILES = "files"
 OWN = "own:"
+NO_PERIOD = "no period was completed"
 NOT_OF_THE_RUN = (FILES, "replay", "trace_sha256")
 """Checks that compare files, and have other findings once the run is over."""
 
@@ -123,42 +126,48 @@ def _wrong_counts(recorded: OpenedRun) -> list[dict[str, Any]]:
     outcomes, counts = np.unique(recorded.trace["outcome"].to_numpy(), return_counts=True)
     rows = dict(zip(outcomes.tolist(), counts.tolist(), strict=True))
     record = recorded.record
-    alone = (
-        bool(recorded.places.ever_lonely.any()) or not recorded.places.most_in_range
-        if len(recorded.states)
-        else True
-    )
-    for outcome, count in record.frames_by_outcome.items():
-        if outcome == "out_of_range":
-            if not alone and count != (due := _out_of_range(recorded)):
-                wrong["frames_by_outcome.out_of_range"] = count, due
-        elif count != rows.get(outcome, 0):
+    for outcome in {*rows, *record.frames_by_outcome} - {"out_of_range"}:
+        if (count := record.frames_by_outcome.get(outcome, 0)) != rows.get(outcome, 0):
             wrong[f"frames_by_outcome.{outcome}"] = count, rows.get(outcome, 0)
-    for outcome in rows.keys() - record.frames_by_outcome.keys():
-        wrong[f"frames_by_outcome.{outcome}"] = None, rows[outcome]
-    if record.cost is not None and not alone:
-        first = np.unique(_transmissions(recorded), return_index=True)[1]
-        first = first[recorded.copy[first] == 0]
-        sizes = recorded.column("size_bytes")[first]
-        due_cost = run_cost(Costs(), recorded.node_ids, recorded.sender[first], sizes, len(recorded.node_ids))
-        by_node = {vehicle.node: vehicle.payload for vehicle in due_cost.vehicles}
-        told: list[tuple[str, PayloadSizes, PayloadSizes | None]] = [
-            ("cost.payload", record.cost.payload, due_cost.payload)
-        ]
-        told += [(f"cost of {each.node}", each.payload, by_node.get(each.node)) for each in record.cost.vehicles]
-        wrong |= {what: (asdict(ours), theirs and asdict(theirs)) for what, ours, theirs in told if ours != theirs}
+    if record.cost is not None:
+        wrong |= _wrong_payloads(recorded, record.cost)
+        unseen = record.cost.payload.frames - len(_sent_frames(recorded))  # nobody was in range of them
+        count, due = record.frames_by_outcome.get("out_of_range", 0), _out_of_range(recorded, unseen)
+        copied = unseen > 0 and any(isinstance(planned.fault, SenderFault) for planned in recorded.plan)
+        if count < due if copied else count != due:
+            wrong["frames_by_outcome.out_of_range"] = count, due
     return [{"figure": what, "kept": ours, "computed": theirs} for what, (ours, theirs) in wrong.items()]
 
 
-def _transmissions(recorded: RecordedRun) -> Any:
-    """Return one number (rows,) for each transmission of a frame."""
-    return recorded.emission * (int(recorded.attempt.max(initial=0)) + 1) + recorded.attempt
+def _wrong_payloads(recorded: OpenedRun, cost: RunCost) -> dict[str, tuple[Any, Any]]:
+    """Return the numbers and sizes of frames that are not those of the trace; it has not those out of all range."""
+    first = _sent_frames(recorded)
+    sizes = recorded.column("size_bytes")[first]
+    due = run_cost(Costs(), recorded.node_ids, recorded.sender[first], sizes, len(recorded.node_ids))
+    of_node = {vehicle.node: vehicle.payload for vehicle in due.vehicles}
+    seen = dict(zip(recorded.node_ids, recorded.places.always_in_range.tolist(), strict=True))
+    told = [("cost.payload", cost.payload, due.payload, all(seen.values()))]
+    for vehicle in cost.vehicles:
+        payload = of_node.get(vehicle.node, PayloadSizes(-1))
+        told.append((f"cost of {vehicle.node}", vehicle.payload, payload, seen.get(vehicle.node, True)))
+    return {
+        what: (asdict(ours), asdict(theirs))
+        for what, ours, theirs, exact in told
+        if (ours != theirs if exact else ours.frames < theirs.frames)
+    }
 
 
-def _out_of_range(recorded: RecordedRun) -> int:
-    """Return how many receptions of the frames of the trace were out of range."""
+def _sent_frames(recorded: RecordedRun) -> NDArray[np.intp]:
+    """Return the first row of each transmission of a frame by its program."""
+    number = recorded.emission * (int(recorded.attempt.max(initial=0)) + 1) + recorded.attempt
+    first = np.unique(number, return_index=True)[1]
+    return np.asarray(first[recorded.copy[first] == 0], dtype=np.intp)
+
+
+def _out_of_range(recorded: RecordedRun, unseen: int) -> int:
+    """Return how many receptions were out of range; so are all of the frames that the trace has not."""
     broadcast = ~received_twice(recorded) & (recorded.attempt == 0)
-    frames = len(np.unique(recorded.emission[broadcast]))
+    frames = len(np.unique(recorded.emission[broadcast])) + unseen
     single = int(((recorded.attempt > 0) & recorded.outcome_is("out_of_range")).sum())
     return frames * (len(recorded.node_ids) - 1) - int(broadcast.sum()) + single
 
@@ -265,8 +274,12 @@ VERDICT_FILE_CHECK = FolderCheck(
 
 def judge_folder(recorded: OpenedRun, judgement: Judgement) -> None:
     """Add the findings of the checks of a folder to those of its run."""
-    findings = [check.function(recorded) for check in FOLDER_CHECKS]
-    findings.append(check_verdict_file(recorded, judgement))
+    findings = [check_files(recorded)]
+    if len(recorded.states):
+        findings += [check.function(recorded) for check in FOLDER_CHECKS[1:]]
+        findings.append(check_verdict_file(recorded, judgement))
+    else:
+        findings += [NotExercised(check.name, NO_PERIOD) for check in (*FOLDER_CHECKS[1:], VERDICT_FILE_CHECK)]
     for finding in findings:
         judgement.put(_of_earlier_format(finding) if recorded.record.format < FIRST_WITH_MANIFEST else finding)
 

@@ -21,6 +21,7 @@ from emulator.records.metrics import rows_of, sha256_of_rows
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of
 from emulator.records.recorded_run import ENDINGS, OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
+from emulator.records.run_folder import STATES_FILE, WORLD_FILE
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
 from emulator.scenario.fault_families import OwnRule, SenderFault
 from emulator.scenario.faults import StaleMessages
@@ -124,15 +125,15 @@ def check_truth(recorded: OpenedRun) -> Finding:
         return NotExercised(name, why)
     vehicles = len(recorded.world.node_ids)
     if vehicles != scenario.network.vehicles + len(scenario.roadside):
-        text = f"world.npz has {counted(vehicles, 'node')}, the scenario {scenario.network.vehicles}"
+        text = f"{WORLD_FILE} has {counted(vehicles, 'node')}, the scenario {scenario.network.vehicles}"
         return CheckResult(name, Verdict.INVALID, text)
     if periods_of(scenario) * vehicles > len(recorded.states) + SPARE_ROWS:
         return NotExercised(name, "the run was cut short")
     world = build_world(scenario)
     ours, theirs = recorded.world, RecordedWorld.of(world)
-    wrong = [{"file": "world.npz", "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
+    wrong = [{"file": WORLD_FILE, "column": each} for each in ARRAYS if not _same_array(ours, theirs, each)]
     if recorded.node_ids and list(world.node_ids) != recorded.node_ids:
-        wrong.append({"file": "states.parquet", "column": "node"})
+        wrong.append({"file": STATES_FILE, "column": "node"})
     else:
         wrong += _wrong_states(recorded, FaultyGnss(world, recorded.plan, scenario.run.seed), recorded.periods)
     text = f"{counted(recorded.periods, 'period')} of {counted(vehicles, 'node')} as the scenario gives them"
@@ -161,7 +162,7 @@ def _wrong_states(recorded: RecordedRun, gnss: FaultyGnss, periods: int) -> list
             theirs = np.broadcast_to(getattr(instant, name), ours.shape)
             same = same_numbers(ours, theirs, TOLERANCE_M).reshape(len(ours), -1).all(axis=1)
             for node in np.flatnonzero(~same)[: MOST_ROWS - len(wrong)].tolist():
-                row = {"file": "states.parquet", "column": name, "period": period, "node": recorded.node_ids[node]}
+                row = {"file": STATES_FILE, "column": name, "period": period, "node": recorded.node_ids[node]}
                 wrong.append({**row, "kept": ours[node].tolist(), "computed": theirs[node].tolist()})
         if len(wrong) >= MOST_ROWS:
             break

@@ -101,8 +101,8 @@ def conclude(
     emulated_s = emulation.emulated_ns / 1e9
     recorded = gather(emulation, wall_s)
     _put_tables(emulation, recorded)
-    judgement = judge(recorded, _own_findings(recorded, folder))
-    judgement.put(kept(folder.unkept))
+    own = _own_findings(recorded, folder)
+    judgement = judge(recorded, [kept(folder.unkept), *own])
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
     if replay:
         judgement.put(NotExercised("replay", replay))

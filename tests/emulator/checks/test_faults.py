@@ -279,7 +279,7 @@ def test_a_node_that_does_not_stand_still_is_found() -> None:
 @pytest.mark.parametrize("seconds", [-0.5, 0.5])
 def test_a_fix_in_an_outage_or_none_without_is_found(seconds: float) -> None:
     moved = shifted(with_fault("gnss_outage"), seconds)
-    assert not_valid(moved) == {"outage_respected": Verdict.INVALID}
+    assert not_valid(moved) == {"outage_respected": Verdict.INVALID, "fault_events": Verdict.INVALID}
     assert len(checked(moved, "outage_respected").figures["rows"]) == 10
 
 
