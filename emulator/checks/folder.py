@@ -94,6 +94,8 @@ def check_verdict_file(recorded: OpenedRun, judgement: Judgement) -> Finding:
     """Check that verdict.json has the figures that the other files give, and the verdict that its checks give."""
     name = "verdict_file"
     record = recorded.record
+    if record.format == 1:
+        return NotExercised(name, "figures of a folder of format 1 meant something else")
     kept_figures = _plain(record)
     computed = verdict_figures(recorded, rows_of(recorded.metrics)) | dict(_of_the_course(recorded))
     wrong = [
@@ -269,6 +271,7 @@ VERDICT_FILE_CHECK = FolderCheck(
     f"`{VERDICT_FILE}` has the figures, the numbers of frames and vehicles, and the checks that the other files "
     "give.",
     "another figure, or a check that the files do not give",
+    "a folder of format 1",
 )
 
 
