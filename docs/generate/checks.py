@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
+from emulator.checks.folder import FOLDER_CHECKS, VERDICT_FILE_CHECK
 from emulator.checks.registry import CHECKS, Check
 
 INTRODUCTION = """
@@ -13,6 +14,10 @@ Every check of a run, from the table by which `vnet check` judges it. [checks.md
 verdicts add up. LABEL is the name of a fault, such as `kill-0`.
 """
 FROM_THE_FOLDER = (
+    *(
+        [f"`{check.name}`", check.claims, check.invalid, "the folder is of an earlier format", check.not_applicable]
+        for check in (*FOLDER_CHECKS, VERDICT_FILE_CHECK)
+    ),
     [
         "`replay`",
         "The same scenario gives the same trace, states and metrics. Judged with `--check-determinism`.",

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from emulator.checks.channel import received_twice
 from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
 from emulator.records.backbone_table import backbone_figures
+from emulator.records.code_digest import vnet_digest
 from emulator.records.costs import Costs, PayloadSizes, RunCost, run_cost
 from emulator.records.driven_table import driving_figures
 from emulator.records.manifest import differing_files, read_manifest
@@ -28,6 +29,7 @@ from emulator.records.reported import reported_figures
 from emulator.records.run_folder import MANIFEST_FILE, VERDICT_FILE
 from emulator.records.verdicts import CheckResult, Finding, Judgement, NotExercised, Verdict, result, unknown
 from emulator.scenario.fault_families import SenderFault
+from emulator.scenario.toml import parse_toml
 from vnet.counted import counted
 
 FIRST_WITH_MANIFEST = 3
@@ -177,16 +179,19 @@ def _out_of_range(recorded: RecordedRun, unseen: int) -> int:
 def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, Any]]:
     """Return the checks of verdict.json that are not those that the files give; own ones stand as recorded."""
     record, program = recorded.record, recorded.scenario.program
-    if record.format < FIRST_WITH_MANIFEST:
-        return []
+    wrong = []
     ours = _by_name(record.judgement)
     theirs = _by_name(judgement)
-    wrong = []
+    for name in ours:
+        if name.startswith(OWN) and not program.checks:
+            wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
+    code = parse_toml(recorded.scenario_text).get("code")
+    if not isinstance(code, dict) or code.get("vnet") != vnet_digest():  # another vnet may have judged otherwise
+        return wrong
     for name, check in ours.items():
         if name.startswith(OWN):
-            if not program.checks:
-                wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
-        elif name not in theirs:
+            continue
+        if name not in theirs:
             wrong.append({"figure": name, "kept": "a check", "computed": "no such check"})
         elif differing := next(differences(_plain(check), _plain(theirs[name]), name), None):
             wrong.append(dict(zip(("figure", "kept", "computed"), differing, strict=True)))

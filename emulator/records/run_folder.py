@@ -79,7 +79,7 @@ class RunFolder:
         self._has_own_number = self._is_scratch = False
         self._lacks_events = False
         self.unkept: list[str] = []
-        """What the disk has refused at the end of the run: a line for each file."""
+        """A line for each file that the disk has refused at the end of the run."""
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
