@@ -52,11 +52,9 @@ class FolderCheck:
     not_applicable: str = ""
 
 
-def kept(unkept: Sequence[str]) -> Finding:
-    """Say at the end of a run whether all its files were written."""
-    if unkept:
-        return unknown(FILES, f"not kept: {'; '.join(unkept)}", unkept=list(unkept))
-    return result(FILES, 0, "all files were written", "")
+def kept(unkept: Sequence[str]) -> list[Finding]:
+    """Return, at the end of a run, the finding that the disk has refused files; none if it has kept all."""
+    return [unknown(FILES, f"not kept: {'; '.join(unkept)}", unkept=list(unkept))] if unkept else []
 
 
 def check_files(recorded: OpenedRun) -> Finding:
@@ -238,8 +236,8 @@ FOLDER_CHECKS = (
     FolderCheck(
         FILES,
         check_files,
-        f"Each file is the one whose SHA-256 `{MANIFEST_FILE}` has. At the end of a run: all files were written; "
-        "if the disk refused one, the run is unknown.",
+        f"Each file is the one whose SHA-256 `{MANIFEST_FILE}` has. A run itself is unknown "
+        "if the disk refused one.",
         "a file has other contents, is missing, or is not in the manifest",
         "a folder of format 1 or 2, which has no manifest",
     ),

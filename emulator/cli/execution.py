@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import typer
-from rich.console import Console
 
 from emulator.cli.access import create_access, load_or_create_access
 from emulator.cli.new_run import prepare_folder
@@ -36,6 +35,7 @@ from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, say_first
 from emulator.terminal.progress import Progress, show_progress
+from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
@@ -212,7 +212,7 @@ def _finish(
         elif asked.quiet:
             output.print(f"verdict: {judgement.verdict}  {folder}")
         else:
-            print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
+            print_summary(judgement, verdict, folder, SafeConsole(), asked.report, asked.verbose)
         if asked.report:
             report_at_end(folder)
     raise typer.Exit(status)

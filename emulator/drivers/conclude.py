@@ -102,7 +102,7 @@ def conclude(
     recorded = gather(emulation, wall_s)
     _put_tables(emulation, recorded)
     own = _own_findings(recorded, folder)
-    judgement = judge(recorded, [kept(folder.unkept), *own])
+    judgement = judge(recorded, [*kept(folder.unkept), *own])
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
     if replay:
         judgement.put(NotExercised("replay", replay))
