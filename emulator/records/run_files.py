@@ -44,7 +44,7 @@ from emulator.records.run_folder import (
     WORLD_FILE,
     Event,
 )
-from emulator.records.run_tables import StatesReader, TableFile, TraceReader
+from emulator.records.run_tables import StatesReader, TableFile, TraceReader, open_table
 from emulator.records.states import STATES
 from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.recorded import parse_recorded_scenario
@@ -54,8 +54,11 @@ from emulator.world.driven.vehicles import Log
 from emulator.world.world import build_world
 from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable
+from vnet.units import NS_PER_S
 
 LARGEST_EVENTS_BYTES = 1 << 28
+SPARE_ROWS = 1_000_000
+"""Rows that every table may have, whatever verdict.json says."""
 MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
 """A folder with any of these is a run's."""
 WITH_MAC = ("on_air_ns", "left_ns")
@@ -241,25 +244,42 @@ class RunFiles:
         self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
+            if path.exists():
+                raise VnetError(f"{path}: cannot be read: not a regular file")
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
         names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
-        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
+        file = self._read(path, lambda: open_table(path, names))
+        self._bound_rows(path, file.metadata.num_rows)
+        kept = file.schema_arrow
         for column in wanted or schema.names:
-            found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
+            found = column in kept.names and kept.field(column).type == schema.field(column).type
             if not found and column not in left_out:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
+        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         return table.unify_dictionaries()
+
+    def _bound_rows(self, path: Path, rows: int) -> None:
+        """Raise VnetError if a table has many times the rows that verdict.json speaks of."""
+        try:
+            record = self.record
+        except VnetError:  # a run that is on, or that was killed
+            return
+        nodes = record.vehicles + record.roadside_units
+        periods = record.emulated_s * NS_PER_S / self.scenario.period_ns + 1
+        due = {TRACE_FILE: record.in_range, STATES_FILE: nodes * periods, METRICS_FILE: periods}
+        if path.name in due and rows > SPARE_ROWS + 2 * due[path.name]:
+            raise VnetError(f"{path}: {rows:,} rows, where {VERDICT_FILE} speaks of {due[path.name]:,.0f}")
 
     def _columns_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
         """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
         if path.name == TRACE_FILE:
-            there = self._read(path, lambda: pq.read_schema(path.absolute()).names)
+            there = self._read(path, lambda: open_table(path, ()).schema_arrow.names)
             beside = [*WITH_UNICASTS, "on_air_ns"] if "attempt" in there else WITH_UNICASTS
             return [name for name in beside if name in there and name not in wanted]
         if path.name != STATES_FILE or "values" not in wanted:
             return []
-        return self._read(path, lambda: value_columns(pq.read_schema(path.absolute())))
+        return self._read(path, lambda: value_columns(open_table(path, ()).schema_arrow))
 
 
 def _from_here(command: str, folder: Path) -> str:
