@@ -33,7 +33,7 @@ from emulator.drivers.signals import first_interrupt_told, signals_ignored
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import LogFormat, say_first
+from emulator.terminal.console import LogFormat, say_first, tell
 from emulator.terminal.progress import Progress, show_progress
 from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import StandardOutput
@@ -201,6 +201,8 @@ def _finish(
         progress.judging()
         judgement, verdict = conclude(emulation, wall_s, command)
         progress.close()
+        for line in emulation.folder.unkept:
+            tell(line, asked.log_format)
         if asked.check_determinism and not interrupted:
             again = ["--quiet"] if asked.only_the_result else []
             verdict = run_again(emulation, judgement, verdict, command, again)

@@ -100,7 +100,8 @@ def conclude(
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
     recorded = gather(emulation, wall_s)
-    _put_tables(emulation, recorded)
+    with folder.room_for_verdict():
+        _put_tables(emulation, recorded)
     own = _own_findings(recorded, folder)
     judgement = judge(recorded, [*kept(folder.unkept), *own])
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder

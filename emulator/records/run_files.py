@@ -246,6 +246,8 @@ class RunFiles:
             check_is_run(self.folder)
             if path.exists():
                 raise VnetError(f"{path}: cannot be read: not a regular file")
+            if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == name]:
+                raise VnetError(f"{self.folder}: its {VERDICT_FILE} says: not kept: {unkept[0]}")
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
         names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
@@ -258,6 +260,14 @@ class RunFiles:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
         return table.unify_dictionaries()
+
+    def _unkept(self) -> list[str]:
+        """What the disk refused at the end of the run, a line for each file."""
+        try:
+            told = [check.figures.get("unkept") for check in self.record.checks]
+        except VnetError:
+            return []
+        return [str(line) for lines in told if isinstance(lines, list) for line in lines]
 
     def _bound_rows(self, path: Path, rows: int) -> None:
         """Raise VnetError if a table has many times the rows that verdict.json speaks of."""

@@ -10,7 +10,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -46,6 +46,8 @@ FILES = "files"
 """The folder, in a run's own, of what vehicles have left on their disks."""
 AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
+VERDICT_ROOM_BYTES = 1 << 16
+"""Size of most verdicts, with their manifests."""
 FORMAT = 3
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
@@ -192,6 +194,17 @@ class RunFolder:
                     file.write(_line(event))
             except OSError:  # the run goes on, and writes them all at its end
                 self._lacks_events = True
+
+    @contextlib.contextmanager
+    def room_for_verdict(self) -> Iterator[None]:
+        """Hold room on the disk during the block, so that the verdict finds some behind tables that fill it."""
+        held = self.path / ".room"
+        try:
+            with contextlib.suppress(OSError):
+                held.write_bytes(bytes(VERDICT_ROOM_BYTES))
+            yield
+        finally:
+            held.unlink(missing_ok=True)
 
     def complete_events(self) -> None:
         """Write the events that the disk has refused while the run was on."""
