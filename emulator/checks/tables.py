@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.reported import is_text
 from emulator.records.run_tables import VALUES_AS_LIST
+from emulator.records.states import STATES
 from emulator.records.verdicts import MOST_ROWS, NO_FAULTS, Finding, NotExercised, result
 from emulator.scenario.fault_families import ProcessFault
 from vnet.counted import counted
@@ -72,13 +73,13 @@ def check_reports(recorded: RecordedRun) -> Finding:
     name = "reports"
     if not recorded.reported.any():
         return NotExercised(name, "the program reports nothing")
-    wrong = [
+    wrong: list[dict[str, Any]] = [
+        {"what": f"{printable(name)}: not a name of a value"} for name in _names(recorded) if not _allowed(name)
+    ]
+    wrong += [
         {"what": f"{column}: no covariance matrix", "period": period, "node": recorded.node_ids[node]}
         for column in COVARIANCES
         for period, node in np.argwhere(_not_covariances(recorded, column)).tolist()
-    ]
-    wrong += [
-        {"what": f"{printable(name)}: not a name of a value"} for name in _names(recorded) if not _allowed(name)
     ]
     for column in recorded.value_names:
         if is_text(recorded.states[column].type):
@@ -107,7 +108,8 @@ def _names(recorded: RecordedRun) -> list[str]:
     """Return the names of all values that were reported."""
     lists = recorded.states["values"].combine_chunks().cast(VALUES_AS_LIST)
     keys = pc.unique(pc.struct_field(lists.flatten(), "key")).to_pylist()
-    return [*recorded.value_names, *(str(key) for key in keys)]
+    columns = [name for name in recorded.states.column_names if name not in STATES.names]
+    return [*columns, *(str(key) for key in keys)]
 
 
 def _allowed(name: str) -> bool:
