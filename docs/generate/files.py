@@ -242,6 +242,7 @@ EVENTS = {
     ),
     "fault_started": ("", "`fault`, `nodes`", "a fault begins to act, and on whom"),
     "fault_ended": ("", "`fault`", "it has healed"),
+    "judged_by_test": ("", "`checks`", "which properties of a test have judged the run, beside its scenario"),
     "emulator_restarted": ("", "`down_s`", "the emulator's connection is back"),
     "router_restarted": ("", "`down_s`", "the separate router is back"),
     "refused": ("vehicle", "`key`, `reason`", "the first message on this key that was not believed"),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.checks.channel import received_twice
+from emulator.checks.own import PREFIX
 from emulator.checks.recomputed import check_metrics, check_outcomes, checked_world
 from emulator.records.backbone_table import backbone_figures
 from emulator.records.code_digest import vnet_digest
@@ -35,7 +36,6 @@ from vnet.counted import counted
 FIRST_WITH_MANIFEST = 3
 """Format of the first folders that have a manifest."""
 FILES = "files"
-OWN = "own:"
 NO_PERIOD = "no period was completed"
 NOT_OF_THE_RUN = (FILES, "replay", "trace_sha256")
 """Checks that compare files, and have other findings once the run is over."""
@@ -180,20 +180,22 @@ def _wrong_checks(recorded: OpenedRun, judgement: Judgement) -> list[dict[str, A
     wrong = []
     ours = _by_name(record.judgement)
     theirs = _by_name(judgement)
+    of_tests = [event.details.get("checks") for event in recorded.event("judged_by_test")]
+    asked = {name for names in of_tests if isinstance(names, list) for name in names if isinstance(name, str)}
     for name in ours:
-        if name.startswith(OWN) and not program.checks:
+        if name.startswith(PREFIX) and not program.checks and name not in asked:
             wrong.append({"figure": name, "kept": "a check of your own", "computed": "the scenario has none"})
     code = parse_toml(recorded.scenario_text).get("code")
     if not isinstance(code, dict) or code.get("vnet") != vnet_digest():  # another vnet may have judged otherwise
         return wrong
     for name, check in ours.items():
-        if name.startswith(OWN):
+        if name.startswith(PREFIX):
             continue
         if name not in theirs:
             wrong.append({"figure": name, "kept": "a check", "computed": "no such check"})
         elif differing := next(differences(_plain(check), _plain(theirs[name]), name), None):
             wrong.append(dict(zip(("figure", "kept", "computed"), differing, strict=True)))
-    missing = [name for name in theirs if name not in ours and not name.startswith(OWN)]
+    missing = [name for name in theirs if name not in ours and not name.startswith(PREFIX)]
     return [*wrong, *({"figure": name, "kept": None, "computed": "a check"} for name in missing)]
 
 

@@ -146,6 +146,8 @@ def _same_array(ours: RecordedWorld, theirs: RecordedWorld, name: str) -> bool:
     mine, other = getattr(ours, name), getattr(theirs, name)
     if mine is None or other is None or np.shape(mine) != np.shape(other):
         return mine is other
+    if name == "area_m":  # of a test that ended the run early it is that of the whole
+        return bool((mine[0] <= other[0] + TOLERANCE_M).all() and (mine[1] >= other[1] - TOLERANCE_M).all())
     if np.asarray(mine).dtype.kind != "f":
         return bool(np.array_equal(mine, other))
     return bool(same_numbers(mine, other, TOLERANCE_M).all())

@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from emulator.checks.folder import kept, verdict_figures
 from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
-from emulator.checks.own import own_findings
+from emulator.checks.own import PREFIX, own_findings
 from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
@@ -221,6 +221,8 @@ def judge_further(
     """Add findings to a concluded run; returns the new contents of verdict.json."""
     for finding in findings:
         judgement.put(finding)
+    if own := [finding.name for finding in findings if finding.name.startswith(PREFIX)]:  # no scenario names them
+        emulation.folder.event(emulation.emulated_ns, "judged_by_test", checks=own)
     verdict = {**verdict, **_judged(judgement)}
     _put_verdict(emulation.folder, verdict)
     return verdict
