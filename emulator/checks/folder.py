@@ -262,7 +262,7 @@ FOLDER_CHECKS = (
         "outcomes",
         check_outcomes,
         "The radio is given the frames of the trace once more: each has the same receivers, outcomes, causes and "
-        "arrivals, and each fault the same copies.",
+        "arrivals, each fault the same copies, and each vehicle the same channel busy ratios.",
         "another reception",
         "real time, an order of events other than FIFO, a run that was cut short, frames to single vehicles, "
         "powers or bit rates of programs, rules of your own, `StaleMessages`, and, with a MAC or copies, frames "

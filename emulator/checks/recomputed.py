@@ -21,7 +21,7 @@ from emulator.records.metrics import rows_of, sha256_of_rows
 from emulator.records.period_figures import VECTORS, Period, PeriodFigures, figures_of
 from emulator.records.recorded_run import ENDINGS, OpenedRun, RecordedRun
 from emulator.records.recorded_world import ARRAYS, RecordedWorld
-from emulator.records.run_folder import STATES_FILE, WORLD_FILE
+from emulator.records.run_folder import BUSY_FILE, STATES_FILE, WORLD_FILE
 from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExercised, Verdict, result
 from emulator.scenario.fault_families import OwnRule, SenderFault
 from emulator.scenario.faults import StaleMessages
@@ -183,11 +183,24 @@ def check_outcomes(recorded: OpenedRun) -> Finding:
     computed = engine.trace.to_table()
     order = np.lexsort([_codes(recorded, each) for each in reversed(KEY)])
     kept = recorded.trace.take(pa.array(order))
-    wrong = _first_difference(recorded, kept, computed)
+    wrong = _first_difference(recorded, kept, computed) + _wrong_busy_ratios(recorded, engine)
     counts = {outcome.name: count for outcome, count in engine.counts.items()}
     text = f"{counted(len(kept), 'reception')} decided again as they were"
     broken_text = f"{counted(len(wrong), 'reception')} other than the radio decides" if wrong else ""
     return result(name, len(wrong), text, broken_text, wrong, out_of_range=counts["out_of_range"])
+
+
+def _wrong_busy_ratios(recorded: RecordedRun, engine: Engine) -> list[dict[str, Any]]:
+    """Return the first channel busy ratio that is not the one of these frames."""
+    kept = recorded.busy_ratio
+    computed = np.array(engine.busy_ratios(recorded.periods * recorded.scenario.period_ns)).reshape(
+        -1, kept.shape[1]
+    )
+    if recorded.busy is None or (len(kept) == len(computed) and same_numbers(kept, computed).all()):
+        return []
+    shared = min(len(kept), len(computed))
+    windows = np.flatnonzero(~same_numbers(kept[:shared], computed[:shared]).all(axis=1))
+    return [{"trace": BUSY_FILE, "window": int(windows[0]) if len(windows) else shared}]
 
 
 def _why_not_decided_again(recorded: RecordedRun) -> str:

@@ -262,7 +262,7 @@ class RunFiles:
         return table.unify_dictionaries()
 
     def _unkept(self) -> list[str]:
-        """What the disk refused at the end of the run, a line for each file."""
+        """Return a line for each file that the disk refused at the end of the run."""
         try:
             told = [check.figures.get("unkept") for check in self.record.checks]
         except VnetError:

@@ -15,7 +15,7 @@ from emulator.records.manifest import write_manifest
 from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from tests.support.folder_edits import EDITS, Edit, forge, listing
+from tests.support.folder_edits import EDITS, Edit, forge, listing, table
 from tests.support.paths import ROOT
 
 SETTINGS = {
@@ -136,6 +136,15 @@ def test_a_run_whose_world_comes_from_a_file_says_why_it_is_not_computed_again(t
     assert {left.name: left.reason for left in judgement.not_exercised}["truth"].startswith(
         "the world comes from files"
     )
+
+
+def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
+    radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 6.0}
+    folder = simulated(tmp_path / "run", radio=radio, fault=[], program={"entry": "agents.beacon:main"})
+    assert not broken(check_run(folder))
+    table("busy", lambda rows: [*rows[:-1], rows[-1] | {"busy_ratio": rows[-1]["busy_ratio"] + 0.01}])(folder)
+    forge(folder)
+    assert "outcomes" in broken(check_run(folder))
 
 
 def test_files_that_vnet_adds_to_a_finished_run_are_no_edit(copy: Path) -> None:

@@ -1,4 +1,4 @@
-"""What others wrote reaches a terminal as text: no escape sequence of theirs is sent, and no markup is obeyed."""
+"""Texts of others reach a terminal as text: no escape sequence of theirs is sent, and no markup is obeyed."""
 
 import io
 import json
