@@ -321,7 +321,7 @@ def test_latencies_that_are_all_possible_and_together_are_not() -> None:
 def test_a_delay_that_a_fault_owed_is_missed() -> None:
     """Had the delay been planned half a second earlier, those frames came too early."""
     found = not_valid(shifted(with_fault("delay"), -0.5))
-    assert found == {"latency": Verdict.INVALID}
+    assert found == {"latency": Verdict.INVALID, "fault_events": Verdict.INVALID}
 
 
 @pytest.mark.parametrize("kind", ["gnss_jump", "duplicate", "DoS", "DataReplay"])
