@@ -399,6 +399,10 @@ def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
         mine = recorded.outcome_is("delivered", "transport") & (recorded.receiver == node)
         delivered = np.searchsorted(np.sort(recorded.arrival_ns[mine]), ends_ns, side="right")
         for period in np.flatnonzero((claimed[:, node] > delivered) & np.isfinite(heard[:, node])).tolist():
-            claim = {"node": recorded.node_ids[node], "period": period, "heard": int(claimed[period, node])}
+            claim = {
+                "node": recorded.node_ids[node],
+                "period": period,
+                "heard": int(min(claimed[period, node], 2**53)),
+            }
             claims.append({**claim, "delivered": int(delivered[period])})
     return claims

@@ -29,7 +29,8 @@ from emulator.scenario.scenario import Scenario, input_files_of
 from emulator.world.gnss_faults import FaultyGnss
 from emulator.world.world import Instant, build_world, components, periods_of
 from vnet.counted import counted
-from vnet.errors import ScenarioError, first_names
+from vnet.errors import ScenarioError, first_names, printable
+from vnet.transport.wire import LARGEST_MESSAGE_BYTES
 from vnet.types import Array, IntArray, Mask
 
 TOLERANCE_M = 1e-6
@@ -42,6 +43,8 @@ SPARE_ROWS = 1_000_000
 """States that a world may have beyond those of the run, which was cut short, and is still built for it."""
 MOST_RECEPTIONS = 20_000_000
 """Receptions that are decided again; more take minutes."""
+MOST_BYTES = 1 << 32
+"""Bytes of frames that are sent again: each is hashed."""
 KEY = ("sent_ns", "sender", "seq", "receiver", "copy")
 """Columns that name a row of the trace, in the order of its rows."""
 UNCOMPARED = (*KEY, "payload_digest", "size_bytes")
@@ -179,7 +182,13 @@ def check_outcomes(recorded: OpenedRun) -> Finding:
     name = "outcomes"
     if why := _why_not_decided_again(recorded):
         return NotExercised(name, why)
-    engine = _decided_again(recorded)
+    size = recorded.column("size_bytes")
+    if int(size.min()) < 0 or int(size.max()) > LARGEST_MESSAGE_BYTES:
+        return CheckResult(name, Verdict.INVALID, f"frames of {int(size.min())} to {int(size.max())} bytes")
+    try:
+        engine = _decided_again(recorded)
+    except (AssertionError, IndexError, OverflowError, ValueError) as error:  # no run has such frames
+        return CheckResult(name, Verdict.INVALID, f"the radio cannot send these frames: {printable(str(error))}")
     computed = engine.trace.to_table()
     order = np.lexsort([_codes(recorded, each) for each in reversed(KEY)])
     kept = recorded.trace.take(pa.array(order))
@@ -211,6 +220,7 @@ def _why_not_decided_again(recorded: RecordedRun) -> str:
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
         "the run was cut short": bool(recorded.event("interrupted", "stalled", "spun", "died")),
         f"more than {MOST_RECEPTIONS:,} receptions": len(recorded.trace) > MOST_RECEPTIONS,
+        f"more than {MOST_BYTES:,} bytes": int(np.maximum(_originals(recorded)[3], 0).sum()) > MOST_BYTES,
         "programs send to single vehicles": bool((recorded.attempt > 0).any()),
         "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,
         "a rule of your own changes frames": any(isinstance(fault, OwnRule) for fault in faults),

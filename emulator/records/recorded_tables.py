@@ -283,6 +283,8 @@ class RecordedTables:
     @cached_property
     def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
+        if len(period) and not 0 <= period.min() <= period.max() < len(period):
+            raise VnetError(f"states: periods {period.min()} to {period.max()} in {len(period)} rows")
         node = self.states["node"].combine_chunks().dictionary_encode()
         names = [*node.dictionary.to_pylist(), *([None] if node.null_count else [])]
         code = np.array([self.number_of(name) for name in names], dtype=np.intp)

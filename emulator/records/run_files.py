@@ -78,6 +78,15 @@ TABLES: dict[str, pa.Schema] = {
     BACKGROUND_FILE: BACKGROUND,
 }
 """The tables, with the columns that they must have."""
+# fmt: off
+WITHOUT_GAPS = frozenset((
+    "sent_ns", "sender", "seq", "receiver", "size_bytes", "payload_digest", "outcome", "cause", "copy",
+    "left_ns", "gain_db", "bitrate_mbps", "attempt", "acked", "period", "time_ns", "node",
+    "position_m", "heading_rad", "fix_m", "common_error_m", "reporting", "not_finite", "busy_ratio",
+    "component_rmse_m", "component_deviation_m",
+))
+# fmt: on
+"""Columns that have a value in every row."""
 Columns = Mapping[str, Collection[str]]
 T = TypeVar("T")
 
@@ -259,6 +268,9 @@ class RunFiles:
             if not found and column not in left_out:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
         table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
+        for column in table.column_names:
+            if column in WITHOUT_GAPS and table[column].null_count:
+                raise VnetError(f"{path}: column {column!r} has gaps")
         return table.unify_dictionaries()
 
     def _unkept(self) -> list[str]:
