@@ -71,6 +71,26 @@ def test_a_manifest_that_is_a_pipe_is_refused(copy: Path) -> None:
         check_run(copy)
 
 
+@pytest.mark.parametrize(
+    ("name", "column", "value", "message"),
+    [
+        ("trace", "sender", None, "column 'sender' has gaps"),
+        ("metrics", "reporting", None, "column 'reporting' has gaps"),
+        ("states", "period", 2**31 - 1, "periods 0 to 2147483647 in 30 rows"),
+    ],
+)
+def test_a_cell_that_no_run_has_is_refused_in_one_line(
+    copy: Path, name: str, column: str, value: object, message: str
+) -> None:
+    path = copy / f"{name}.parquet"
+    kept = pq.read_table(path)
+    rows = kept.to_pylist()
+    rows[-1][column] = value
+    pq.write_table(pa.Table.from_pylist(rows, schema=kept.schema), path)
+    with pytest.raises(VnetError, match=message):
+        check_run(copy)
+
+
 def many_rows(path: Path, count: int) -> None:
     """Write a table of as many rows as its first one says, in a small file."""
     first = pq.read_table(path).slice(0, 1)
