@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from docs.generate.markdown import page as whole_page
 from docs.generate.markdown import table
+from emulator.checks.folder import FOLDER_CHECKS, VERDICT_FILE_CHECK
 from emulator.checks.registry import CHECKS, Check, Subject
 
 INTRODUCTION = """
@@ -14,6 +15,17 @@ verdicts add up. LABEL is the name of a fault, such as `kill-0`. A check
 *of the run* may be invalid; one *of the machine* is a note, or unknown, and never invalid.
 """
 FROM_THE_FOLDER = (
+    *(
+        [
+            f"`{check.name}`",
+            check.claims,
+            check.invalid,
+            "the folder is of an earlier format",
+            check.not_applicable,
+            Subject.RUN.value,
+        ]
+        for check in (*FOLDER_CHECKS, VERDICT_FILE_CHECK)
+    ),
     [
         "`replay`",
         "The same scenario gives the same trace, states and metrics. Judged with `--check-determinism`.",

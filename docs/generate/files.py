@@ -48,6 +48,8 @@ FOLDER = {
     "world.npz": "[what else there was in the world](#worldnpz): vehicles, lanes, links",
     "events.jsonl": "[what happened](#eventsjsonl), line by line as it happens",
     "verdict.json": "[the verdict](#verdictjson), the checks with their figures, and how to have the run again",
+    "manifest.json": "SHA-256 of each file above, of `logs/` but for `programs.log`, and of `files/`, by its path; "
+    "[`vnet check`](../checks.md#the-files-of-a-run) compares them",
     "logs/": "what each vehicle printed and logged: `v01.log`, …; further incarnations append. `programs.log`: "
     "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign",
     "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
@@ -88,6 +90,8 @@ KINDS = {"U": "text", "f": "double", "i": "int64", "b": "bool"}
 FORMATS = """
 `format` in `verdict.json` is the version of the whole folder.
 
+- 3: there is a `manifest.json`. Without one, checks that compare files with each other make a folder *unknown*
+  where they find something, and not *invalid*.
 - 2: there is a `world.npz`, and `scenario.toml` has a section `[code]`.
 - 1 (vnet 0.1.0): there is neither. Such folders are read. What needs the world, needs the run's input files:
   `render` and `play`, and, with `radio.links` in a file, checks and radio figures. Names of checks that began with
@@ -241,6 +245,7 @@ EVENTS = {
     ),
     "fault_started": ("", "`fault`, `nodes`", "a fault begins to act, and on whom"),
     "fault_ended": ("", "`fault`", "it has healed"),
+    "judged_by_test": ("", "`checks`", "which properties of a test have judged the run, beside its scenario"),
     "emulator_restarted": ("", "`down_s`", "the emulator's connection is back"),
     "router_restarted": ("", "`down_s`", "the separate router is back"),
     "refused": ("vehicle", "`key`, `reason`", "the first message on this key that was not believed"),
@@ -268,7 +273,7 @@ EVENTS = {
     ),
 }
 VERDICT = {
-    "format": "version of the folder, [2](#formats)",
+    "format": "version of the folder, [3](#formats)",
     "verdict": "`valid`, `invalid` or `unknown`",
     "checks": "list of {`name`, `verdict`, `text`, `figures`}; `figures.rows` are the first offending rows",
     "not_exercised": "list of {`name`, `reason`}",

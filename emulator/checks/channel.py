@@ -168,7 +168,7 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
     name = "peer_cap"
     cap = recorded.scenario.radio.max_peers
     largest = recorded.places.most_in_range
-    if largest <= cap:
+    if largest <= cap and not recorded.outcome_is("peer_cap").any():
         return NotExercised(name, f"no receiver has more than {cap} senders in range (at most {largest})")
     if not len(recorded.trace):
         return unknown(name, "no frame was sent")
@@ -179,6 +179,8 @@ def check_peer_cap(recorded: RecordedRun) -> Finding:
     if not broken and not capped.any():
         text = f"the cap of {cap} never acted, though up to {largest} are in range: those beyond it sent nothing"
         return unknown(name, text, **figures)
+    if largest <= cap:  # nothing explains them
+        broken, wrong = int(capped.sum()), capped
     text = f"{counted(int(capped.sum()), 'reception')} beyond the nearest {cap} (up to {largest} in range)"
     return result(
         name,
@@ -397,6 +399,10 @@ def _claims_beyond(recorded: RecordedRun) -> list[dict[str, Any]]:
         mine = recorded.outcome_is("delivered", "transport") & (recorded.receiver == node)
         delivered = np.searchsorted(np.sort(recorded.due_ns[mine]), ends_ns, side="right")
         for period in np.flatnonzero((claimed[:, node] > delivered) & np.isfinite(heard[:, node])).tolist():
-            claim = {"node": recorded.node_ids[node], "period": period, "heard": int(claimed[period, node])}
+            claim = {
+                "node": recorded.node_ids[node],
+                "period": period,
+                "heard": int(min(claimed[period, node], 2**53)),
+            }
             claims.append({**claim, "delivered": int(delivered[period])})
     return claims

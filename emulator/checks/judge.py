@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from emulator.checks.folder import judge_folder
 from emulator.checks.own import PREFIX, load_checks, own_findings, recorded_findings
 from emulator.checks.registry import CHECKS, Subject
 from emulator.checks.replay import ONCE, check_replay
@@ -68,6 +69,7 @@ def check_run(folder: Path, own_checks: bool = False, checks: Sequence[str] = ()
     if judgement.trace_sha256 != trace_sha256:
         text = f"the trace is not the one that verdict.json speaks of ({trace_sha256[:12]}…)"
         judgement.put(CheckResult("trace_sha256", Verdict.INVALID, text))
+    judge_folder(recorded, judgement)
     return judgement
 
 

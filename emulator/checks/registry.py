@@ -47,9 +47,11 @@ from emulator.checks.run import (
     check_transport,
 )
 from emulator.checks.senders import check_copies, check_gnss
+from emulator.checks.tables import check_fault_events, check_reports, check_row_order
 from emulator.records.divergence import DIVERGENT_M, DIVERGENT_S
 from emulator.records.recorded_run import RecordedRun
 from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict
+from vnet.reports import LONGEST_TEXT
 
 Function = Callable[[RecordedRun], Finding] | Callable[[RecordedRun], Iterator[Finding]]
 
@@ -151,7 +153,7 @@ CHECKS: list[Check] = [
         RADIO,
         "Each receiver hears its nearest `max_peers` senders that are up. Frames sent at the instant of a "
         "death are not judged.",
-        invalid="a reception on the wrong side of the cap",
+        invalid="a reception on the wrong side of the cap, or beyond a cap that nothing exceeds",
         unknown="the cap could have acted and never did",
         not_applicable="no receiver has so many senders in range",
         without_positions=WithoutPositions.UNKNOWN,
@@ -239,6 +241,14 @@ CHECKS: list[Check] = [
         unknown=BEHIND,
         not_applicable="no vehicle was paused",
         realtime_sensitive=True,
+    ),
+    Check(
+        check_fault_events,
+        FAULTS,
+        "Events tell the start and the end of each fault, with its nodes, and each restart, at the instants of the "
+        "plan; in real time at any instant, and restarts are not judged.",
+        invalid="an event too many, missing, or at another instant",
+        not_applicable="no faults",
     ),
     Check(
         check_outage_respected,
@@ -380,6 +390,21 @@ CHECKS: list[Check] = [
         invalid="one does",
         not_applicable="no program reports",
         without_positions=WithoutPositions.JUDGE,
+    ),
+    Check(
+        check_reports,
+        RUN,
+        "Reports hold what `node.report` allows: covariance matrices that are symmetric and positive semidefinite, "
+        f"names that are identifiers, with a dot and any text behind it, and texts of at most {LONGEST_TEXT} "
+        "characters.",
+        invalid="one holds something else",
+        not_applicable="no program reports",
+    ),
+    Check(
+        check_row_order,
+        RUN,
+        "The rows of trace, states and metrics are in their order, and those of each period have its time.",
+        invalid="a row out of order",
     ),
     Check(
         check_memory,

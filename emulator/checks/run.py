@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from emulator.checks.memory_growth import is_long_enough, steady_growth_kib_per_s
 from emulator.records.distributions import lowest_share
 from emulator.records.failures import in_words, kinds_of
+from emulator.records.period_figures import VECTORS
 from emulator.records.recorded_run import END_OF_TIME_NS, RecordedRun
 from emulator.records.reported import is_text, numbers_of
 from emulator.records.run_folder import Event
@@ -18,7 +20,7 @@ from emulator.records.verdicts import MOST_ROWS, CheckResult, Finding, NotExerci
 from emulator.scenario.fault_families import ProcessFault
 from vnet.counted import counted
 from vnet.errors import first_names
-from vnet.types import Mask
+from vnet.types import IntArray, Mask
 from vnet.units import NS_PER_S
 
 LATE_SHARE_LIMIT = 0.001
@@ -125,13 +127,32 @@ def check_finite(recorded: RecordedRun) -> Finding:
     reporting = int(np.sum(recorded.metrics["reporting"].to_numpy()))
     if reporting == 0:
         return NotExercised(name, "the program reports nothing")
-    not_finite = recorded.metrics["not_finite"].to_numpy()
+    not_finite = np.maximum(recorded.metrics["not_finite"].to_numpy(), _not_finite_rows(recorded))
     broken = int(np.sum(not_finite))
     text = f"{counted(reporting, 'report')}, all numbers finite"
     rows = [{"period": int(p), "not_finite": int(not_finite[p])} for p in np.flatnonzero(not_finite)]
     values = "; ".join(_not_finite_values(recorded)) if broken else ""
     broken_text = f"{counted(broken, 'report')} with NaN or infinity" + (f": {values}" if values else "")
     return result(name, broken, text, broken_text, rows, reports=reporting, not_finite=broken)
+
+
+def _not_finite_rows(recorded: RecordedRun) -> IntArray:
+    """Number of rows of the states in each period of the metrics that hold NaN or infinity."""
+    broken = np.zeros(len(recorded.states), dtype=bool)
+    for name in (*VECTORS, "cloud_m", *recorded.value_names):
+        column = recorded.states[name].combine_chunks()
+        if is_text(column.type):
+            continue
+        if not pa.types.is_list(column.type) and not pa.types.is_fixed_size_list(column.type):
+            broken |= np.asarray(column.is_valid()) & ~np.isfinite(numbers_of(recorded.states[name]))
+            continue
+        number = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=float)
+        if not np.isfinite(number).all():
+            row = np.asarray(pc.list_parent_indices(column).to_numpy())
+            broken[row[~np.isfinite(number)]] = True
+    period = np.asarray(recorded.states["period"].to_numpy(), dtype=np.intp)[broken]
+    counts = np.bincount(period[period >= 0], minlength=len(recorded.metrics))
+    return np.asarray(counts[: len(recorded.metrics)], dtype=np.int64)
 
 
 def _not_finite_values(recorded: RecordedRun) -> list[str]:

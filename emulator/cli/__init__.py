@@ -16,12 +16,19 @@ def main() -> None:
     except KeyboardInterrupt:  # of `python -m emulator`, which no console script has guarded
         sys.exit(130)
     from emulator.cli.table import find
-    from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_same_arithmetic
+    from vnet.runtime.environment import (
+        fix_hash_seed,
+        open_standard_descriptors,
+        too_little_address_space,
+        use_same_arithmetic,
+    )
 
     open_standard_descriptors()
     use_same_arithmetic()
     arguments = sys.argv[1:]
     command = find(arguments)
+    if command is not None and (problem := too_little_address_space(command.needed_mb)):
+        sys.exit(_refuse(problem))
     if command is not None and command.runs_programs:
         fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
@@ -33,3 +40,9 @@ def main() -> None:
     if failure := standard_streams.failure():
         status = console.say_output_failed(failure, arguments)
     sys.exit(status)
+
+
+def _refuse(problem: str) -> int:
+    """Say what is wrong before anything is imported; return the exit status."""
+    print(f"vnet: {problem}", file=sys.stderr)
+    return 2

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from emulator.checks.judge import check_run
 from emulator.cli.options import ChecksOption, path_of
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import from_here
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.summary import print_checks
 
 
@@ -29,5 +29,5 @@ def check(
     """Judge a run again, from its files alone; its own checks stand as recorded unless asked."""
     with one_line_errors():
         judgement = check_run(folder, own_checks, [from_here(each) for each in check or ()])
-        print_checks(judgement, Console(), RecordedRun.open(folder).record.reproduce)
+        print_checks(judgement, SafeConsole(), RecordedRun.open(folder).record.reproduce)
         raise typer.Exit(judgement.exit_status)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -15,6 +14,7 @@ from emulator.cli.options import RunArgument, path_of
 from emulator.records.parting import Parting, before, partings
 from emulator.records.recorded_run import RecordedRun
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import printable
 from vnet.units import NS_PER_S
 
@@ -33,7 +33,7 @@ def diff(
     with one_line_errors():
         ours, theirs = RecordedRun.open(run), RecordedRun.open(other)
         found = partings(ours, theirs)
-        console = Console()
+        console = SafeConsole()
         if not found:
             console.print("the runs agree in all decisions, frames, receptions, events and reported values")
             return

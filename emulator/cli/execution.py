@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import typer
-from rich.console import Console
 
 from emulator.cli.access import create_access, load_or_create_access
 from emulator.cli.new_run import prepare_folder
@@ -34,8 +33,9 @@ from emulator.drivers.signals import first_interrupt_told, signals_ignored
 from emulator.drivers.simulate import simulate as run_simulation
 from emulator.records.code_digest import entries_of
 from emulator.scenario.scenario import Scenario
-from emulator.terminal.console import LogFormat, say_first
+from emulator.terminal.console import LogFormat, say_first, tell
 from emulator.terminal.progress import Progress, show_progress
+from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
@@ -201,6 +201,8 @@ def _finish(
         progress.judging()
         judgement, verdict = conclude(emulation, wall_s, command)
         progress.close()
+        for line in emulation.folder.unkept:
+            tell(line, asked.log_format)
         if asked.check_determinism and not interrupted:
             again = ["--quiet"] if asked.only_the_result else []
             verdict = run_again(emulation, judgement, verdict, command, again)
@@ -212,7 +214,7 @@ def _finish(
         elif asked.quiet:
             output.print(f"verdict: {judgement.verdict}  {folder}")
         else:
-            print_summary(judgement, verdict, folder, Console(), asked.report, asked.verbose)
+            print_summary(judgement, verdict, folder, SafeConsole(), asked.report, asked.verbose)
         if asked.report:
             report_at_end(folder)
     raise typer.Exit(status)

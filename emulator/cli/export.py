@@ -25,6 +25,7 @@ from emulator.records.radio_metrics import BIN_M, RadioMetrics, radio_metrics
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.unicast_figures import UnicastFigures, unicast_figures
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError
 
 WORST_LINKS = 10
@@ -80,7 +81,7 @@ def radio(
             for name, table in tables.items():
                 with atomically(out / f"{name}.parquet") as part:
                     pq.write_table(table, part, compression="zstd")
-        _print(metrics, unicast_figures(recorded), Console())
+        _print(metrics, unicast_figures(recorded), SafeConsole())
 
 
 def _print(metrics: RadioMetrics, unicast: UnicastFigures | None, console: Console) -> None:

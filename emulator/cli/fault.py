@@ -11,7 +11,6 @@ from typing import Annotated, Any
 
 import typer
 from msgspec import convert
-from rich.console import Console
 from rich.table import Table
 
 from emulator.cli.help import group
@@ -23,6 +22,7 @@ from emulator.terminal.console import one_line_errors
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import Painter
 from emulator.terminal.progress import terminal
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import ScenarioError, VnetError, first_names
 
 app = group("Inject faults into a running emulator, and heal them.")
@@ -104,7 +104,7 @@ def status(
         elif watch:
             _watch(run, convert(found, Snapshot))
         else:
-            Console().print(Dashboard(convert(found, Snapshot), steady=False), height=ALL_ROWS, end="")
+            SafeConsole().print(Dashboard(convert(found, Snapshot), steady=False), height=ALL_ROWS, end="")
 
 
 def _watch(run: Path, shot: Snapshot) -> None:
@@ -146,4 +146,4 @@ def _show(faults: list[dict[str, Any]]) -> None:
         nodes = fault["nodes"]
         shown = first_names(nodes, 6, with_total=True)
         table.add_row(fault["fault"], fault["state"], f"{fault['start_s']:.3f} s", f"{fault['end_s']:.3f} s", shown)
-    Console().print(table)
+    SafeConsole().print(table)

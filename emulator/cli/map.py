@@ -10,12 +10,12 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 
 from emulator.cli.help import group
 from emulator.cli.options import pair
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from emulator.world.maps import datum as calibration
 from emulator.world.maps.city import SIZE_M, city_roads
 from emulator.world.maps.datum import PLACE_M, Calibration
@@ -207,7 +207,7 @@ def _box(middle_m: tuple[float, float], side_km: float) -> tuple[Array, Array]:
 
 def _print(path: Path, report: MapReport, frame: Frame | None) -> None:
     east, north = report.size_km
-    console = Console()
+    console = SafeConsole()
     print(f"{path.name}: {east:.1f} × {north:.1f} km, {report.roads:,} roads, {report.nodes:,} points")
     print(
         f"{report.length_km:,.1f} km of road, {report.one_way_km:,.1f} km one way; {report.lane_km:,.1f} km of lane"

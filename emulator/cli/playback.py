@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import track
 
 from emulator.cli.options import LATEST, RerunBindOption, RerunPortOption, RerunVehicleOption, RunArgument
@@ -18,6 +17,7 @@ from emulator.stream.pace import play as play_scheduled
 from emulator.stream.pace import schedule
 from emulator.stream.playback import Message, messages
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from emulator.viewer.sinks import Sinks, has_display, place_to_serve
 from vnet.errors import VnetError
 from vnet.units import NS_PER_S
@@ -56,7 +56,7 @@ def _write_recording(played: Iterator[Message], sinks: Sinks) -> None:
     stream, scene = next(played)
     with _recorder(sinks, scene["name"]) as recorder:
         recorder.take(stream, scene)
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         total = scene["duration_ns"] / scene["period_ns"]
         for stream, message in track(
             played, "drawing", total, console=console, transient=True, disable=not console.is_terminal

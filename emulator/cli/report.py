@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from emulator.cli.options import LATEST, RunArgument
 from emulator.records.run_folder import VERDICT_FILE
 from emulator.terminal.console import one_line_errors, tell
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError
 
 
@@ -55,7 +55,7 @@ def compare(
 
     with one_line_errors():
         comparison = Comparison.of(first, second)
-        print_comparison(comparison, Console())
+        print_comparison(comparison, SafeConsole())
         if out is not None:
             from emulator.report.compare_page import write_comparison
 

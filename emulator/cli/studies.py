@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from emulator.cli.options import (
     ChecksOption,
@@ -22,6 +21,7 @@ from emulator.cli.options import (
     load,
 )
 from emulator.terminal.console import one_line_errors, tell
+from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import result_only
 
 RUNS_ON_DASK = 64
@@ -40,7 +40,7 @@ def analyze(
     from emulator.experiments.analyze import analyze as analyze_scenario
 
     with one_line_errors():
-        Console().print(analysis_table(analyze_scenario(load(scenario, overrides), run)))
+        SafeConsole().print(analysis_table(analyze_scenario(load(scenario, overrides), run)))
 
 
 def campaign(
@@ -90,4 +90,4 @@ def campaign(
         if plan.note:
             tell(plan.note)
         with open_executor(executor) as pool:
-            raise typer.Exit(run_campaign(plan, out, Console(stderr=True), pool))
+            raise typer.Exit(run_campaign(plan, out, SafeConsole(stderr=True), pool))

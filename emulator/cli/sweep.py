@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from emulator.cells.cells import run_cells
 from emulator.cells.executors import open_executor
@@ -33,6 +32,7 @@ from emulator.cli.options import (
 )
 from emulator.scenario.overrides import parse_values
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError, printable
 
 INTERRUPTED = 130
@@ -89,7 +89,7 @@ def sweep(
         table = write_sweep(plan, folder)
         verdicts = table["verdict"].to_pylist()
         counts = ", ".join(f"{verdicts.count(name)} {name}" for name in sorted(set(verdicts)))
-        Console().print(f"{len(table)} runs: {counts}", highlight=False)
+        SafeConsole().print(f"{len(table)} runs: {counts}", highlight=False)
         print(folder / TABLE)
         print(folder / PAGE)
 

@@ -35,6 +35,11 @@ class Command:
     runs_programs: bool = False
     """It runs programs in this process, which therefore needs a fixed hash seed."""
 
+    @property
+    def needed_mb(self) -> int:
+        """Address space in MB that it needs at least: libraries and their threads, most of it never touched."""
+        return 3000 if self.name in ("run", "emulator", "demo", "host") else 800
+
 
 COMMANDS = (
     Command("run", Panel.RUN, "runs", "run", "Run a scenario, with a process for each vehicle."),

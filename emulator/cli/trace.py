@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
@@ -18,6 +17,7 @@ from emulator.records.frame_log import FrameEntry, frame_log
 from emulator.records.recorded_run import RecordedRun
 from emulator.scenario.program import split_file
 from emulator.terminal.console import one_line_errors
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import VnetError, did_you_mean, printable, shown
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import error_line
@@ -26,6 +26,8 @@ from vnet.units import NS_PER_S
 COLUMNS = ("s", "sender", "frame", "bytes", "content", "receivers")
 LONGEST_CONTENT = 200
 """Characters of a content that are shown."""
+LONGEST_CELL = 100_000
+"""Characters of a cell that are printed where no table is."""
 MOST_BYTES = 32
 """Bytes of a payload that are shown where nothing decodes it."""
 
@@ -56,11 +58,11 @@ def trace(
         content = _raw if decode is None else _decoded_by(_load(decode))
         end_ns = None if end is None else round(end * NS_PER_S)
         rows = (_row(entry, content) for entry in frame_log(recorded, node, round(start * NS_PER_S), end_ns))
-        console = Console()
+        console = SafeConsole()
         if not console.is_terminal:
             print("\t".join(COLUMNS))
             for row in rows:
-                print("\t".join(row))
+                print("\t".join(printable(cell, LONGEST_CELL) for cell in row))
             return
         table = Table(*COLUMNS, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for row in rows:

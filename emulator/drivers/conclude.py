@@ -17,21 +17,18 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.checks.folder import kept, verdict_figures
 from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
-from emulator.checks.own import own_findings
+from emulator.checks.own import PREFIX, own_findings
 from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
-from emulator.records.backbone_table import backbone_figures
 from emulator.records.busy import busy_table
 from emulator.records.costs import run_cost
-from emulator.records.driven_table import driving_figures
-from emulator.records.metrics import summarize
+from emulator.records.manifest import write_manifest
 from emulator.records.node_files import collect
-from emulator.records.radio_metrics import delivery_ratio
 from emulator.records.recorded_world import RecordedWorld
-from emulator.records.reported import reported_figures
 from emulator.records.run import Run
 from emulator.records.run_folder import (
     AGAIN,
@@ -98,13 +95,15 @@ def conclude(
     """Write what is kept of a run and judge it. `command` is the vnet command that ran it (run, simulate).
 
     `replay` says why no replay is warranted, if none is. Returns the judgement and the contents of verdict.json.
-    Raises VnetError if the disk is full.
+    What the disk refuses is left out, and the run is unknown; raises VnetError if it refuses the verdict itself.
     """
     folder = emulation.folder
     emulated_s = emulation.emulated_ns / 1e9
     recorded = gather(emulation, wall_s)
-    _put_tables(emulation, recorded)
-    judgement = judge(recorded, _own_findings(recorded, folder))
+    with folder.room_for_verdict():
+        _put_tables(emulation, recorded)
+    own = _own_findings(recorded, folder)
+    judgement = judge(recorded, [*kept(folder.unkept), *own])
     reproduce = f"vnet {command} {shlex.quote(str(folder.scenario_path.absolute()))}"  # from any folder
     if replay:
         judgement.put(NotExercised("replay", replay))
@@ -115,20 +114,12 @@ def conclude(
         **_judged(judgement),
         "trace_sha256": judgement.trace_sha256,
         "metrics_sha256": emulation.metrics.sha256(),
-        "emulated_s": emulated_s,
+        **verdict_figures(recorded, emulation.metrics.rows),
         "start_up_s": _start_up_s(emulation),
         "wall_s": round(wall_s, 3),
         "real_time_factor": round(emulated_s / wall_s, 3) if wall_s > 0 else None,
-        "seed": emulation.scenario.run.seed,
         "order": _order(emulation),
-        "vehicles": len(emulation.world.node_ids) - len(emulation.scenario.roadside),
-        "roadside_units": len(emulation.scenario.roadside),
         "frames_by_outcome": {o.name: n for o, n in emulation.engine.counts.items() if o is not Outcome.pending},
-        "packet_delivery_ratio": delivery_ratio(recorded),
-        "figures": summarize(emulation.metrics.rows),
-        "driving": driving_figures(recorded.driven, recorded.events),
-        "backbone": backbone_figures(recorded.backbone),
-        "reported": {name: asdict(figure) for name, figure in reported_figures(recorded.states).items()},
         "cost": asdict(cost),
         "reproduce": reproduce,
         "versions": {
@@ -139,32 +130,38 @@ def conclude(
             **emulation.driving.versions,
         },
     }
-    folder.put_json(VERDICT_FILE, verdict)
+    _put_verdict(folder, verdict)
     return judgement, verdict
+
+
+def _put_verdict(folder: RunFolder, verdict: dict[str, Any]) -> None:
+    """Write the verdict, and the manifest that has its digest and those of all files before it."""
+    folder.put_json(VERDICT_FILE, verdict)
+    write_manifest(folder)
 
 
 def _put_tables(emulation: Emulation, recorded: RecordedRun) -> None:
     """Write the tables of a run into its folder."""
     folder = emulation.folder
-    tables = {
-        TRACE_FILE: recorded.trace,
-        STATES_FILE: recorded.states,
+    folder.complete_events()
+    if recorded.world is not None:
+        folder.keep(WORLD_FILE, recorded.world.write)
+    tables = {  # the largest come last: on a full disk the others are kept
         METRICS_FILE: recorded.metrics,
+        STATES_FILE: recorded.states,
         BUSY_FILE: recorded.busy,
         DRIVEN_FILE: recorded.driven,
         BACKBONE_FILE: recorded.backbone,
         BACKGROUND_FILE: recorded.background,
+        TRACE_FILE: recorded.trace,
+        PAYLOADS_FILE: None if emulation.payloads is None else emulation.payloads.to_table(),
     }
     for name, table in tables.items():
         if table is not None:
-            folder.put_table(name, table)
-    if emulation.payloads is not None:
-        folder.put_table(PAYLOADS_FILE, emulation.payloads.to_table())
-    if recorded.world is not None:
-        folder.put(WORLD_FILE, recorded.world.write)
+            folder.keep_table(name, table)
     if emulation.orders.explores:
         tape = dump_tape(emulation.orders.in_order())
-        folder.put(TAPE_FILE, lambda path: write_text(path, tape))
+        folder.keep(TAPE_FILE, lambda path: write_text(path, tape))
 
 
 def _order(emulation: Emulation) -> dict[str, Any] | None:
@@ -197,7 +194,7 @@ def _own_findings(
     with redirect_stdout(StringIO()) as printed, signals_handled(signal.default_int_handler, signal.SIGINT):
         findings = own_findings(program, Run(recorded, folder.path, write=write))
     if printed.getvalue():
-        folder.put("logs/checks.log", lambda path: write_text(path, printed.getvalue()))
+        folder.keep("logs/checks.log", lambda path: write_text(path, printed.getvalue()))
     return findings
 
 
@@ -224,8 +221,10 @@ def judge_further(
     """Add findings to a concluded run; returns the new contents of verdict.json."""
     for finding in findings:
         judgement.put(finding)
+    if own := [finding.name for finding in findings if finding.name.startswith(PREFIX)]:  # no scenario names them
+        emulation.folder.event(emulation.emulated_ns, "judged_by_test", checks=own)
     verdict = {**verdict, **_judged(judgement)}
-    emulation.folder.put_json(VERDICT_FILE, verdict)
+    _put_verdict(emulation.folder, verdict)
     return verdict
 
 

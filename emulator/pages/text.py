@@ -31,4 +31,4 @@ def cell(value: Any) -> str:
     """Return a value as a table shows it: six digits of a fraction, nothing for None."""
     if isinstance(value, float):
         return f"{value:.6g}"
-    return "" if value is None else str(value)
+    return as_text(value)

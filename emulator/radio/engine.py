@@ -154,6 +154,10 @@ class Engine:
 
     # Enqueueing.
 
+    def number_next(self, node: int, seq: int) -> None:
+        """Give the next frame of a node this number: a trace lacks the frames that nobody was in range of."""
+        self._next_seq[node] = seq
+
     def transmit(
         self, time_ns: int, node: int, payloads: Sequence[bytes], options: Mapping[int, SendOptions] = NO_OPTIONS
     ) -> None:

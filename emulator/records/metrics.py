@@ -128,7 +128,17 @@ class Metrics:
 
     def sha256(self) -> str:
         """A hash of the metrics' content, bit by bit."""
-        return hashlib.sha256(repr(self.rows).encode()).hexdigest()
+        return sha256_of_rows(self.rows)
+
+
+def sha256_of_rows(rows: Sequence[PeriodFigures]) -> str:
+    """Return a hash of the figures of all periods, bit by bit."""
+    return hashlib.sha256(repr(list(rows)).encode()).hexdigest()
+
+
+def rows_of(metrics: pa.Table) -> list[PeriodFigures]:
+    """Return the rows of a table of metrics."""
+    return [PeriodFigures(**row) for row in metrics.select(METRICS.names).to_pylist()]
 
 
 def _truth(instants: Sequence[Instant], node_ids: Sequence[str]) -> dict[str, pa.Array]:

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from emulator.records.atomic import disk_errors
 from emulator.records.run_folder import FILES, RunFolder
 from vnet.units import BYTES_PER_MB
 
@@ -43,7 +42,7 @@ class LeftOut:
 def collect(folder: RunFolder, nodes: Iterable[str], most_mb: float) -> dict[str, LeftOut]:
     """Move the files of the disks to `files/` and remove the disks; return what was left out, by vehicle.
 
-    Of each vehicle `most_mb` megabytes are kept. Raises VnetError where the run's folder cannot be written.
+    Of each vehicle `most_mb` megabytes are kept.
     """
     left_out = {}
     for node in nodes:
@@ -114,9 +113,13 @@ class _Collection:
                 self.left_out.add(name, f"{found.st_size:,} bytes, and there is room for {self._bytes_left:,}")
             else:
                 target = self._target / name
-                with disk_errors(target):
+                try:
                     target.parent.mkdir(parents=True, exist_ok=True)
                     with target.open("xb") as copy:
                         shutil.copyfileobj(file, copy)
+                except OSError as error:  # a full disk: the run is kept all the same
+                    target.unlink(missing_ok=True)
+                    self.left_out.add(name, error.strerror or "cannot be written")
+                    return
                 self._bytes_left -= found.st_size
                 self._files_left -= 1

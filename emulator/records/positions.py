@@ -169,6 +169,11 @@ class Places:
         lonely = self._degrees[0] == 0
         return np.asarray(lonely.any(axis=0) & ~lonely.all(axis=0))
 
+    @cached_property
+    def always_in_range(self) -> Mask:
+        """(N,), who had somebody in range throughout: each of its frames has rows."""
+        return np.asarray((self._degrees[0] > 0).all(axis=0))
+
     def was_lonely(self, sender: int, time_ns: IntArray) -> Mask:
         """(n - 1,), whether a sender had nobody in range at some time between one of n instants and the next."""
         lonely = np.concatenate([[0], np.cumsum(self._degrees[0][:, sender] == 0)])

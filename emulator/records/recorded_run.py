@@ -166,10 +166,15 @@ class RecordedRun(RecordedTables):
     @cached_property
     def plan(self) -> list[PlannedFault]:
         """The faults and whom they chose. Raises ScenarioError if they do not fit the run's nodes."""
+        return [] if self.fault_plan is None else self.fault_plan.faults
+
+    @cached_property
+    def fault_plan(self) -> FaultPlan | None:
+        """The plan of the faults; None without faults."""
         if not self.node_ids or not self.scenario.fault:
-            return []
+            return None
         nodes_at = self._nodes_at if self.topology_changes else None
-        return FaultPlan(self.scenario, self._nodes_at(0), nodes_at).faults
+        return FaultPlan(self.scenario, self._nodes_at(0), nodes_at)
 
     def _nodes_at(self, period: int) -> Nodes:
         position_m = self.places.position_m(period)

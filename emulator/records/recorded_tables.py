@@ -291,6 +291,8 @@ class RecordedTables:
     @cached_property
     def _place(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         period = np.asarray(self.states["period"].to_numpy(), dtype=np.intp)
+        if len(period) and not 0 <= period.min() <= period.max() < len(period):
+            raise VnetError(f"states: periods {period.min()} to {period.max()} in {len(period)} rows")
         node = self.states["node"].combine_chunks().dictionary_encode()
         names = [*node.dictionary.to_pylist(), *([None] if node.null_count else [])]
         code = np.array([self.number_of(name) for name in names], dtype=np.intp)
@@ -317,6 +319,12 @@ class RecordedTables:
         spread[period[there], node[there]] = flat.reshape(-1, size)
         return spread
 
+    def scalars(self, name: str) -> Array:
+        """A column of numbers of the states (periods, N); NaN where there is none."""
+        spread = np.full((self.periods, len(self.node_ids)), np.nan)
+        spread[self._place] = numbers_of(self.states[name])
+        return spread
+
     @cached_property
     def value_names(self) -> list[str]:
         """Names of the values that have a column of the states, in the order in which they were first reported."""
@@ -325,9 +333,7 @@ class RecordedTables:
     def value(self, name: str) -> Array:
         """A number or boolean that programs report by this name (periods, N); NaN where there is none."""
         if name in self.value_names:
-            spread = np.full((self.periods, len(self.node_ids)), np.nan)
-            spread[self._place] = numbers_of(self.states[name])
-            return spread
+            return self.scalars(name)
         lists = pc.map_lookup(self.states["values"].combine_chunks(), name, "first")
         return self._spread(pc.if_else(pc.equal(pc.list_value_length(lists), 1), lists, None), 1)[..., 0]
 

@@ -15,6 +15,7 @@ from emulator.world.buildings import LEAST_CORNERS, Buildings
 from emulator.world.link_table import LinkTable
 from emulator.world.radio_inputs import RadioInputs
 from emulator.world.world import World
+from vnet.bounded import open_regular
 from vnet.errors import ScenarioError, VnetError
 from vnet.types import Array, IntArray, Mask
 
@@ -129,9 +130,12 @@ class RecordedWorld:
     def read(cls, path: Path) -> RecordedWorld:
         """Read the file, which may be anything. Raises VnetError in one line."""
         try:
+            open_regular(path).close()
             arrays = read_arrays(path, ARRAYS, LARGEST_BYTES)
         except ScenarioError as error:
             raise VnetError(str(error)) from None
+        except ValueError as error:
+            raise VnetError(f"{path}: {error}") from None
         _check(path, arrays)
         node_ids = tuple(arrays.pop("node_ids").tolist())
         return cls(node_ids=node_ids, **arrays)

@@ -44,7 +44,7 @@ from emulator.records.run_folder import (
     WORLD_FILE,
     Event,
 )
-from emulator.records.run_tables import StatesReader, TableFile, TraceReader
+from emulator.records.run_tables import StatesReader, TableFile, TraceReader, open_table
 from emulator.records.states import STATES
 from emulator.records.verdict_file import Record, read_record
 from emulator.scenario.recorded import parse_recorded_scenario
@@ -52,10 +52,13 @@ from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.scenario.toml import LARGEST_BYTES
 from emulator.world.driven.vehicles import Log
 from emulator.world.world import build_world
-from vnet.bounded import read_bounded
+from vnet.bounded import read_regular
 from vnet.errors import ScenarioError, VnetError, printable
+from vnet.units import NS_PER_S
 
 LARGEST_EVENTS_BYTES = 1 << 28
+SPARE_ROWS = 1_000_000
+"""Rows that every table may have, whatever verdict.json says."""
 MARKS = (SCENARIO_FILE, VERDICT_FILE, EVENTS_FILE)
 """A folder with any of these is a run's."""
 WITH_MAC = ("on_air_ns", "left_ns")
@@ -75,6 +78,15 @@ TABLES: dict[str, pa.Schema] = {
     BACKGROUND_FILE: BACKGROUND,
 }
 """The tables, with the columns that they must have."""
+# fmt: off
+WITHOUT_GAPS = frozenset((
+    "sent_ns", "sender", "seq", "receiver", "size_bytes", "payload_digest", "outcome", "cause", "copy",
+    "left_ns", "gain_db", "bitrate_mbps", "attempt", "acked", "period", "time_ns", "node",
+    "position_m", "heading_rad", "fix_m", "common_error_m", "reporting", "not_finite", "busy_ratio",
+    "component_rmse_m", "component_deviation_m",
+))
+# fmt: on
+"""Columns that have a value in every row."""
 Columns = Mapping[str, Collection[str]]
 T = TypeVar("T")
 
@@ -97,7 +109,7 @@ class RunFiles:
     def scenario_text(self) -> str:
         """The text of scenario.toml."""
         path = self.folder / SCENARIO_FILE
-        return self._read(path, lambda: read_bounded(path, LARGEST_BYTES).decode("utf-8", "replace"))
+        return self._read(path, lambda: read_regular(path, LARGEST_BYTES).decode("utf-8", "replace"))
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -129,7 +141,7 @@ class RunFiles:
     def events(self) -> list[Event]:
         """The events, in the order in which they were written; a last line that was cut off is left out."""
         path = self.folder / EVENTS_FILE
-        return self._read(path, lambda: _parse_events(path, read_bounded(path, LARGEST_EVENTS_BYTES)))
+        return self._read(path, lambda: _parse_events(path, read_regular(path, LARGEST_EVENTS_BYTES)))
 
     @cached_property
     def world(self) -> RecordedWorld:
@@ -241,25 +253,55 @@ class RunFiles:
         self.refuse_later_format()
         if not path.is_file():
             check_is_run(self.folder)
+            if path.exists():
+                raise VnetError(f"{path}: cannot be read: not a regular file")
+            if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == name]:
+                raise VnetError(f"{self.folder}: its {VERDICT_FILE} says: not kept: {unkept[0]}")
             raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
         wanted = self._columns.get(name)
         names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
-        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
+        file = self._read(path, lambda: open_table(path, names))
+        self._bound_rows(path, file.metadata.num_rows)
+        kept = file.schema_arrow
         for column in wanted or schema.names:
-            found = column in table.column_names and table.schema.field(column).type == schema.field(column).type
+            found = column in kept.names and kept.field(column).type == schema.field(column).type
             if not found and column not in left_out:
                 raise VnetError(f"{path}: has no column {column!r} of {schema.field(column).type}")
+        table: pa.Table = self._read(path, lambda: pq.read_table(path.absolute(), columns=names))
+        for column in table.column_names:
+            if column in WITHOUT_GAPS and table[column].null_count:
+                raise VnetError(f"{path}: column {column!r} has gaps")
         return table.unify_dictionaries()
+
+    def _unkept(self) -> list[str]:
+        """Return a line for each file that the disk refused at the end of the run."""
+        try:
+            told = [check.figures.get("unkept") for check in self.record.checks]
+        except VnetError:
+            return []
+        return [str(line) for lines in told if isinstance(lines, list) for line in lines]
+
+    def _bound_rows(self, path: Path, rows: int) -> None:
+        """Raise VnetError if a table has many times the rows that verdict.json speaks of."""
+        try:
+            record = self.record
+        except VnetError:  # a run that is on, or that was killed
+            return
+        nodes = record.vehicles + record.roadside_units
+        periods = record.emulated_s * NS_PER_S / self.scenario.period_ns + 1
+        due = {TRACE_FILE: record.in_range, STATES_FILE: nodes * periods, METRICS_FILE: periods}
+        if path.name in due and rows > SPARE_ROWS + 2 * due[path.name]:
+            raise VnetError(f"{path}: {rows:,} rows, where {VERDICT_FILE} speaks of {due[path.name]:,.0f}")
 
     def _columns_beside(self, path: Path, wanted: Collection[str]) -> list[str]:
         """Columns that only some runs have: reported values beside `values`, and what tells unicasts."""
         if path.name == TRACE_FILE:
-            there = self._read(path, lambda: pq.read_schema(path.absolute()).names)
+            there = self._read(path, lambda: open_table(path, ()).schema_arrow.names)
             beside = [*WITH_UNICASTS, "on_air_ns"] if "attempt" in there else WITH_UNICASTS
             return [name for name in beside if name in there and name not in wanted]
         if path.name != STATES_FILE or "values" not in wanted:
             return []
-        return self._read(path, lambda: value_columns(pq.read_schema(path.absolute())))
+        return self._read(path, lambda: value_columns(open_table(path, ()).schema_arrow))
 
 
 def _from_here(command: str, folder: Path) -> str:

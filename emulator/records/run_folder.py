@@ -10,7 +10,7 @@ import contextlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -37,6 +37,7 @@ BACKGROUND_FILE = "background.parquet"
 PAYLOADS_FILE = "payloads.parquet"
 WORLD_FILE = "world.npz"
 VERDICT_FILE = "verdict.json"
+MANIFEST_FILE = "manifest.json"
 REPORT, INDEX, RECORDING = "report.html", "index.html", "recording.rrd"
 """Names of a run's report and recording, and of the list of the runs in a folder."""
 PROGRAMS_LOG = "programs.log"
@@ -45,7 +46,9 @@ FILES = "files"
 """The folder, in a run's own, of what vehicles have left on their disks."""
 AGAIN = "again"
 """The folder, in a run's own, of the second run of `--check-determinism`."""
-FORMAT = 2
+VERDICT_ROOM_BYTES = 1 << 16
+"""Size of most verdicts, with their manifests."""
+FORMAT = 3
 """Version of the folder's files; `verdict.json` holds it. docs/reference/files.md says what changed with each."""
 
 
@@ -76,6 +79,9 @@ class RunFolder:
         self.is_open = False
         """True once there is a folder, whose files are kept."""
         self._has_own_number = self._is_scratch = False
+        self._lacks_events = False
+        self.unkept: list[str] = []
+        """A line for each file that the disk has refused at the end of the run."""
 
     @classmethod
     def prepare(cls, out: Path | None, scenario: Scenario) -> RunFolder:
@@ -157,11 +163,11 @@ class RunFolder:
         self.scenario_text = dump_scenario(scenario, self._digests)
         self.put(SCENARIO_FILE, lambda path: write_text(path, self.scenario_text))
 
-    def put_table(self, name: str, table: pa.Table) -> None:
-        """Write a table as Parquet in one step."""
+    def keep_table(self, name: str, table: pa.Table) -> None:
+        """Keep a table as Parquet, as `keep` does."""
         import pyarrow.parquet as pq  # slow to import, and a command's first line comes before any table
 
-        self.put(name, lambda path: pq.write_table(table, path, compression="zstd"))
+        self.keep(name, lambda path: pq.write_table(table, path, compression="zstd"))
 
     def event(self, time_ns: int, kind: str, node: str | None = None, **details: Any) -> None:
         """Write down what happened at an emulated instant, after all that was foreseen for an earlier one."""
@@ -182,9 +188,35 @@ class RunFolder:
 
     def _write(self, event: Event) -> None:
         self.events.append(event)
-        if self.is_open:
-            with disk_errors(self.path), (self.path / EVENTS_FILE).open("a") as file:
-                file.write(_line(event))
+        if self.is_open and not self._lacks_events:
+            try:
+                with (self.path / EVENTS_FILE).open("a") as file:
+                    file.write(_line(event))
+            except OSError:  # the run goes on, and writes them all at its end
+                self._lacks_events = True
+
+    @contextlib.contextmanager
+    def room_for_verdict(self) -> Iterator[None]:
+        """Hold room on the disk during the block, so that the verdict finds some behind tables that fill it."""
+        held = self.path / ".room"
+        try:
+            with contextlib.suppress(OSError):
+                held.write_bytes(bytes(VERDICT_ROOM_BYTES))
+            yield
+        finally:
+            held.unlink(missing_ok=True)
+
+    def complete_events(self) -> None:
+        """Write the events that the disk has refused while the run was on."""
+        if self._lacks_events:
+            self.keep(EVENTS_FILE, lambda path: write_text(path, "".join(map(_line, self.events))))
+
+    def keep(self, name: str, write: Callable[[Path], None]) -> None:
+        """Put a file of a run that is over; if the disk refuses, name it in `unkept`: the others are kept."""
+        try:
+            self.put(name, write)
+        except VnetError as error:
+            self.unkept.append(str(error))
 
     def put(self, name: str, write: Callable[[Path], None]) -> None:
         """Have `write` make a file beside its place, then move it there in one step."""

@@ -12,7 +12,7 @@ from emulator.records.costs import RunCost
 from emulator.records.reported import ReportedFigure
 from emulator.records.verdicts import CheckResult, Judgement, NotExercised, Verdict
 from emulator.scenario.sections import first_problem
-from vnet.bounded import read_bounded
+from vnet.bounded import read_regular
 from vnet.errors import VnetError
 
 LARGEST_BYTES = 64 * 2**20
@@ -68,7 +68,7 @@ _RECORD = TypeAdapter(Record)
 def read_record(path: Path) -> Record:
     """Read a verdict.json. Raises OSError, and VnetError where it is not what vnet writes."""
     try:
-        data = json.loads(read_bounded(path, LARGEST_BYTES))
+        data = json.loads(read_regular(path, LARGEST_BYTES))
         record = _RECORD.validate_python(data)
     except ValidationError as error:
         raise VnetError(f"{path}: {first_problem(error, _RECORD)}") from None

@@ -365,20 +365,26 @@ def dump_scenario(scenario: Scenario, digests: Mapping[str, Mapping[str, str]] |
     return tomli_w.dumps(data)
 
 
-def input_digests(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names.
-
-    Where SUMO is stepped with the run, `libsumo` is its version and build.
-    """
+def input_files_of(scenario: Scenario) -> list[Path]:
+    """Return the files that the scenario names for its world and its radio."""
     read = (
         scenario.network.path,
         scenario.radio.links,
         scenario.radio.buildings and scenario.radio.buildings.path,
         scenario.map and scenario.map.path,
         scenario.world.common_error.path,
-        scenario.run.tape,
     )
-    paths = [path for path in read if isinstance(path, Path)]
+    return [path for path in read if isinstance(path, Path)]
+
+
+def input_digests(scenario: Scenario) -> dict[str, str]:
+    """SHA-256 of each file that the scenario reads, by path; of SUMO's also those that its configuration names.
+
+    Where SUMO is stepped with the run, `libsumo` is its version and build.
+    """
+    paths = input_files_of(scenario)
+    if isinstance(scenario.run.tape, Path):
+        paths.append(scenario.run.tape)
     if scenario.network.kind == "sumo" and scenario.network.path is not None:
         paths += input_files(scenario.network.path)
     build = libsumo_build() if scenario.network.step else None

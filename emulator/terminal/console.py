@@ -33,8 +33,13 @@ REFUSED_BY_THE_SYSTEM = (
     errno.EMFILE,
     errno.ENFILE,
     errno.ENOMEM,
+    errno.EFBIG,
+    errno.EIO,
+    errno.EAGAIN,
 )
 """Errors that say something of the machine, and not of vnet."""
+OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't start new thread")
+"""Parts of the messages of other errors than MemoryError with which libraries say that there is no memory."""
 _KINDS_OF_VALUES = {"integer": "a whole number", "number": "a number", "boolean": "true or false"}
 """Values of options as pydantic names them, and as vnet does."""
 
@@ -121,6 +126,9 @@ def _say_unexpected(error: Exception, arguments: Sequence[str]) -> int:
         _say(f"{where}{error.strerror}", log_format)
         return WRONG_USAGE
     what = printable(f"{type(error).__name__}: {error}", LONGEST_MESSAGE)
+    if isinstance(error, MemoryError) or any(part in str(error).lower() for part in OUT_OF_MEMORY):
+        _say(f"not enough memory: {what}", log_format)
+        return WRONG_USAGE
     _say(f"a bug in vnet: {what}; please report it with {_keep_traceback(error, arguments)}", log_format, BUG)
     return BUG
 

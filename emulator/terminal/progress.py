@@ -21,6 +21,7 @@ from emulator.records.run_folder import Event
 from emulator.terminal.console import LogFormat
 from emulator.terminal.dashboard import Dashboard, describe, is_bad
 from emulator.terminal.painter import EVERY_S, Painter
+from emulator.terminal.safe_console import SafeConsole
 from vnet.errors import first_names, printable
 
 PLAIN_LINE_EVERY_S = 5.0
@@ -66,10 +67,10 @@ def show_progress(emulation: Emulation, log_format: LogFormat, quiet: bool, pict
 
 def terminal(file: TextIO) -> Console | None:
     """A console on a terminal that can show a picture; None for a file, a pipe, or a terminal that cannot."""
-    console = Console(file=file)
+    console = SafeConsole(file)
     able = file.isatty() and console.is_interactive and not console.options.ascii_only
     if able and console.no_color:  # and none of its sisters, bold and dim
-        console = Console(file=file, color_system=None)
+        console = SafeConsole(file, colours=False)
     return console if able else None
 
 

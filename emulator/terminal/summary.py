@@ -18,7 +18,7 @@ from rich.text import Text
 
 from emulator.checks.judge import Judgement, Verdict
 from emulator.checks.own import PREFIX
-from emulator.pages.text import cell
+from emulator.pages.text import as_text, cell
 from emulator.records.backbone_table import on_backbone
 from emulator.records.costs import HEADS, RunCost, read_cost
 from emulator.records.key_figures import shown_figures
@@ -141,7 +141,8 @@ def _listed(checks: Sequence[CheckResult]) -> Table:
     table.add_column("verdict")
     table.add_column("what was seen", overflow="fold")
     for check in checks:
-        table.add_row(check.name, Text(check.verdict.value, style=STYLE[check.verdict]), Text(check.text))
+        verdict = Text(check.verdict.value, style=STYLE[check.verdict])
+        table.add_row(as_text(check.name), verdict, Text(as_text(check.text)))
     return table
 
 
@@ -161,7 +162,7 @@ def offending(rows: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(box=None, padding=(0, 1, 0, 0))
     columns = dict.fromkeys(key for row in rows for key in row if row[key] not in (None, ""))
     for column in columns:
-        table.add_column(column, overflow="fold")
+        table.add_column(as_text(column), overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell(row.get(column))) for column in columns))
     return table
@@ -172,7 +173,7 @@ def _print_details(check: CheckResult, console: Console) -> None:
         for key in ("where", "log_tail"):
             if item.get(key):
                 console.print(Text(f"{item.get('node', check.name)} {key}:", style="bold"))
-                console.print(Text(str(item[key]).rstrip()))
+                console.print(Text(as_text(str(item[key]).rstrip())))
 
 
 def _print_table(title: str, table: Table, console: Console) -> None:

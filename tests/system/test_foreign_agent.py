@@ -144,6 +144,36 @@ def test_misbehaving_foreign_agents_are_refused_and_the_run_is_unknown(tmp_path:
         assert reason in refused[node]
 
 
+def test_a_message_of_a_hundred_megabytes_is_refused_by_name(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN, "--set", "run.stall_timeout_s=3600")
+        start(stack, [*WRONG, "SendsHundredMegabytes"], "v01", endpoint, folder)
+        for node in NODES[1:]:
+            start(stack, FOREIGN, node, endpoint, folder)
+        while '"refused"' not in (folder / "events.jsonl").read_text():
+            assert emulator.poll() is None
+            time.sleep(0.05)
+        emulator.send_signal(signal.SIGINT)
+        done = finish(emulator, folder)
+    (refused,) = done.events_of("refused")
+    assert refused["node"] == "v01" and "message of 10000" in refused["reason"]
+
+
+def test_reports_that_no_program_could_make_are_seen(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with ExitStack() as stack:
+        emulator, endpoint = start_emulator(stack, folder, *LISTEN)
+        start(stack, [*WRONG, "ReportsNoCovariance"], "v01", endpoint, folder)
+        for node in NODES[1:]:
+            start(stack, FOREIGN, node, endpoint, folder)
+        done = finish(emulator, folder)
+    check = done.check("reports")
+    assert check["verdict"] == done.verdict["verdict"] == "invalid"
+    told = [row["what"] for row in check["figures"]["rows"]]
+    assert "../../x: not a name of a value" in told and "covariance_m2: no covariance matrix" in told
+
+
 def test_a_foreign_agent_that_is_refused_ends_with_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with ExitStack() as stack:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import sys
 from collections.abc import Collection
 from pathlib import Path
@@ -84,6 +85,17 @@ def open_standard_descriptors() -> None:
         except OSError:
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
             setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+
+
+def too_little_address_space(needed_mb: int) -> str:
+    """Return in one line that a limit (`ulimit -v`) leaves this process less than that; "" if it does not.
+
+    Libraries that find no room for their threads end a process, or wait for ever, and say nothing.
+    """
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY or limit >= needed_mb * 1_000_000:
+        return ""
+    return f"ulimit -v: {limit // 1024} kB of address space: {needed_mb * 1_000_000 // 1024} kB are needed"
 
 
 def use_same_arithmetic() -> None:

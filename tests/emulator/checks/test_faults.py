@@ -279,7 +279,7 @@ def test_a_node_that_does_not_stand_still_is_found() -> None:
 @pytest.mark.parametrize("seconds", [-0.5, 0.5])
 def test_a_fix_in_an_outage_or_none_without_is_found(seconds: float) -> None:
     moved = shifted(with_fault("gnss_outage"), seconds)
-    assert not_valid(moved) == {"outage_respected": Verdict.INVALID}
+    assert not_valid(moved) == {"outage_respected": Verdict.INVALID, "fault_events": Verdict.INVALID}
     assert len(checked(moved, "outage_respected").figures["rows"]) == 10
 
 
@@ -321,7 +321,7 @@ def test_latencies_that_are_all_possible_and_together_are_not() -> None:
 def test_a_delay_that_a_fault_owed_is_missed() -> None:
     """Had the delay been planned half a second earlier, those frames came too early."""
     found = not_valid(shifted(with_fault("delay"), -0.5))
-    assert found == {"latency": Verdict.INVALID}
+    assert found == {"latency": Verdict.INVALID, "fault_events": Verdict.INVALID}
 
 
 @pytest.mark.parametrize("kind", ["gnss_jump", "duplicate", "DoS", "DataReplay"])

@@ -146,6 +146,19 @@ class SendsTooMuch(OtherTraffic):
         return [[[node, bytes(100_000)] for node, _ in frames], reports, endings]
 
 
+class SendsHundredMegabytes(OtherTraffic):
+    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
+        return [[[node, bytes(100_000_000)] for node, _ in frames], reports, endings]
+
+
+class ReportsNoCovariance(OtherTraffic):
+    """Reports a covariance that is none, under a name that is none, beside the foreign agent's own report."""
+
+    def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
+        forged = {"covariance_m2": [-1.0, 0.0, 0.0, -1.0], "values": {"../../x": 1.0}}
+        return [frames, [{**report, **forged} for report in reports], endings]
+
+
 class ReportsNan(OtherTraffic):
     def traffic(self, frames: list[Any], reports: list[Any], endings: list[Any]) -> list[Any]:
         return [frames, [{**report, "estimate_m": [float("nan"), 0.0]} for report in reports], endings]

@@ -1,0 +1,110 @@
+"""The manifest of a run's folder: SHA-256 of each file that was written until the verdict, by its path.
+
+Reports, recordings and access files may be made, or left out, afterwards, and are not in it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import TypeAdapter, ValidationError
+
+from emulator.records.run_folder import (
+    BACKBONE_FILE,
+    BACKGROUND_FILE,
+    BUSY_FILE,
+    DRIVEN_FILE,
+    EVENTS_FILE,
+    FILES,
+    MANIFEST_FILE,
+    METRICS_FILE,
+    PAYLOADS_FILE,
+    PROGRAMS_LOG,
+    SCENARIO_FILE,
+    STATES_FILE,
+    TRACE_FILE,
+    VERDICT_FILE,
+    WORLD_FILE,
+    RunFolder,
+)
+from emulator.records.tape import TAPE_FILE
+from vnet.bounded import open_regular, read_regular
+from vnet.errors import VnetError, printable
+
+LARGEST_BYTES = 1 << 26
+EVIDENCE = (
+    SCENARIO_FILE,
+    TRACE_FILE,
+    STATES_FILE,
+    METRICS_FILE,
+    BUSY_FILE,
+    DRIVEN_FILE,
+    BACKBONE_FILE,
+    BACKGROUND_FILE,
+    PAYLOADS_FILE,
+    WORLD_FILE,
+    TAPE_FILE,
+    EVENTS_FILE,
+    VERDICT_FILE,
+)
+"""Files by which a run is judged; those that are there stand in the manifest."""
+_MANIFEST = TypeAdapter(dict[str, str])
+
+
+def write_manifest(folder: RunFolder) -> None:
+    """Write the digests of the files as they are now. Raises VnetError where the disk refuses."""
+    digests = {name: sha256_of(folder.path / name) for name in _names(folder.path)}
+    folder.put_json(MANIFEST_FILE, digests)
+
+
+def read_manifest(folder: Path) -> dict[str, str] | None:
+    """Return the digests by path, or None if there is no manifest. Raises VnetError for anything else."""
+    path = folder / MANIFEST_FILE
+    try:
+        return _MANIFEST.validate_python(json.loads(read_regular(path, LARGEST_BYTES)), strict=True)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (ValidationError, ValueError, RecursionError):
+        raise VnetError(f"{path}: not a table of digests by file") from None
+
+
+def differing_files(folder: Path, digests: dict[str, str]) -> dict[str, str]:
+    """Return the files that are not those of the manifest, each with what is wrong with it."""
+    found = {}
+    for name in sorted({*digests, *(each for each in EVIDENCE if (folder / each).exists())}):
+        if name not in digests:
+            found[name] = "is not in the manifest"
+        elif Path(name).is_absolute() or ".." in Path(name).parts:
+            found[name] = "is no file of the folder"
+        else:
+            try:
+                if sha256_of(folder / name) != digests[name]:
+                    found[name] = "has other contents"
+            except VnetError as error:
+                found[name] = str(error).rpartition(": ")[2]
+    return {printable(name): what for name, what in found.items()}
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises VnetError if it cannot be read."""
+    try:
+        with open_regular(path) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValueError as error:
+        raise VnetError(f"{path}: {error}") from None
+
+
+def _names(folder: Path) -> Iterator[str]:
+    """Yield the files of a folder that is complete, as the manifest names them."""
+    yield from (name for name in EVIDENCE if (folder / name).is_file())
+    for below in (folder / "logs", folder / FILES):
+        for path in sorted(below.rglob("*")):
+            if path.is_file() and not path.is_symlink() and path.name != PROGRAMS_LOG:
+                yield path.relative_to(folder).as_posix()

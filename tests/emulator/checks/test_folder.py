@@ -1,0 +1,160 @@
+"""`vnet check` judges the whole folder: every edit is found, but for those that no reader can find."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from emulator.checks.judge import Judgement, Verdict, check_run
+from emulator.drivers.conclude import conclude
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.simulate import simulate
+from emulator.records.manifest import write_manifest
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import build_world
+from tests.support.folder_edits import EDITS, Edit, forge, listing, table
+from tests.support.paths import ROOT
+
+SETTINGS = {
+    "run": {"duration_s": 4.0, "settle_s": 1.0},
+    "network": {"vehicles": 8, "layout": "dense"},
+    "radio": {"max_peers": 3, "loss": 0.2},
+    "program": {"entry": "agents.cooperative:main", "options": {"particles": 60}},
+    "fault": [{"kind": "restart", "at_s": 1.0, "duration_s": 0.8, "nodes": {"count": 2}}],
+}
+OF_DIGESTS = {"files", "trace_sha256"}
+
+
+def simulated(folder: Path, **changes: object) -> Path:
+    scenario = Scenario.model_validate(SETTINGS | changes)
+    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
+    conclude(emulation, simulate(emulation)[0], "simulate")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("folder") / "run")
+
+
+@pytest.fixture
+def copy(run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+def broken(judgement: Judgement) -> set[str]:
+    return {check.name for check in judgement.checks if check.verdict is Verdict.INVALID}
+
+
+def test_a_run_as_it_was_written_is_valid_and_every_check_of_its_folder_judged_it(run: Path) -> None:
+    judgement = check_run(run)
+    assert judgement.verdict is Verdict.VALID
+    names = {check.name for check in judgement.checks}
+    assert {
+        "files",
+        "truth",
+        "metrics",
+        "outcomes",
+        "verdict_file",
+        "fault_events",
+        "row_order",
+        "reports",
+    } <= names
+
+
+def test_forging_nothing_changes_nothing(copy: Path) -> None:
+    forge(copy)
+    assert check_run(copy).verdict is Verdict.VALID
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("edit", EDITS, ids=[edit.what for edit in EDITS])
+def test_an_edit_is_found_as_an_accident_and_as_a_forgery(copy: Path, edit: Edit) -> None:
+    edit.apply(copy)
+    assert "files" in broken(check_run(copy)), "as an accident"
+    forge(copy)
+    found = broken(check_run(copy))
+    assert not found & OF_DIGESTS, "the forger knows all digests"
+    assert edit.found_by in found if edit.found_by else not found
+
+
+def test_most_edits_are_found_and_the_page_has_the_table() -> None:
+    assert len(EDITS) == len({edit.what for edit in EDITS}) == 40
+    assert sum(bool(edit.found_by) for edit in EDITS) >= 28
+    assert all(bool(edit.why) != bool(edit.found_by) for edit in EDITS)
+    assert listing() in (ROOT / "docs" / "checks.md").read_text()
+
+
+def without_manifest(folder: Path) -> None:
+    (folder / "manifest.json").unlink()
+
+
+def of_format(number: int) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        path = folder / "verdict.json"
+        path.write_text(path.read_text().replace('"format": 3', f'"format": {number}', 1))
+
+    return apply
+
+
+def test_a_folder_whose_manifest_is_gone_is_invalid_and_an_earlier_one_needs_none(copy: Path) -> None:
+    without_manifest(copy)
+    assert broken(check_run(copy)) == {"files"}
+    of_format(2)(copy)
+    judgement = check_run(copy)
+    assert judgement.verdict is Verdict.VALID
+    assert "files" in {left.name for left in judgement.not_exercised}
+
+
+def test_a_folder_of_an_earlier_format_gets_no_new_invalid_and_no_pass_for_what_is_wrong(copy: Path) -> None:
+    next(edit for edit in EDITS if edit.found_by == "truth").apply(copy)
+    forge(copy)
+    without_manifest(copy)
+    of_format(2)(copy)
+    judgement = check_run(copy)
+    assert (broken(judgement), judgement.verdict) == (set(), Verdict.UNKNOWN)
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/etc/passwd", "nothing.parquet"])
+def test_a_manifest_names_files_of_the_folder_alone(copy: Path, name: str) -> None:
+    path = copy / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {name: "0" * 64}))
+    judgement = check_run(copy)
+    (found,) = [check for check in judgement.checks if check.name == "files"]
+    assert [row["file"] for row in found.figures["rows"]] == [name]
+
+
+def test_a_run_whose_world_comes_from_a_file_says_why_it_is_not_computed_again(tmp_path: Path) -> None:
+    (tmp_path / "network.csv").write_text("id,x_m,y_m,heading_rad\na,0,0,0\nb,100,0,0\n")
+    network = {"kind": "file", "path": tmp_path / "network.csv"}
+    folder = simulated(tmp_path / "run", network=network, fault=[], program={"entry": "agents.beacon:main"})
+    judgement = check_run(folder)
+    assert judgement.verdict is Verdict.VALID
+    assert {left.name: left.reason for left in judgement.not_exercised}["truth"].startswith(
+        "the world comes from files"
+    )
+
+
+def test_a_busy_ratio_is_computed_again(tmp_path: Path) -> None:
+    radio = {"path_loss": {"kind": "log_distance"}, "mac": {}, "bitrate_mbps": 6.0}
+    folder = simulated(tmp_path / "run", radio=radio, fault=[], program={"entry": "agents.beacon:main"})
+    assert not broken(check_run(folder))
+    table("busy", lambda rows: [*rows[:-1], rows[-1] | {"busy_ratio": rows[-1]["busy_ratio"] + 0.01}])(folder)
+    forge(folder)
+    assert "outcomes" in broken(check_run(folder))
+
+
+def test_files_that_vnet_adds_to_a_finished_run_are_no_edit(copy: Path) -> None:
+    (copy / "report.html").write_text("a report")
+    (copy / "recording.rrd").write_text("a recording")
+    assert check_run(copy).verdict is Verdict.VALID
+
+
+def test_a_file_that_the_manifest_lacks_is_told(copy: Path) -> None:
+    shutil.copy(copy / "states.parquet", copy / "busy.parquet")
+    assert broken(check_run(copy)) == {"files"}
+    write_manifest(RunFolder(copy))
+    assert check_run(copy).verdict is Verdict.VALID
