@@ -10,6 +10,8 @@ from rich.console import Console
 
 from emulator.cli.options import (
     ChecksOption,
+    Compared,
+    DeterminismOption,
     DurationOption,
     OrderOption,
     OrderOptions,
@@ -23,6 +25,7 @@ from emulator.cli.options import (
 )
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.standard_output import result_only
+from vnet.errors import VnetError
 
 RUNS_ON_DASK = 64
 """Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
@@ -61,6 +64,7 @@ def campaign(
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
     checks: ChecksOption = None,
+    check_determinism: DeterminismOption = None,
     jobs: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores, or 64 on Dask."),
@@ -84,9 +88,16 @@ def campaign(
         loaded = load(
             scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, OrderOptions(order)
         )
+        if check_determinism is Compared.PORTABLE:
+            raise VnetError("--check-determinism=portable: is for vnet run and vnet simulate")
         jobs = jobs or (RUNS_ON_DASK if executor else None)
-        limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
-        plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)
+        options = {
+            "limit_s": time_limit,
+            "shrink_steps": shrink_steps,
+            "check_determinism": check_determinism is not None,
+            **({"jobs": jobs} if jobs else {}),
+        }
+        plan = Plan.of(loaded, faults, runs, loaded.run.seed, **options)
         if plan.note:
             tell(plan.note)
         with open_executor(executor) as pool:

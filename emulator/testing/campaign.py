@@ -39,7 +39,7 @@ from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, regression_test
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.shrinking_runs import MOST_ORDER_STEPS, order_text, shrink_order, shrink_run, with_faults
-from emulator.testing.trial import Trial, TrialPool
+from emulator.testing.trial import REPLAY, Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError
 
@@ -148,7 +148,7 @@ class Campaign:
         self._plan = plan
         self._folder = folder
         self._progress = progress
-        self._workshop = TrialPool(plan.limit_s, plan.scenario, executor)
+        self._workshop = TrialPool(plan.limit_s, plan.scenario, executor, plan.check_determinism)
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 
@@ -282,7 +282,8 @@ class Campaign:
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
             "order": outcome.order(),
-            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
+            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}"
+            + (" --check-determinism" if REPLAY in outcome.trial.failed else ""),
             "folder": f"failures/{outcome.folder.name}",
             "parting": shown_parting(outcome.explanation) if outcome.explanation else None,
         }

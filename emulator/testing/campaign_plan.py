@@ -42,6 +42,8 @@ class Plan:
     limit_s: float = 300.0
     shrink_steps: int = SHRINK_STEPS
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    check_determinism: bool = False
+    """True if each run is made again in another way, and fails by `replay` where that differs."""
     note: str = ""
     """Change of the scenario that the campaign has made by itself, in one line; "" if none."""
     constraints: ScheduleConstraints | None = None
