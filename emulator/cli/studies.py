@@ -56,6 +56,13 @@ def campaign(
             help="random, the kinds to draw from (kill,partition), or none: the runs differ by their seeds.",
         ),
     ] = "random",
+    draw: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND.KEY=LOW..HIGH",
+            help="Draw a parameter of faults from this range: delay.delay_ms=1..2000. May be repeated.",
+        ),
+    ] = None,
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
@@ -83,6 +90,7 @@ def campaign(
     from emulator.cells.executors import open_executor
     from emulator.testing.campaign import run_campaign
     from emulator.testing.campaign_plan import Plan
+    from emulator.testing.schedules import parse_ranges
 
     with one_line_errors(), result_only(True):
         loaded = load(
@@ -94,6 +102,7 @@ def campaign(
         options = {
             "limit_s": time_limit,
             "shrink_steps": shrink_steps,
+            "ranges": parse_ranges(draw or ()),
             "check_determinism": check_determinism is not None,
             **({"jobs": jobs} if jobs else {}),
         }

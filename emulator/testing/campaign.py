@@ -259,6 +259,8 @@ class Campaign:
         """Write campaign.json and campaign.html of the runs so far."""
         rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.number)]
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
+        if self._plan.ranges:
+            head["ranges"] = {k: {n: r.bounds for n, r in of.items()} for k, of in self._plan.ranges.items()}
         write_atomically(self._folder / CAMPAIGN_FILE, json.dumps(head | {"results": rows}, indent=1) + "\n")
         write_atomically(self._folder / CAMPAIGN_PAGE, self._page())
 
