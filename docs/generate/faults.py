@@ -45,10 +45,11 @@ INFRASTRUCTURE = """
 Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
 """
 DRAWN = f"""
-`vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has one
-to {MOST_FAULTS} of them. A kind is drawn as often as its weight says, relative to the others. A fault starts at any
-hundredth of a second, lasts any number of tenths that fits, and is over `run.settle_s` before the end. Parameters that
-are not listed keep their defaults. All numbers of a range are equally likely; a pair of numbers is two draws.
+`vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has
+one to {MOST_FAULTS} of them. A kind is drawn as often as its weight says, relative to the others. A fault starts
+at any hundredth of a second, lasts any number of tenths that fits, and is over `run.settle_s` before the end.
+Parameters that are not listed keep their defaults. All numbers of a range are equally likely; a pair of numbers is
+two draws.
 
 `vnet campaign --draw delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
 """

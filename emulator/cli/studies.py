@@ -72,6 +72,14 @@ def campaign(
     option: ProgramOptionsOption = None,
     checks: ChecksOption = None,
     check_determinism: DeterminismOption = None,
+    before: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="An earlier campaign: say whether what failed there is credibly fixed. Default: the last of the "
+            "same name and seed in runs/, without --out.",
+        ),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores, or 64 on Dask."),
@@ -110,4 +118,4 @@ def campaign(
         if plan.note:
             tell(plan.note)
         with open_executor(executor) as pool:
-            raise typer.Exit(run_campaign(plan, out, Console(stderr=True), pool))
+            raise typer.Exit(run_campaign(plan, out, Console(stderr=True), pool, before))

@@ -82,6 +82,16 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
     assert "vnet simulate" in text
 
 
+def test_after_a_fix_a_campaign_says_whether_it_is_credible(tmp_path: Path) -> None:
+    status, said = run(Plan.of(planted("growing"), "none", 1, seed=1, shrink_steps=0), tmp_path / "before")
+    assert status == 1 and "once it is fixed, 59 runs without a failure" in said
+    fixed, plan = io.StringIO(), Plan.of(planted("impatient"), "none", 2, seed=5)
+    assert run_campaign(plan, tmp_path / "after", Console(width=200, file=fixed), before=tmp_path / "before") == 0
+    assert "in 1 of 1 runs before, and in none of 2 now: a fix is credible from 59 runs on" in fixed.getvalue()
+    with pytest.raises(VnetError, match="cannot be read"):
+        run_campaign(plan, tmp_path / "other", Console(quiet=True), before=tmp_path / "nowhere")
+
+
 def test_a_campaign_finds_a_nondeterministic_program_if_asked(tmp_path: Path) -> None:
     folder = tmp_path / "campaign"
     status, _ = run(Plan.of(planted("sends_a_set"), "none", 1, seed=1), tmp_path / "unasked")
