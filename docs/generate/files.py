@@ -217,7 +217,11 @@ EVENTS = {
         "its program did not let time advance (busy loop); where its tasks stood",
     ),
     "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
-    "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),
+    "stalled": (
+        "vehicle",
+        "`error`, `where`, `refused`",
+        "its process did not yield, or did not come back, in time; why its last message was refused, if it was",
+    ),
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
     "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
     "left": ("vehicle", "", "it is not in the network any more"),
