@@ -14,6 +14,7 @@ from typing import Any
 
 from emulator.records.verdicts import Verdict
 from emulator.testing.matrix import column_of
+from emulator.testing.trial import EMULATOR, HUNG
 
 ALPHA = 0.05
 """Probability of error, both of the bound of the rate and of as many green runs by chance."""
@@ -31,10 +32,13 @@ def failures_by_check(results: Sequence[Mapping[str, Any]]) -> Counter[str]:
     """Count the runs of `campaign.json` in which each check failed."""
     counts: Counter[str] = Counter()
     for row in results:
-        checks = row.get("checks")
-        verdicts = checks if isinstance(checks, dict) else {}
-        counts.update({column_of(name)[0] for name, verdict in verdicts.items() if verdict == Verdict.INVALID})
+        counts.update({column_of(name)[0] for name, verdict in _checks(row) if verdict == Verdict.INVALID})
     return counts
+
+
+def _checks(row: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    checks = row.get("checks")
+    return list(checks.items()) if isinstance(checks, dict) else []
 
 
 def after_a_fix(results: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -50,10 +54,14 @@ def after_a_fix(results: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 def compared_with_before(before: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield a line for each check that failed before: whether it is credibly fixed now."""
     failing = failures_by_check(now)
+    judged = {HUNG, EMULATOR} | {column_of(name)[0] for row in now for name, _ in _checks(row)}
     for check, failed in failures_by_check(before).most_common():
         was = f"{check} failed in {failed} of {len(before)} runs before"
         if failing[check]:
             yield f"{was}, and in {failing[check]} of {len(now)} now"
+            continue
+        if check not in judged:
+            yield f"{was}, and was judged in no run now"
             continue
         needed = green_runs_needed(failed, len(before))
         if len(now) >= needed:

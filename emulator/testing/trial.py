@@ -92,8 +92,10 @@ def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False) -> Tri
     verdicts[GROWTH] = Verdict.INVALID if greatest > GREATEST else Verdict.VALID
     if greatest > GREATEST:
         texts[GROWTH] = f"a report holds {greatest:.3g}"
-    if twice and (differs := _difference_of_another(emulation)):
-        verdicts[REPLAY], texts[REPLAY] = Verdict.INVALID, differs
+    if twice:
+        differs = _difference_of_another(emulation)
+        verdicts[REPLAY] = Verdict.INVALID if differs else Verdict.VALID
+        texts |= {REPLAY: differs} if differs else {}
     failed = Verdict.INVALID in verdicts.values()
     tape = tuple(emulation.orders.in_order()) if failed else ()
     return Trial(verdicts, texts, judgement.trace_sha256, time.monotonic() - started, tape)

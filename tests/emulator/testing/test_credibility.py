@@ -50,6 +50,10 @@ def test_a_campaign_is_compared_with_the_one_before_the_fix() -> None:
     (failing,) = compared_with_before(rows(200, 10), rows(needed, 1))
     assert "credible" not in failing and f"in 1 of {needed} now" in failing
     assert list(compared_with_before(rows(200, 0), rows(10, 0))) == []
+    (not_judged,) = compared_with_before(rows(200, 10), rows(needed, 0, "own:other"))
+    assert "judged in no run now" in not_judged and "credible" not in not_judged
+    (hung,) = compared_with_before(rows(200, 10, "hung"), rows(needed, 0))
+    assert "enough" in hung, "a run that hangs comes to no check, and one that does not has no such check"
 
 
 def test_a_fault_s_own_checks_count_together_and_a_foreign_row_counts_nothing() -> None:
