@@ -29,8 +29,8 @@ FROM_THE_FOLDER = (
     [
         "`replay`",
         "The same scenario gives the same trace, states and metrics. Judged with `--check-determinism`.",
-        "a row differs; the first is shown, from both runs",
-        "the second run failed",
+        "a row differs; the first is shown, with its frame, vehicle and line of the program",
+        "a repetition failed",
         "the run ran once",
         Subject.RUN.value,
     ],

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from docs.generate.keys import key_table
 from docs.generate.markdown import docstring, table
 from docs.generate.markdown import page as whole_page
+from emulator.scenario.fault_draws import Drawn
 from emulator.scenario.fault_families import Fault, Selector
 from emulator.scenario.faults import KINDS
+from emulator.testing.campaign_plan import MOST_FAULTS
+from emulator.testing.schedules import simulated_kinds
 
 INTRODUCTION = """
 A fault is a table `[[fault]]` in a scenario, the arguments of `vnet fault inject`, or those of `emu.fault(…)` in a
@@ -41,6 +44,15 @@ payloads mean: lies in them are a program, `agents.cooperative.attacker:main`, f
 INFRASTRUCTURE = """
 Live runs only; a simulation has neither. `router_restart` needs a router of its own, `vnet run --router separate`.
 """
+DRAWN = f"""
+`vnet campaign`, and the strategy `faults` of property tests, draw faults of these kinds. A run of a campaign has
+one to {MOST_FAULTS} of them. A kind is drawn as often as its weight says, relative to the others. A fault starts
+at any hundredth of a second, lasts any number of tenths that fits, and is over `run.settle_s` before the end.
+Parameters that are not listed keep their defaults. All numbers of a range are equally likely; a pair of numbers is
+two draws.
+
+`vnet campaign --draw delay.delay_ms=1..2000` draws from another range, in the same steps; it may be repeated.
+"""
 RULES = """
 [faults.md](../faults.md#rules-of-your-own) shows how rules are written. They stand in a scenario, or in a test as
 `emu.rule(…)`; a running emulator accepts none.
@@ -58,7 +70,23 @@ def page() -> str:
     for title in dict.fromkeys(kind.chapter for kind in KINDS.values()):
         chapter = {name: kind for name, kind in KINDS.items() if kind.chapter == title}
         parts += [f"## {title}", NOTES.get(title, ""), *_chapter(chapter)]
+    parts += ["## What a campaign draws", DRAWN, table(["kind", "weight", "target", "parameters"], _drawn())]
     return whole_page("Faults", *parts)
+
+
+def _drawn() -> Iterator[Sequence[str]]:
+    """Yield a row for each kind that a campaign draws, from its declarations."""
+    for name in simulated_kinds():
+        kind = KINDS[name]
+        target = docstring(kind.draw_target).removeprefix("Draw ").rstrip(".")
+        ranges = [f"`{key}` {_range(law)}" for key, law in kind.drawn_ranges().items()]
+        yield f"`{name}`", str(kind.campaign_weight), target, "; ".join(ranges)
+
+
+def _range(law: Drawn) -> str:
+    """Return the range of a parameter in words."""
+    low, high = law.bounds
+    return f"{low:g} to {high:g} in steps of {law.step:g}"
 
 
 def _chapter(kinds: Mapping[str, type[Fault]]) -> Iterator[str]:

@@ -51,14 +51,15 @@ FOLDER = {
     "manifest.json": "SHA-256 of each file above, of `logs/` but for `programs.log`, and of `files/`, by its path; "
     "[`vnet check`](../checks.md#the-files-of-a-run) compares them",
     "logs/": "what each vehicle printed and logged: `v01.log`, …; further incarnations append. `programs.log`: "
-    "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign",
+    "what programs of a simulation print on standard output with `--quiet`, `--log-format json` or in a campaign; "
+    "`calls/`: what each vehicle has sent and reported, and from which line, with `--check-determinism`",
     "files/": "what each vehicle has left on its disk, `node.folder`: `files/v01/`, …, up to `run.files_max_mb` "
     "each. Only regular files of processes that the emulator has started; during a run they are in `disks/`",
     "report.html": "[the run on one page](../report.md)",
     "recording.rrd": "a Rerun recording, if one was asked for",
     "control.json, operator.json": "the control endpoint for `vnet fault` and `vnet status`, during a live run",
     "access/": "users and credentials, if `vnet emulator` made them; leave it out when you pass a run on",
-    "again/": "the second run, with `--check-determinism`",
+    "again/": "the repetition that differs, or the last one, with `--check-determinism`",
 }
 SCENARIO = """
 Two sections are not the scenario's own: they hold SHA-256 of what the run has read at its start.
@@ -223,7 +224,11 @@ EVENTS = {
         "its program did not let time advance (busy loop); where its tasks stood",
     ),
     "died": ("vehicle", "`how`, `log_tail` or `process`", "its process ended without being told to"),
-    "stalled": ("vehicle", "`error`, `where`", "its process did not yield, or did not come back, in time"),
+    "stalled": (
+        "vehicle",
+        "`error`, `where`, `refused`",
+        "its process did not yield, or did not come back, in time; why its last message was refused, if it was",
+    ),
     "restarted": ("vehicle", "`incarnation`", "it is up again after a kill or restart"),
     "entered": ("vehicle", "`incarnation`", "it is in the network, and its program starts"),
     "left": ("vehicle", "", "it is not in the network any more"),

@@ -31,6 +31,7 @@ from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
 from emulator.drivers.live import run_live
 from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.program_check import program_check
 from emulator.drivers.simulate import simulate
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
@@ -118,6 +119,9 @@ def compute(cell: Cell, live: bool = False) -> CellResult:
 
 def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
     scenario = with_order_steps(cell.scenario)
+    if live:
+        with program_check(scenario) as check:
+            check.wait()
     folder = RunFolder.create(path, scenario)
     emulation = Emulation(scenario, build_world(scenario), folder)
     if live:

@@ -42,6 +42,11 @@ class Moment:
     values: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def name(self) -> str:
+        """Name of the event, as `name` of an event of `run.events`."""
+        return self.event
+
+    @property
     def time_s(self) -> float:
         """Emulated seconds."""
         return self.time_ns / NS_PER_S
@@ -74,11 +79,7 @@ def moments(run: Run, at: str = PERIOD) -> list[Moment]:
 def _events(run: Run) -> Iterator[Moment]:
     for event in run.events:
         if event.node is not None:
-            own = event.kind == "event"
-            name = str(event.details.get("name", "")) if own else event.kind
-            yield Moment(
-                event.time_ns, event.node, name, event.details.get("details", {}) if own else event.details
-            )
+            yield Moment(event.time_ns, event.node, event.name, event.values)
 
 
 def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,20 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from emulator.records.parting import partings
 from emulator.records.recorded_run import OpenedRun, RecordedRun
 from emulator.records.reported import value_columns
 from emulator.records.run_folder import AGAIN
-from emulator.records.verdicts import Finding, NotExercised, result
-from vnet.errors import VnetError
+from emulator.records.verdicts import CheckResult, Finding, NotExercised, Verdict, result
+from vnet.errors import VnetError, printable
+from vnet.units import NS_PER_S
 
 ONCE = NotExercised("replay", "it ran once; --check-determinism runs it twice")
+CALLS = "logs/calls"
+"""Folder of the calls of each node, with the lines of the program that made them; with `--check-determinism`."""
+LONGEST_LINE = 1000
+LONGEST = 100
+"""Characters that are shown of a call."""
 TABLES = ("trace", "states", "metrics")
 ABOUT = ("sent_ns", "sender", "seq", "receiver", "copy", "period", "node", "outcome", "arrival_ns")
 """The columns that are shown of a differing row, beside those that differ."""
@@ -27,17 +35,72 @@ def check_replay(folder: Path) -> Finding:
     return compare_folders(folder, again) if RecordedRun.open(again).has_record else ONCE
 
 
-def compare_folders(first: Path, second: Path) -> Finding:
-    """Compare two finished runs. Raises VnetError if a table cannot be read, or has other columns in one."""
+def compare_folders(first: Path, second: Path) -> CheckResult:
+    """Compare two finished runs, and name the first frame and line of the program in which they differ.
+
+    Raises VnetError if a table cannot be read, or has other columns in one.
+    """
     ours, theirs = RecordedRun.open(first), RecordedRun.open(second)
-    tables = []
-    for name, mine, other in zip(TABLES, _tables(ours), _tables(theirs), strict=True):
-        if name == "states":
-            mine, other = _with_values(mine, other), _with_values(other, mine)
-        if set(mine.column_names) != set(other.column_names):
-            raise VnetError(f"{second}: the table of the {name} has other columns than the one of {first}")
-        tables.append((name, mine, other))
-    return compare(tables)
+    try:
+        found = compare_tables(_tables(ours), _tables(theirs))
+    except ValueError as error:
+        raise VnetError(f"{second}: {error} than the one of {first}") from None
+    if found.verdict is Verdict.VALID:
+        return found
+    told, figures = _first_frame(ours, theirs)
+    call, node = first_call(first, second)
+    if call:
+        told, figures = f"{told}; {call}", {**figures, "call": call, "vehicle": node}
+    return CheckResult(found.name, found.verdict, f"{found.text}; {told}", {**found.figures, **figures})
+
+
+def _first_frame(ours: OpenedRun, theirs: OpenedRun) -> tuple[str, dict[str, Any]]:
+    """Return the first frame in which two runs differ, as a phrase and as figures."""
+    parting = next((each for each in partings(ours, theirs) if each.kind == "frame"), None)
+    if parting is None:
+        return "no frame differs", {}
+    frame = (parting.first or parting.second).partition(",")[0]
+    seconds = f"{parting.time_ns / NS_PER_S:.6f}"
+    return f"first {frame} at {seconds} s", {"frame": frame, "time_s": float(seconds), "vehicle": parting.node}
+
+
+def first_call(ours: Path, theirs: Path) -> tuple[str, str]:
+    """Return the first call in which the programs of two runs differ, with its line, and its vehicle; or "", ""."""
+    first, second = ours / CALLS, theirs / CALLS
+    differing = []
+    for node in sorted({each.name for folder in (first, second) if folder.is_dir() for each in folder.iterdir()}):
+        pairs = zip_longest(_calls(first / node), _calls(second / node))
+        if (pair := next((pair for pair in pairs if pair[0] != pair[1]), None)) is not None:
+            differing.append((min(time_ns for time_ns, *_ in filter(None, pair)), node, pair))
+    if not differing:
+        return "", ""
+    time_ns, node, calls = min(differing, key=lambda each: each[:2])
+    one, other = (_told(call, time_ns) for call in calls)
+    told = f"{one} in both" if one == other else f"{one} and {other}"
+    return f"{node}'s program parts at {time_ns / NS_PER_S:.6f} s: {told}", node
+
+
+Call = tuple[int, str, str, str]
+"""Time in ns, kind, digest, and file and line of the program."""
+
+
+def _calls(path: Path) -> Iterator[Call]:
+    """Yield the calls of a node in their order; what is no such file ends them."""
+    if not path.is_file():
+        return
+    with path.open(errors="replace") as lines:
+        for line in iter(lambda: lines.readline(LONGEST_LINE), ""):
+            parts = line.rstrip("\n").split("\t")
+            if len(parts) != 4 or not parts[0].isdecimal():
+                return
+            yield int(parts[0]), parts[1], parts[2], parts[3]
+
+
+def _told(call: Call | None, time_ns: int) -> str:
+    """Return a call of that instant in words; "nothing" for a later one."""
+    if call is None or call[0] != time_ns:
+        return "nothing"
+    return printable(f"{call[1]} from {call[3]}", LONGEST)
 
 
 def _tables(run: OpenedRun) -> tuple[pa.Table, pa.Table, pa.Table]:
@@ -53,7 +116,19 @@ def _with_values(states: pa.Table, others: pa.Table) -> pa.Table:
     return states
 
 
-def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
+def compare_tables(ours: Sequence[pa.Table], theirs: Sequence[pa.Table]) -> CheckResult:
+    """Compare the tables of two runs, as `TABLES` calls them. Raises ValueError for other columns in one."""
+    tables = []
+    for name, mine, other in zip(TABLES, ours, theirs, strict=True):
+        if name == "states":
+            mine, other = _with_values(mine, other), _with_values(other, mine)
+        if set(mine.column_names) != set(other.column_names):
+            raise ValueError(f"the table of the {name} has other columns")
+        tables.append((name, mine, other))
+    return compare(tables)
+
+
+def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> CheckResult:
     """Compare tables (name, first, second) of two runs; the first difference is shown."""
     for name, first, second in tables:
         index = first_difference(first, second)
@@ -63,7 +138,7 @@ def compare(tables: list[tuple[str, pa.Table, pa.Table]]) -> Finding:
     return result("replay", 0, text, "", rows_each=len(tables[0][1]))
 
 
-def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> Finding:
+def _difference(name: str, first: pa.Table, second: pa.Table, index: int) -> CheckResult:
     ours, theirs = _row(first, index), _row(second, index)
     differing = [key for key in first.column_names if str(ours.get(key)) != str(theirs.get(key))]
     how = ", ".join(differing) if ours and theirs else "one has no such row"

@@ -104,7 +104,14 @@ def check_progress(recorded: RecordedRun) -> Finding:
         return CheckResult(name, Verdict.INVALID, text, {"node": event.node, **event.details})
     if stalled := recorded.event("stalled"):
         event = stalled[0]
-        text = f"{event.node} hangs at {event.time_ns / 1e9:.3f} s: {event.details.get('error')}"
+        when, error, refused = (
+            f"{event.time_ns / 1e9:.3f} s",
+            event.details.get("error"),
+            event.details.get("refused"),
+        )
+        text = f"{event.node} hangs at {when}: {error}"
+        if refused is not None:
+            text = f"the last message of {event.node} at {when} was refused: {refused}; since then {error}"
         return CheckResult(name, Verdict.UNKNOWN, text, {"node": event.node, **event.details})
     if exceeded := recorded.event("memory_exceeded"):
         return unknown(name, memory_exceeded(exceeded[0]), node=exceeded[0].node)

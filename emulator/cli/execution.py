@@ -21,7 +21,8 @@ from emulator.cli.new_run import prepare_folder
 from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, OutputOptions
 from emulator.cli.report import report_at_end
 from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude, run_again
+from emulator.drivers.conclude import conclude
+from emulator.drivers.determinism import calls_recorded, run_again
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
@@ -110,6 +111,7 @@ def run_simulated(request: Request, processes: str) -> None:
                 _record_here(emulation, request.sinks, stack)
             say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
             debug = request.asked.debug
+            stack.enter_context(calls_recorded(emulation.folder.path, request.asked.check_determinism is not None))
             wall_s, interrupted = run_simulation(emulation, on_interrupt=say, debug=debug, processes=count)
         _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
 
@@ -182,7 +184,8 @@ def _run_live(
             progress.state(options.record.serve.announcement())
         with signals_ignored():  # a second Ctrl-C must not lose the records
             running = run_live(emulation, options, progress.state, on_missing=progress.awaits, on_open=on_open)
-            wall_s, interrupted = asyncio.run(running)
+            with calls_recorded(emulation.folder.path, asked.check_determinism is not None):
+                wall_s, interrupted = asyncio.run(running)
             _finish(emulation, progress, wall_s, interrupted, "run", asked, output)
 
 
@@ -203,9 +206,9 @@ def _finish(
         progress.close()
         for line in emulation.folder.unkept:
             tell(line, asked.log_format)
-        if asked.check_determinism and not interrupted:
+        if asked.check_determinism is not None and not interrupted:
             again = ["--quiet"] if asked.only_the_result else []
-            verdict = run_again(emulation, judgement, verdict, command, again)
+            verdict = run_again(emulation, judgement, verdict, command, asked.check_determinism, again)
         status = 130 if interrupted else judgement.exit_status
         folder = emulation.folder.path
         progress.ended(verdict, str(folder), status)

@@ -7,9 +7,16 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
+DEFAULTS = {"--check-determinism": "--check-determinism=layouts"}
+"""Values of options that may be given without one."""
+
 
 class _Group(TyperGroup):
     """A group of commands whose help lists them by panel, with nothing cut off."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Give the one option whose value may be left out, which Typer does not have, its default."""
+        return super().parse_args(ctx, [DEFAULTS.get(each, each) for each in args])
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write each panel's commands, their names aligned over all panels."""

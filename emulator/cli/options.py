@@ -71,7 +71,8 @@ class OutputOptions:
 
     log_format: LogFormat
     quiet: bool
-    check_determinism: bool = False
+    check_determinism: str | None = None
+    """Compared ways of making the run: "layouts" or "portable"; None if it is made once."""
     report: bool = True
     verbose: bool = False
     debug: DebugTarget | None = None
@@ -150,9 +151,23 @@ RerunOption = Annotated[
         "viewer here as well. off. Several as serve,save.",
     ),
 ]
+
+
+class Compared(StrEnum):
+    """Values of `--check-determinism`."""
+
+    LAYOUTS = "layouts"
+    PORTABLE = "portable"
+
+
 DeterminismOption = Annotated[
-    bool,
-    typer.Option("--check-determinism", metavar="", help="Run it twice, and show the first row that differs."),
+    Compared | None,
+    typer.Option(
+        "--check-determinism",
+        metavar="[=portable]",
+        help="Run it again live or simulated, in other processes, without windows and at other addresses, and show "
+        "the first frame, vehicle and line that differ. portable: note, too, how it is with another hash seed.",
+    ),
 ]
 LogFormatOption = Annotated[
     LogFormat, typer.Option(help="json: an object a line on stderr, and verdict.json in one line on stdout.")

@@ -77,7 +77,7 @@ def run(
     rerun_bind: RerunBindOption = None,
     rerun_port: RerunPortOption = None,
     rerun_vehicle: RerunVehicleOption = None,
-    check_determinism: DeterminismOption = False,
+    check_determinism: DeterminismOption = None,
     report: ReportOption = True,
     router: Annotated[
         RouterKind, typer.Option(help="The emulator is the router itself, or starts one as a separate process.")
@@ -96,7 +96,7 @@ def run(
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         order_asked = OrderOptions(order, order_seed, tape)
         loaded = load(scenario, overrides, program, pacing, seed, duration, option, checks, order_asked)
-        if check_determinism and loaded.run.pacing == Pacing.REALTIME.value:
+        if check_determinism is not None and loaded.run.pacing == Pacing.REALTIME.value:
             raise VnetError("--check-determinism: in real time no two runs are alike; use --pacing lockstep")
         _check_restarts(loaded, router is RouterKind.SEPARATE)
         sinks = choose_sinks(rerun or (), rerun_bind, rerun_port, rerun_vehicle)
@@ -127,7 +127,7 @@ def simulate(
     checks: ChecksOption = None,
     rerun: RerunOption = None,
     rerun_vehicle: RerunVehicleOption = None,
-    check_determinism: DeterminismOption = False,
+    check_determinism: DeterminismOption = None,
     processes: ProcessesOption = "1",
     debug: DebugOption = None,
     log_format: LogFormatOption = LogFormat.TEXT,

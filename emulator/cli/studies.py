@@ -9,6 +9,8 @@ import typer
 
 from emulator.cli.options import (
     ChecksOption,
+    Compared,
+    DeterminismOption,
     DurationOption,
     OrderOption,
     OrderOptions,
@@ -23,6 +25,7 @@ from emulator.cli.options import (
 from emulator.terminal.console import one_line_errors, tell
 from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import result_only
+from vnet.errors import VnetError
 
 RUNS_ON_DASK = 64
 """Runs of a campaign that wait for Dask's workers at once: more than most clusters have."""
@@ -53,6 +56,13 @@ def campaign(
             help="random, the kinds to draw from (kill,partition), or none: the runs differ by their seeds.",
         ),
     ] = "random",
+    draw: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KIND.KEY=LOW..HIGH",
+            help="Draw a parameter of faults from this range: delay.delay_ms=1..2000. May be repeated.",
+        ),
+    ] = None,
     program: ProgramOption = None,
     seed: SeedOption = None,
     duration: DurationOption = None,
@@ -61,6 +71,15 @@ def campaign(
     overrides: SetOption = None,
     option: ProgramOptionsOption = None,
     checks: ChecksOption = None,
+    check_determinism: DeterminismOption = None,
+    before: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="An earlier campaign: say whether what failed there is credibly fixed. Default: the last of the "
+            "same name and seed in runs/, without --out.",
+        ),
+    ] = None,
     jobs: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Runs at once. Default: as many as there are cores, or 64 on Dask."),
@@ -79,15 +98,24 @@ def campaign(
     from emulator.cells.executors import open_executor
     from emulator.testing.campaign import run_campaign
     from emulator.testing.campaign_plan import Plan
+    from emulator.testing.schedules import parse_ranges
 
     with one_line_errors(), result_only(True):
         loaded = load(
             scenario, overrides, program, Pacing.LOCKSTEP, seed, duration, option, checks, OrderOptions(order)
         )
+        if check_determinism is Compared.PORTABLE:
+            raise VnetError("--check-determinism=portable: is for vnet run and vnet simulate")
         jobs = jobs or (RUNS_ON_DASK if executor else None)
-        limits = {"limit_s": time_limit, "shrink_steps": shrink_steps} | ({"jobs": jobs} if jobs else {})
-        plan = Plan.of(loaded, faults, runs, loaded.run.seed, **limits)
+        options = {
+            "limit_s": time_limit,
+            "shrink_steps": shrink_steps,
+            "ranges": parse_ranges(draw or ()),
+            "check_determinism": check_determinism is not None,
+            **({"jobs": jobs} if jobs else {}),
+        }
+        plan = Plan.of(loaded, faults, runs, loaded.run.seed, **options)
         if plan.note:
             tell(plan.note)
         with open_executor(executor) as pool:
-            raise typer.Exit(run_campaign(plan, out, SafeConsole(stderr=True), pool))
+            raise typer.Exit(run_campaign(plan, out, SafeConsole(stderr=True), pool, before))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import platform
 import shlex
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict
@@ -18,9 +16,8 @@ import numpy as np
 import pyarrow as pa
 
 from emulator.checks.folder import kept, verdict_figures
-from emulator.checks.judge import Judgement, RecordedRun, Verdict, judge
+from emulator.checks.judge import Judgement, RecordedRun, judge
 from emulator.checks.own import PREFIX, own_findings
-from emulator.checks.replay import check_replay
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.signals import signals_handled
 from emulator.radio.outcomes import Outcome
@@ -31,7 +28,6 @@ from emulator.records.node_files import collect
 from emulator.records.recorded_world import RecordedWorld
 from emulator.records.run import Run
 from emulator.records.run_folder import (
-    AGAIN,
     BACKBONE_FILE,
     BACKGROUND_FILE,
     BUSY_FILE,
@@ -47,7 +43,7 @@ from emulator.records.run_folder import (
     write_text,
 )
 from emulator.records.tape import TAPE_FILE, described, dump_tape
-from emulator.records.verdicts import Finding, NotExercised, unknown
+from emulator.records.verdicts import Finding, NotExercised
 from vnet.runtime.environment import arithmetic
 
 
@@ -226,21 +222,3 @@ def judge_further(
     verdict = {**verdict, **_judged(judgement)}
     _put_verdict(emulation.folder, verdict)
     return verdict
-
-
-def run_again(
-    emulation: Emulation, judgement: Judgement, verdict: dict[str, Any], command: str, options: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Repeat a concluded run in processes of its own, and add to its verdict how the two compare.
-
-    Returns the new contents of verdict.json.
-    """
-    path = emulation.folder.path
-    arguments = [command, str(emulation.folder.scenario_path), "--out", str(path / AGAIN), "--no-report", *options]
-    # A process of its own: nothing that a program has left in this one may help it to agree with itself.
-    done = subprocess.run([sys.executable, "-P", "-m", "emulator.cli", *arguments], stdout=subprocess.DEVNULL)
-    finding: Finding = check_replay(path)
-    if done.returncode not in {each.exit_status for each in Verdict}:
-        finding = unknown("replay", f"the second run ended with status {done.returncode}")
-    verdict = {**verdict, "reproduce": f"{verdict['reproduce']} --check-determinism"}
-    return judge_further(emulation, judgement, verdict, [finding])

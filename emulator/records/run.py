@@ -155,7 +155,10 @@ class Run:
 
     @property
     def events(self) -> Sequence[Event]:
-        """Events in the order of their recording: `time_ns`, `kind`, `node` (or None) and `details`."""
+        """Events in the order of their recording: `time_ns`, `kind`, `node` (or None) and `details`.
+
+        `name` and `values` are those of a program's own event (`node.event`), as in properties over time.
+        """
         return self._recorded.events
 
     @property

@@ -61,6 +61,17 @@ class Event:
     node: str | None
     details: dict[str, Any]
 
+    @property
+    def name(self) -> str:
+        """Name that the program gave to an event of its own (`node.event`); else the kind."""
+        return str(self.details.get("name", "")) if self.kind == "event" else self.kind
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Details that the program gave to an event of its own; else those of the kind."""
+        values = self.details.get("details") if self.kind == "event" else self.details
+        return values if isinstance(values, dict) else {}
+
 
 class RunFolder:
     """A run's folder; see the module's text. All methods raise VnetError where the disk does not play along.

@@ -38,6 +38,26 @@ class Drawn:
     times: int = 1
     per: int = 1
 
+    @property
+    def step(self) -> float:
+        """Distance of two neighbouring numbers that can be drawn."""
+        return self.times / self.per
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and greatest number that can be drawn."""
+        return self.low * self.times / self.per, self.high * self.times / self.per
+
+    def between(self, low: float, high: float) -> Drawn:
+        """Return the same steps between other bounds. Raises ValueError for what is no multiple of a step."""
+        steps = [round(bound / self.step) for bound in (low, high)]
+        if (
+            any(abs(n * self.step - bound) > 1e-9 for n, bound in zip(steps, (low, high), strict=True))
+            or low > high
+        ):
+            raise ValueError(f"two multiples of {self.step:g} are needed, the lower one first")
+        return Drawn(steps[0], steps[1], self.times, self.per)
+
     def draw(self, choose: Chooser) -> float:
         """Draw one number."""
         return choose.integer(self.low, self.high) * self.times / self.per

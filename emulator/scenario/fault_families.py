@@ -17,7 +17,7 @@ draws it, and which law it follows. The layers above act on families:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, get_args
 
 from pydantic import Field, model_validator
@@ -127,13 +127,18 @@ class Fault(Section):
         return {}
 
     @classmethod
-    def draw_parameters(cls, choose: Chooser) -> dict[str, Any]:
-        """Draw every parameter with a `Drawn`, in the order of the fields."""
+    def drawn_ranges(cls) -> dict[str, Drawn]:
+        """Return the ranges of the parameters that campaigns draw, in the order of the fields."""
+        metadata = {name: field.metadata for name, field in cls.model_fields.items()}
+        return {name: each for name, found in metadata.items() for each in found if isinstance(each, Drawn)}
+
+    @classmethod
+    def draw_parameters(cls, choose: Chooser, ranges: Mapping[str, Drawn] | None = None) -> dict[str, Any]:
+        """Draw every parameter with a `Drawn`, in the order of the fields; `ranges` are used in place of theirs."""
         drawn: dict[str, Any] = {}
-        for name, field in cls.model_fields.items():
-            for law in (each for each in field.metadata if isinstance(each, Drawn)):
-                pair = get_args(field.annotation) == get_args(Point)
-                drawn[name] = (law.draw(choose), law.draw(choose)) if pair else law.draw(choose)
+        for name, law in (cls.drawn_ranges() | dict(ranges or {})).items():
+            pair = get_args(cls.model_fields[name].annotation) == get_args(Point)
+            drawn[name] = (law.draw(choose), law.draw(choose)) if pair else law.draw(choose)
         return drawn
 
 

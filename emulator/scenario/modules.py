@@ -116,8 +116,8 @@ class _Modules:
         if found is None:
             where = " or in ".join(dict.fromkeys(str(folder.resolve()) for folder in self._searched))
             raise ScenarioError(f"{problem}: no such file in {where}")
-        if not found.stem.isidentifier():
-            raise ScenarioError(f"{problem}: not importable: name the file with letters, digits and _ only")
+        if not found.stem.replace(" ", "_").isidentifier():
+            raise ScenarioError(f"{problem}: not importable: name the file with letters, digits, blanks and _ only")
         folder = self._of_files.setdefault(found.stem, found.parent)
         if folder.resolve() != found.parent.resolve():
             raise ScenarioError(f"{problem}: there is another {found.name} in {folder}: rename one of them")

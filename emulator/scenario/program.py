@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from emulator.scenario.sections import Section
 from vnet.errors import shown
 
-_MODULE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+_MODULE = re.compile(r"[A-Za-z_][\w. ]*:[A-Za-z_]\w*")
 _FILE = re.compile(r"([^\0]*\.py)(?::([A-Za-z_]\w*))?")
 
 

@@ -27,7 +27,7 @@ _LONG_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{D
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a file. Raises OSError, and ValueError with the reason where it is not valid or not plain."""
-    return parse_toml(read_bounded(path, LARGEST_BYTES).decode())
+    return parse_toml(read_bounded(path, LARGEST_BYTES).decode("utf-8-sig"))
 
 
 def parse_toml(text: str) -> dict[str, Any]:

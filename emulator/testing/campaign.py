@@ -13,9 +13,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,13 @@ from rich.text import Text
 
 from emulator.checks.own import is_broken
 from emulator.records.atomic import write_atomically
-from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE
+from emulator.records.campaign_file import CAMPAIGN_FILE, CAMPAIGN_PAGE, read_campaign
 from emulator.records.run_folder import RUNS, SCENARIO_FILE
 from emulator.records.verdicts import Verdict
 from emulator.report.index import write_index
 from emulator.scenario.scenario import Scenario, dump_scenario
 from emulator.testing.campaign_plan import Plan
+from emulator.testing.credibility import after_a_fix, compared_with_before
 from emulator.testing.explanation import PARTING_FILE, Explanation, explain
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.failure_page import shown_parting, write_failure_page
@@ -39,7 +40,7 @@ from emulator.testing.matrix import column_of, count_verdicts, page
 from emulator.testing.regression_test import TEST_FILE, regression_test
 from emulator.testing.shrinking import MOST_STEPS, Schedule, shrink
 from emulator.testing.shrinking_runs import MOST_ORDER_STEPS, order_text, shrink_order, shrink_run, with_faults
-from emulator.testing.trial import Trial, TrialPool
+from emulator.testing.trial import REPLAY, Trial, TrialPool
 from vnet.counted import counted
 from vnet.errors import VnetError
 
@@ -148,7 +149,7 @@ class Campaign:
         self._plan = plan
         self._folder = folder
         self._progress = progress
-        self._workshop = TrialPool(plan.limit_s, plan.scenario, executor)
+        self._workshop = TrialPool(plan.limit_s, plan.scenario, executor, plan.check_determinism)
         self.outcomes: list[Outcome] = []
         self.interrupted = False
 
@@ -255,11 +256,17 @@ class Campaign:
         shrunk, steps = shrink_run(with_faults(base, schedule), still_fails, left)
         return shrunk, self._plan.shrink_steps - (left - steps)
 
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The runs so far, as in campaign.json."""
+        return [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.number)]
+
     def write(self) -> None:
         """Write campaign.json and campaign.html of the runs so far."""
-        rows = [outcome.as_json() for outcome in sorted(self.outcomes, key=lambda o: o.number)]
         head = {"format": FORMAT, "seed": self._plan.seed, "runs": self._plan.runs, "kinds": self._plan.kinds}
-        write_atomically(self._folder / CAMPAIGN_FILE, json.dumps(head | {"results": rows}, indent=1) + "\n")
+        if self._plan.ranges:
+            head["ranges"] = {k: {n: r.bounds for n, r in of.items()} for k, of in self._plan.ranges.items()}
+        write_atomically(self._folder / CAMPAIGN_FILE, json.dumps(head | {"results": self.rows}, indent=1) + "\n")
         write_atomically(self._folder / CAMPAIGN_PAGE, self._page())
 
     def _page(self) -> str:
@@ -282,7 +289,8 @@ class Campaign:
             "checks": outcome.texts(),
             "schedule": outcome.schedule(),
             "order": outcome.order(),
-            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}",
+            "command": f"vnet simulate {shlex.quote(str(outcome.folder.absolute() / SCENARIO_FILE))}"
+            + (" --check-determinism" if REPLAY in outcome.trial.failed else ""),
             "folder": f"failures/{outcome.folder.name}",
             "parting": shown_parting(outcome.explanation) if outcome.explanation else None,
         }
@@ -323,6 +331,20 @@ def _folders(name: str) -> Iterator[Path]:
         yield RUNS / (name if number == 1 else f"{name}-{number}")
 
 
+def _earlier(name: str, before: Path | None, out: Path | None) -> list[dict[str, Any]]:
+    """Return the runs of the earlier campaign that this one is compared with; none if there is none.
+
+    Raises VnetError for a named folder that has none.
+    """
+    if before is not None:
+        return read_campaign(before).results
+    if out is None:
+        there = list(takewhile(Path.exists, _folders(name)))
+        with suppress(VnetError):  # of another version, or edited
+            return read_campaign(there[-1]).results if there else []
+    return []
+
+
 @contextmanager
 def _interrupted_once() -> Iterator[None]:
     """Ctrl-C and SIGTERM interrupt the block once: a second one must not lose what there is."""
@@ -343,16 +365,20 @@ def _interrupted_once() -> Iterator[None]:
             signal.signal(each, handler)
 
 
-def run_campaign(plan: Plan, out: Path | None, console: Console, executor: Executor | None = None) -> int:
+def run_campaign(
+    plan: Plan, out: Path | None, console: Console, executor: Executor | None = None, before: Path | None = None
+) -> int:
     """Run a campaign, print its result and return the exit status. Raises VnetError.
 
-    Its runs are simulated on `executor`, by default on this machine; those that are kept always are.
+    Its runs are simulated on `executor`, by default on this machine; those that are kept always are. `before` is
+    the folder of an earlier campaign, by default the last one of the same name: its failures may have been fixed.
 
     0 if no run failed, 1 if one did, 3 if none did but a check of the user's own could not be made, 130 if it was
     interrupted.
     """
     name = f"campaign-{plan.scenario.run.name}-{plan.seed}"
     folder = out or next(path for path in _folders(name) if not path.exists())
+    earlier = _earlier(name, before, out)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise VnetError(f"--out {folder}: exists and is not an empty folder")
     folder.mkdir(parents=True, exist_ok=True)
@@ -366,6 +392,8 @@ def run_campaign(plan: Plan, out: Path | None, console: Console, executor: Execu
         console.print(*campaign.summary(), sep="\n")
     for kind in campaign.broken:
         console.print(Text(f"unknown in {runs_of(kind)}: {kind.check}: {kind.text}"))
+    for line in (*compared_with_before(earlier, campaign.rows), *after_a_fix(campaign.rows)):
+        console.print(Text(line))
     done = len(campaign.outcomes)
     failed = f"{done} run{'s' if done != 1 else ''}, {len(campaign.failures)} failed"
     console.print(f"{failed}: {folder / CAMPAIGN_PAGE}", highlight=False, soft_wrap=True)

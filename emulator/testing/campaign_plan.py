@@ -16,7 +16,7 @@ from emulator.scenario.fault_families import OwnRule
 from emulator.scenario.faults import KINDS
 from emulator.scenario.scenario import Scenario
 from emulator.testing.scenarios import make_scenario
-from emulator.testing.schedules import LEAST_TIME_S, ScheduleConstraints, draw_fault, known_kinds
+from emulator.testing.schedules import LEAST_TIME_S, Ranges, ScheduleConstraints, draw_fault, known_kinds
 from vnet.errors import ScenarioError
 from vnet.runtime.program_path import search_programs_in
 from vnet.runtime.programs import load_program
@@ -42,6 +42,10 @@ class Plan:
     limit_s: float = 300.0
     shrink_steps: int = SHRINK_STEPS
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    ranges: Ranges = field(default_factory=dict)
+    """Ranges of drawn parameters that differ from those of the kinds."""
+    check_determinism: bool = False
+    """True if each run is made again in another way, and fails by `replay` where that differs."""
     note: str = ""
     """Change of the scenario that the campaign has made by itself, in one line; "" if none."""
     constraints: ScheduleConstraints | None = None
@@ -77,7 +81,9 @@ class Plan:
             return scenario
         choose, constraints = _Random(seed), self.constraints
         weighted = [kind for kind in self.kinds for _ in range(KINDS[kind].campaign_weight)]
-        faults = [draw_fault(choose, constraints, weighted) for _ in range(choose.integer(1, MOST_FAULTS))]
+        faults = [
+            draw_fault(choose, constraints, weighted, self.ranges) for _ in range(choose.integer(1, MOST_FAULTS))
+        ]
         return make_scenario(scenario, {"faults": [*scenario.fault, *faults]})
 
 

@@ -11,7 +11,7 @@ import math
 import shlex
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -29,6 +29,8 @@ from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_further
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.join import split_into_processes
+from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.program_check import program_check
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.period_figures import PeriodFigures
@@ -59,6 +61,11 @@ class RunHarness:
             raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
         load_checks(scenario.program)
         load_rules(scenario.fault, scenario.program)
+        with ThreadPoolExecutor(1) as pool:  # a test's thread may run an event loop
+            scenario = pool.submit(with_order_steps, scenario).result()
+        if live:
+            with program_check(scenario) as check:
+                check.wait()
         self.folder = folder
         self.live = live
         self._emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))

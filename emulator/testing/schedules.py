@@ -6,17 +6,20 @@ that a network of vehicles may meet. The fault's class says how it is drawn (`em
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from emulator.drivers.join import split_into_processes
-from emulator.scenario.fault_draws import Chooser
+from emulator.scenario.fault_draws import Chooser, Drawn
 from emulator.scenario.fault_families import Fault
 from emulator.scenario.faults import KINDS, parse_fault
 from emulator.scenario.scenario import Scenario
 from emulator.world.world import build_world
-from vnet.errors import ScenarioError, did_you_mean
+from vnet.errors import ScenarioError, did_you_mean, printable
 
+T = TypeVar("T")
 AT_STEPS, DURATION_STEPS = 100, 10
 """Faults start on hundredths of a second and last tenths."""
 LEAST_TIME_S = 1 / DURATION_STEPS
@@ -57,12 +60,57 @@ def known_kinds(kinds: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(kinds) if kinds else known
 
 
-def draw_fault(choose: Chooser, constraints: ScheduleConstraints, kinds: Sequence[str]) -> Fault:
-    """Draw a fault of one of these kinds."""
+Ranges = Mapping[str, Mapping[str, Drawn]]
+"""Ranges of parameters by kind and key, in place of those of the kinds."""
+
+
+def parse_ranges(texts: Sequence[str]) -> Ranges:
+    """Return the ranges of texts such as `delay.delay_ms=1..2000`. Raises ScenarioError if none can be drawn."""
+    found: dict[str, dict[str, Drawn]] = {}
+    for text in texts:
+        match = re.fullmatch(r"(\w+)\.(\w+)=(-?[\d.]+?)\.\.(-?[\d.]+)", text)
+        if match is None:
+            raise ScenarioError(f"--draw {printable(text)}: write KIND.KEY=LOW..HIGH, as delay.delay_ms=1..2000")
+        kind, key, *bounds = match.groups()
+        known_kinds([kind])
+        if (law := KINDS[kind].drawn_ranges().get(key)) is None:
+            drawn = ", ".join(KINDS[kind].drawn_ranges()) or "no parameter"
+            raise ScenarioError(f"--draw {text}: of {kind} a campaign draws {drawn}")
+        try:
+            wider = law.between(float(bounds[0]), float(bounds[1]))
+        except ValueError as error:
+            raise ScenarioError(f"--draw {text}: {error}") from None
+        for chooser in (_Ends(least=True), _Ends(least=False)):
+            data = {"kind": kind, "duration_s": 1.0} | KINDS[kind].draw_parameters(chooser, {key: wider})
+            parse_fault(data)
+        found.setdefault(kind, {})[key] = wider
+    return found
+
+
+class _Ends:
+    """A Chooser of the least or the greatest of all."""
+
+    def __init__(self, least: bool) -> None:
+        self._end = 0 if least else -1
+
+    def integer(self, low: int, high: int) -> int:
+        return (low, high)[self._end]
+
+    def choice(self, items: Sequence[T]) -> T:
+        return items[self._end]
+
+    def subset(self, items: Sequence[T], most: int) -> list[T]:
+        return list(items[:most])
+
+
+def draw_fault(
+    choose: Chooser, constraints: ScheduleConstraints, kinds: Sequence[str], ranges: Ranges | None = None
+) -> Fault:
+    """Draw a fault of one of these kinds; `ranges` are those of parameters that differ from the kinds' own."""
     kind = choose.choice(kinds)
     last = round(constraints.healed_s * AT_STEPS) - AT_STEPS // DURATION_STEPS
     at_s = choose.integer(0, last) / AT_STEPS
     longest = int((constraints.healed_s - at_s) * DURATION_STEPS + 1e-6)
     times = {"kind": kind, "at_s": at_s, "duration_s": choose.integer(1, longest) / DURATION_STEPS}
     target = KINDS[kind].draw_target(choose, constraints.processes)
-    return parse_fault(times | target | KINDS[kind].draw_parameters(choose))
+    return parse_fault(times | target | KINDS[kind].draw_parameters(choose, (ranges or {}).get(kind)))

@@ -17,12 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
 from emulator.cells.executors import WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
+from emulator.checks.replay import compare_tables, first_call
 from emulator.drivers.conclude import conclude, judge_unkept
+from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
 from emulator.drivers.order_length import with_order_steps
 from emulator.drivers.simulate import simulate
@@ -34,7 +37,7 @@ from vnet.errors import VnetError
 
 GREATEST = 1e6
 """No number that a vehicle reports grows beyond it: metres, and their squares, of vehicles in one town."""
-HUNG, EMULATOR, GROWTH = "hung", "emulator", "growth"
+HUNG, EMULATOR, GROWTH, REPLAY = "hung", "emulator", "growth", "replay"
 STDOUT = 1
 """Descriptor of standard output."""
 LOOK_S = 0.5
@@ -69,15 +72,16 @@ UNKNOWN = Trial({}, {})
 """Result of a run that was given up."""
 
 
-def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
+def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False) -> Trial:
     """Simulate and judge a run in this process. Raises VnetError if it cannot be run.
 
-    In a folder that is open its files are written, as of any other run.
+    In a folder that is open its files are written, as of any other run. `twice` has it made again in another way.
     """
     started = time.monotonic()
     scenario = with_order_steps(scenario)
     emulation = Emulation(scenario, build_world(scenario), folder)
-    wall_s, _ = simulate(emulation)
+    with calls_recorded(folder.path, twice):
+        wall_s, _ = simulate(emulation)
     if folder.is_open:
         judgement, _ = conclude(emulation, wall_s, "simulate")
     else:
@@ -88,9 +92,35 @@ def run_trial(scenario: Scenario, folder: RunFolder) -> Trial:
     verdicts[GROWTH] = Verdict.INVALID if greatest > GREATEST else Verdict.VALID
     if greatest > GREATEST:
         texts[GROWTH] = f"a report holds {greatest:.3g}"
+    if twice:
+        differs = _difference_of_another(emulation)
+        verdicts[REPLAY] = Verdict.INVALID if differs else Verdict.VALID
+        texts |= {REPLAY: differs} if differs else {}
     failed = Verdict.INVALID in verdicts.values()
     tape = tuple(emulation.orders.in_order()) if failed else ()
     return Trial(verdicts, texts, judgement.trace_sha256, time.monotonic() - started, tape)
+
+
+def _difference_of_another(emulation: Emulation) -> str:
+    """Simulate a run again, in two processes, without windows, at other addresses; returns what differs, or ""."""
+    scenario = emulation.scenario
+    scenario = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": False})})
+    with tempfile.TemporaryDirectory(prefix="vnet-again-") as name:
+        folder = RunFolder.scratch(Path(name) / "run")
+        again = Emulation(scenario, build_world(scenario), folder)
+        with calls_recorded(folder.path, True), scattered():
+            simulate(again, processes=2)
+        found = compare_tables(_tables(emulation), _tables(again))
+        if found.verdict is Verdict.VALID:
+            return ""
+        call, _ = first_call(emulation.folder.path, folder.path)
+    return "; ".join(filter(None, [found.text, call]))
+
+
+def _tables(emulation: Emulation) -> tuple[pa.Table, ...]:
+    """Return the tables that `TABLES` names."""
+    metrics = emulation.metrics
+    return emulation.engine.trace.to_table(), metrics.states_table(), metrics.metrics_table()
 
 
 def _greatest(emulation: Emulation) -> float:
@@ -109,9 +139,12 @@ class TrialPool:
     those on an executor, for which nobody waits any more.
     """
 
-    def __init__(self, limit_s: float, scenario: Scenario, executor: Executor | None = None) -> None:
-        """Trials of changes of `scenario`, which have its programs and checks."""
+    def __init__(
+        self, limit_s: float, scenario: Scenario, executor: Executor | None = None, twice: bool = False
+    ) -> None:
+        """Trials of changes of `scenario`, which have its programs and checks; `twice`: each in two ways."""
         self.limit_s = limit_s
+        self._twice = twice
         self.closed = False
         self._place = Place.here(scenario)
         self._pool = WorkerPool()
@@ -149,16 +182,18 @@ class TrialPool:
         self._pool.call(self._place, _get_ready)
         if folder is not None:
             return self._pool.call(
-                self._place, _run_in_worker, scenario, folder, self.limit_s, limit_s=self.limit_s
+                self._place, _run_in_worker, scenario, folder, self.limit_s, self._twice, limit_s=self.limit_s
             )
         scratch = self._scratch / str(threading.get_ident())
-        return self._pool.call(self._place, _run_unkept, scenario, scratch, self.limit_s, limit_s=self.limit_s)
+        return self._pool.call(
+            self._place, _run_unkept, scenario, scratch, self.limit_s, self._twice, limit_s=self.limit_s
+        )
 
     def _away(self, scenario: Scenario) -> Trial:
         if self._executor is None:
             return self._here(scenario, None)
         future: Future[Trial] = self._executor.submit(
-            call_fitly, self._place, _run_elsewhere, scenario, self.limit_s, limit_s=self.limit_s
+            call_fitly, self._place, _run_elsewhere, scenario, self.limit_s, self._twice, limit_s=self.limit_s
         )
         while not self.closed:
             if wait([future], timeout=LOOK_S).done:
@@ -177,33 +212,36 @@ def _get_ready() -> None:
     """Have a worker import all of this module before the time of a trial is measured."""
 
 
-def _run_elsewhere(scenario: Scenario, limit_s: float) -> Trial:
+def _run_elsewhere(scenario: Scenario, limit_s: float, twice: bool) -> Trial:
     """Run a trial in a worker on any machine, and keep nothing but its result."""
     with tempfile.TemporaryDirectory(prefix="vnet-trial-") as name:
-        return _run_unkept(scenario, Path(name) / "run", limit_s)
+        return _run_unkept(scenario, Path(name) / "run", limit_s, twice)
 
 
-def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float) -> Trial:
+def _run_unkept(scenario: Scenario, scratch: Path, limit_s: float, twice: bool) -> Trial:
     """Run a trial in a worker, and keep nothing but its result: files take as long as a small run's checks."""
     folder = RunFolder.scratch(scratch)
     # Checks of the user's own may read what programs have printed.
     log = folder.logs / PROGRAMS_LOG if scenario.program.checks else Path(os.devnull)
-    return _run(scenario, folder, log, Path(os.devnull), limit_s)
+    return _run(scenario, folder, log, Path(os.devnull), limit_s, twice)
 
 
-def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float) -> Trial:
+def _run_in_worker(scenario: Scenario, folder: Path, limit_s: float, twice: bool) -> Trial:
     """Run a trial in a worker. What its programs print, and where it stood if it hangs, is in the run's logs."""
     run_folder = RunFolder.create(folder, scenario)
-    return _run(scenario, run_folder, run_folder.logs / PROGRAMS_LOG, run_folder.logs / "stacks.txt", limit_s)
+    log, stacks = run_folder.logs / PROGRAMS_LOG, run_folder.logs / "stacks.txt"
+    return _run(scenario, run_folder, log, stacks, limit_s, twice)
 
 
-def _run(scenario: Scenario, run_folder: RunFolder, log_path: Path, stacks_path: Path, limit_s: float) -> Trial:
+def _run(
+    scenario: Scenario, run_folder: RunFolder, log_path: Path, stacks_path: Path, limit_s: float, twice: bool
+) -> Trial:
     with log_path.open("ab") as log, stacks_path.open("w") as stacks:
         before = os.dup(STDOUT)
         os.dup2(log.fileno(), STDOUT)
         faulthandler.dump_traceback_later(STACKS_AT * limit_s, file=stacks)
         try:
-            return run_trial(scenario, run_folder)
+            return run_trial(scenario, run_folder, twice)
         except BaseException as error:
             traceback.print_exc(file=stacks)
             return Trial.failure(EMULATOR, f"{type(error).__name__}: {error}")

@@ -33,6 +33,7 @@ from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
 from vnet.runtime.programs import Program, Programs, error_line
+from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
@@ -63,6 +64,7 @@ class Host:
     ) -> None:
         self._debugger = debugger
         self._disks = disks or Disks()
+        self._calls, self._heap = call_log(), scattered_heap()
         self._clock = clock
         self._on_traffic = on_traffic
         self._on_line = on_line
@@ -137,6 +139,8 @@ class Host:
     def _enqueue(self, node: str, queue: list[Any], item: object) -> None:
         if self._active[node]:
             queue.append(item)
+            if self._calls is not None:
+                self._calls.add(node, self._clock(), item)
             self._on_traffic()
 
     # What the transport asks of the host.
@@ -252,6 +256,8 @@ class Host:
 
         `mail` is what comes with the grant, if it is not in it (simulated).
         """
+        if self._heap is not None:
+            self._heap.scatter()
         packets, fixes = mail or Mail.of(grant.packets, grant.fixes)
         self._window.open(grant.end_ns, packets)
         if grant.busy:

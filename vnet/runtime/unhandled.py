@@ -34,7 +34,7 @@ MOST_HELD = 1000
 """Exceptions that a process keeps until its end; of a flood, the first ones."""
 FIRST_CLEANING = 1000
 """Failures that are remembered before those that have been retrieved are forgotten."""
-_NOT_THE_PROGRAM = (
+NOT_THE_PROGRAM = (
     f"{Path(__file__).parents[1]}/",
     *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
 )
@@ -216,7 +216,7 @@ class UnhandledExceptions:
 def _own_line(trace: TracebackType | None) -> str:
     """File and line of the innermost frame that is the program's own, or of the innermost of all."""
     lines = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(trace)]
-    own = [line for line in lines if not line[0].startswith(_NOT_THE_PROGRAM)] or lines
+    own = [line for line in lines if not line[0].startswith(NOT_THE_PROGRAM)] or lines
     return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
 
 

@@ -21,10 +21,10 @@ def check(run: Run) -> Iterator[Result]:
     in_time: dict[int, set[str]] = defaultdict(set)
     for event in run.events:
         if event.kind == "event" and event.node:
-            name, details = event.details["name"], event.details["details"]
-            if name == "warned":
+            details = event.values
+            if event.name == "warned":
                 sent[details["number"]] = event.time_ns / 1e9, event.node
-            elif name == "informed" and details["delay_ms"] <= WITHIN_MS:
+            elif event.name == "informed" and details["delay_ms"] <= WITHIN_MS:
                 in_time[details["number"]].add(event.node)
     # A warning that was sent so late that the run ended before WITHIN_MS were over is not judged.
     end_s = run.times_s[-1] + run.period_s

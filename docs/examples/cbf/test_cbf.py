@@ -17,8 +17,8 @@ def informed(emu: Any) -> dict[int, set[str]]:
     """Return who has received each warning."""
     found: dict[int, set[str]] = defaultdict(set)
     for event in emu.events:
-        if event.kind == "event" and event.details["name"] == "informed":
-            found[event.details["details"]["number"]].add(event.node)
+        if event.name == "informed":
+            found[event.values["number"]].add(event.node)
     return found
 
 

@@ -80,6 +80,8 @@ class Inbox:
         self.on_sent: Callable[[SentMessage], None] = lambda message: None
         self.connected: set[str] = set()
         self.stacks: dict[str, wire.StackDump] = {}
+        self.refused: dict[str, str] = {}
+        """Reasons of the last refused messages, of nodes whose next yield has not come."""
 
     # On Zenoh's threads: append, and wake the loop once.
 
@@ -142,8 +144,11 @@ class Inbox:
             if handler is None:
                 raise ProtocolError(f"an unexpected {type(message).__name__}")
             handler(node, message)
+            if type(message) is wire.Yield:
+                self.refused.pop(node, None)
         except (WireError, ProtocolError) as error:
             self._refusals.add(node, str(error))
+            self.refused[node] = str(error)
 
     def take_backbone(self, unit: str, payload: bytes) -> None:
         """Take what a unit has put on its key of the backbone."""

@@ -187,6 +187,7 @@ class LockstepDriver(Driver):
         parts = self._parts
         for process_id in process_ids:
             dump = parts.inbox.stacks.get(process_id)
+            refused = parts.inbox.refused.get(process_id)
             self._emulation.folder.event(
                 self.time_ns,
                 "stalled",
@@ -194,6 +195,7 @@ class LockstepDriver(Driver):
                 error=f"{self._lacking(process_id)} within {timeout_s:g} s of wall clock; "
                 f"{parts.members.describe(process_id)}",
                 where=(dump.text if dump else "") or parts.agents.log_tail(process_id),
+                **({} if refused is None else {"refused": refused}),
             )
         raise Stalled
 

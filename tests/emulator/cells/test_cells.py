@@ -55,6 +55,14 @@ def test_a_cell_comes_out_the_same_whichever_process_runs_it(tmp_path: Path) -> 
     assert in_pool == {"seed": 3} | compute(tiny_cell(3)).figures
 
 
+def test_a_live_cell_whose_program_cannot_be_imported_is_refused_before_it_starts() -> None:
+    scenario = tiny_cell(1).scenario.model_copy(deep=True)
+    program = scenario.program.model_copy(update={"entry": "nothing:main"})
+    cell = Cell({"seed": 1}, scenario.model_copy(update={"program": program}), 1.0)
+    with pytest.raises(VnetError, match=r"cell .*\}: program.entry = 'nothing:main': cannot import"):
+        compute(cell, live=True)
+
+
 def test_a_program_that_raises_ends_the_experiment_and_names_the_cell(tmp_path: Path) -> None:
     with pytest.raises(VnetError, match=r"cell \{'seed': 1\}.*program.options.fusion = 'magic'"):
         run_cells([tiny_cell(1, fusion="magic")], tmp_path)

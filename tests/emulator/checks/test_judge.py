@@ -96,6 +96,9 @@ def test_without_events_nothing_is_known_of_the_course_of_a_run(recorded: Record
     assert verdict(silent, "agents_alive") is Verdict.UNKNOWN
     assert verdict(silent, "progress") is Verdict.UNKNOWN
     assert verdict(replace(recorded, events=[Event(0, "started", None, {})]), "progress") is Verdict.UNKNOWN
+    refused = Event(5, "stalled", "v02", {"error": "no yield", "where": "", "refused": "wrong number"})
+    told = result(replace(recorded, events=[*recorded.events, refused]), "progress")
+    assert isinstance(told, CheckResult) and "refused: wrong number" in told.text and "hangs" not in told.text
 
 
 @pytest.mark.parametrize("table", ["states", "metrics"])

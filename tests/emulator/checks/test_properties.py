@@ -3,6 +3,8 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import pytest
 from emulator.api import simulate
 from emulator.checks.properties import Moment, always, eventually, leads_to, moments, never
 from emulator.records.run import Run
+from emulator.records.run_folder import Event
 from emulator.testing.harness import RunHarness
 from emulator.testing.scenarios import make_scenario
 from vnet import Node
@@ -205,3 +208,16 @@ def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: 
     asyncio.run(story("kept", lambda emu: emu.always(lambda moment: True, name="kept")))
     with pytest.raises(VnetError, match="own:wrong: the predicate raised ZeroDivisionError: division by zero"):
         asyncio.run(story("raises", lambda emu: emu.always(lambda moment: bool(1 / 0), name="wrong")))
+
+
+def test_events_of_a_run_and_moments_of_a_property_are_named_alike() -> None:
+    own = Event(5, "event", "v01", {"name": "warned", "details": {"number": 3}})
+    vnets = Event(6, "crashed", "v01", {"error": "tired"})
+    foreign = Event(7, "event", "v01", {"details": 3})
+    assert [(each.name, each.values) for each in (own, vnets, foreign)] == [
+        ("warned", {"number": 3}),
+        ("crashed", {"error": "tired"}),
+        ("", {}),
+    ]
+    run = cast(Run, SimpleNamespace(events=[own, vnets, foreign]))
+    assert [(m.name, m.values) for m in moments(run, "event")] == [(e.name, e.values) for e in run.events]

@@ -1,12 +1,15 @@
 """Two runs are compared row by row, and the first that differs is shown; also as users ask for it."""
 
+import inspect
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
@@ -29,6 +32,21 @@ async def throws_dice(node: Node) -> None:
     async for fix in node.gnss:
         dice = node.id == "v02" and fix.time_ns >= 300_000_000
         await node.radio.broadcast(os.urandom(8) if dice else b"nothing")
+
+
+async def sends_a_set_of_objects(node: Node) -> None:
+    """Send in the order of a set of objects, which is that of their addresses."""
+    async for _ in node.gnss:
+        first, second = object(), object()
+        for each in {first, second}:
+            await node.radio.broadcast(b"1" if each is first else b"2")
+
+
+async def sends_a_set_of_texts(node: Node) -> None:
+    """Send in the order of a set of texts, which the hash seed decides."""
+    async for _ in node.gnss:
+        for text in {"a", "b", "c", "d"}:
+            await node.radio.broadcast(text.encode())
 
 
 @pytest.fixture(scope="module")
@@ -97,25 +115,54 @@ def test_a_failed_check_prints_its_rows_and_the_command(recorded: RecordedRun) -
     assert lines[-1].endswith("vnet simulate here/scenario.toml")
 
 
-@pytest.mark.parametrize(("program", "status"), [("agents.beacon:main", 0), (f"{__name__}:throws_dice", 1)])
-def test_a_simulation_is_had_twice_and_judged_again(tmp_path: Path, program: str, status: int) -> None:
-    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", "scenarios/beacon.toml"]
-    options = ["--duration", "1", "--program", program, "--out", str(tmp_path / "run"), "--check-determinism"]
+def replayed(command: str, program: str, folder: Path, asked: str = "--check-determinism") -> dict[str, Any]:
+    """Return the check `replay` of a run of a program, which is also made again; the verdicts agree."""
+    done = vnet(command, "--duration", "1", "--program", program, "--out", str(folder), asked)
+    written = json.loads((folder / "verdict.json").read_text())
+    assert written["reproduce"].endswith(asked)
+    assert done.returncode == check_run(folder).exit_status, done.stderr
+    replay: dict[str, Any] = next(check for check in written["checks"] if check["name"] == "replay")
+    assert (written["verdict"] == "invalid") == (replay["verdict"] == "invalid")
+    return replay
+
+
+def vnet(command: str, *options: str) -> subprocess.CompletedProcess[str]:
+    arguments = [sys.executable, "-P", "-m", "emulator.cli", command, "scenarios/beacon.toml", *options]
     environment = {**os.environ, "PYTHONHASHSEED": "0"}  # it need not start itself anew for that
-    done = subprocess.run(
-        [*command, *options], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+    return subprocess.run(arguments, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+
+
+@pytest.mark.parametrize("command", ["simulate", "run"])
+def test_a_deterministic_program_agrees_in_all_layouts(tmp_path: Path, command: str) -> None:
+    replay = replayed(command, f"{__name__}:sends_a_set_of_texts", tmp_path / "run")
+    assert replay["verdict"] == "valid"
+    assert all(way in replay["text"] for way in ("2 processes", "without windows", "at other addresses"))
+    assert ("live" in replay["text"]) == (command == "simulate")
+
+
+@pytest.mark.parametrize("command", ["simulate", "run"])
+@pytest.mark.parametrize("program", [sends_a_set_of_objects, throws_dice])
+def test_a_nondeterministic_program_is_found_with_frame_vehicle_and_line(
+    tmp_path: Path, command: str, program: Callable[[Node], Awaitable[None]]
+) -> None:
+    replay = replayed(command, f"{__name__}:{program.__name__}", tmp_path / "run")
+    assert replay["verdict"] == "invalid"
+    lines, first = inspect.getsourcelines(program)
+    sends = first + next(i for i, line in enumerate(lines) if "broadcast" in line)
+    assert f"test_replay.py:{sends}" in replay["figures"]["call"]
+    assert replay["figures"]["frame"].endswith(replay["figures"]["vehicle"])
+    assert program is not throws_dice or replay["figures"]["vehicle"] == "v02"
+
+
+def test_another_hash_seed_is_a_note_and_no_verdict(tmp_path: Path) -> None:
+    replay = replayed(
+        "simulate", f"{__name__}:sends_a_set_of_texts", tmp_path / "run", "--check-determinism=portable"
     )
-    assert done.returncode == status, done.stderr
-    written = json.loads((tmp_path / "run" / "verdict.json").read_text())
-    replay = next(check for check in written["checks"] if check["name"] == "replay")
-    assert (written["verdict"] == "invalid", replay["verdict"] == "invalid") == (status == 1, status == 1)
-    assert written["reproduce"].endswith("--check-determinism")
-    assert check_run(tmp_path / "run").exit_status == status
+    assert replay["verdict"] == "valid"
+    assert "hash seed" in replay["text"] and "two runs differ" in replay["text"]
 
 
 def test_in_real_time_no_two_runs_are_compared(tmp_path: Path) -> None:
-    command = [sys.executable, "-P", "-m", "emulator.cli", "run", "scenarios/beacon.toml"]
-    options = ["--pacing", "realtime", "--out", str(tmp_path / "run"), "--check-determinism"]
-    done = subprocess.run([*command, *options], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = vnet("run", "--pacing", "realtime", "--out", str(tmp_path / "run"), "--check-determinism")
     assert done.returncode == 2
     assert "use --pacing lockstep" in done.stderr

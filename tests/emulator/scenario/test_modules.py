@@ -40,7 +40,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     before = list(sys.path)
     yield tmp_path
     sys.path[:] = before
-    for name in [name for name in sys.modules if name.startswith("pp_")]:
+    for name in [name for name in sys.modules if name.startswith(("pp_", "pp "))]:
         del sys.modules[name]
 
 
@@ -231,3 +231,16 @@ def test_agents_of_a_live_run_are_told_the_folders(tmp_path: Path, monkeypatch: 
     launcher.start_agents("tcp/127.0.0.1:1", Access.create("run", [["v01"]]), [["v01"]])
     (arguments,) = [words for _, words, *_ in started]
     assert arguments[-4:] == ["--path", str(tmp_path / "a b"), "--path", str(tmp_path)]
+
+
+def test_a_file_name_may_have_blanks(here: Path) -> None:
+    program(here / "pp my prog.py", b"blank")
+    status, said = simulate("scenarios/own.toml", "--program", "pp my prog.py", "--out", "run")
+    assert status == 0, said
+    again = load_scenario(here / "run" / "scenario.toml")
+    assert again.program.entry == "pp my prog:main"
+    assert RecordedRun.open(here / "run").scenario.program.entry == again.program.entry
+    status, said = simulate("run/scenario.toml", "--out", "again")
+    assert status == 0, said
+    digests = [json.loads((here / each / "verdict.json").read_text())["trace_sha256"] for each in ("run", "again")]
+    assert digests[0] == digests[1]

@@ -344,3 +344,9 @@ def test_what_may_have_been_meant(word: object, meant: str) -> None:
 def test_a_key_with_several_types_is_named_without_them() -> None:
     with pytest.raises(ScenarioError, match=r"network\.driven\.speed_mps = -1: "):
         load_scenario(Path("beacon"), ["network.kind=driven", "network.driven.speed_mps=-1"])
+
+
+def test_a_file_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text("[network]\nvehicles = 7\n", encoding="utf-8-sig")
+    assert load_scenario(path).network.vehicles == 7

@@ -74,3 +74,11 @@ async def northerner(node: Node) -> None:
     async for fix in node.gnss:
         assert fix.position_m[1] > fix.position_m[0], "too far south-east"
         await node.radio.broadcast(b"here")
+
+
+async def sends_a_set(node: Node) -> None:
+    """Send in the order of a set of objects, which is that of their addresses."""
+    async for _ in node.gnss:
+        first, second = object(), object()
+        for each in {first, second}:
+            await node.radio.broadcast(b"1" if each is first else b"2")

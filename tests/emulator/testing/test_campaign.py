@@ -82,6 +82,39 @@ def test_a_program_that_crashes_under_pause_is_found_and_shrunk(tmp_path: Path) 
     assert "vnet simulate" in text
 
 
+def test_after_a_fix_a_campaign_says_whether_it_is_credible(tmp_path: Path) -> None:
+    status, said = run(Plan.of(planted("growing"), "none", 1, seed=1, shrink_steps=0), tmp_path / "before")
+    assert status == 1 and "once it is fixed, 59 runs without a failure" in said
+    fixed, plan = io.StringIO(), Plan.of(planted("impatient"), "none", 2, seed=5)
+    assert run_campaign(plan, tmp_path / "after", Console(width=200, file=fixed), before=tmp_path / "before") == 0
+    assert "in 1 of 1 runs before, and in none of 2 now: a fix is credible from 59 runs on" in fixed.getvalue()
+    with pytest.raises(VnetError, match="cannot be read"):
+        run_campaign(plan, tmp_path / "other", Console(quiet=True), before=tmp_path / "nowhere")
+
+
+def test_a_campaign_finds_a_nondeterministic_program_if_asked(tmp_path: Path) -> None:
+    folder = tmp_path / "campaign"
+    status, _ = run(Plan.of(planted("sends_a_set"), "none", 1, seed=1), tmp_path / "unasked")
+    assert status == 0
+    plan = Plan.of(planted("sends_a_set"), "none", 1, seed=1, shrink_steps=3, check_determinism=True)
+    status, _ = run(plan, folder)
+    assert status == 1
+    (row,) = results_of(folder)
+    assert list(row["failed"]) == ["replay"]
+    assert "programs.py:" in row["failed"]["replay"]
+    test = (Path(row["folder"]) / TEST_FILE).read_text()
+    assert "twice=True" in test
+    assert list(failures(Path(row["folder"]) / "scenario.toml", tmp_path / "again", 60, twice=True)) == ["replay"]
+    assert "--check-determinism" in (folder / "campaign.html").read_text()
+
+
+def test_a_deterministic_program_passes_a_campaign_that_compares(tmp_path: Path) -> None:
+    plan = Plan.of(planted("proud"), "kill,loss,pause", 2, seed=1, check_determinism=True)
+    pool = TrialPool(60.0, plan.scenario, twice=True)
+    assert "replay" not in pool.run_anywhere(plan.draw(0)).failed
+    pool.close()
+
+
 def test_on_an_executor_a_campaign_finds_the_same(tmp_path: Path) -> None:
     plan = Plan.of(planted("impatient"), "pause", 1, seed=1, shrink_steps=1)
     quiet = Console(quiet=True)

@@ -1,15 +1,19 @@
 """The runs of a campaign are drawn from its seed, with time for faults; failures of one kind are one line."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from emulator.checks.judge import Verdict
 from emulator.report.index import write_index
+from emulator.scenario.fault_draws import Drawn
+from emulator.scenario.faults import KINDS, Delay, GnssJump
 from emulator.scenario.scenario import Scenario, load_scenario
 from emulator.testing.campaign_plan import Plan
 from emulator.testing.failure_kinds import FailureKind, failure_kinds
 from emulator.testing.matrix import count_verdicts, page
+from emulator.testing.schedules import parse_ranges, simulated_kinds
 from tests.support.paths import ROOT
 from vnet.errors import ScenarioError
 
@@ -109,3 +113,52 @@ def test_the_list_of_runs_has_the_campaigns(tmp_path: Path) -> None:
 
 def test_a_list_without_campaigns_says_nothing_of_them(tmp_path: Path) -> None:
     assert "Campaigns" not in write_index(tmp_path).read_text()
+
+
+def test_a_campaign_draws_from_other_ranges_if_asked() -> None:
+    ranges = parse_ranges(["delay.delay_ms=1000..2000", "gnss_jump.offset_m=-100..-60"])
+    plan = Plan.of(scenario(2.0, 0.5), "delay,gnss_jump", 40, seed=1, ranges=ranges)
+    drawn = [fault for number in range(40) for fault in plan.draw(number).fault]
+    delays = [fault.delay_ms for fault in drawn if isinstance(fault, Delay)]
+    jumps = [number for fault in drawn if isinstance(fault, GnssJump) for number in fault.offset_m]
+    assert delays and all(1000 <= delay <= 2000 for delay in delays) and max(delays) > 1500
+    assert jumps and all(-100 <= jump <= -60 for jump in jumps)
+
+
+def test_the_ranges_of_the_kinds_are_what_is_drawn_without_others() -> None:
+    plain = Plan.of(scenario(2.0, 0.5), "random", 10, seed=1)
+    same = [f"{kind}.{key}={law.bounds[0]}..{law.bounds[1]}" for kind, key, law in all_ranges()]
+    asked = Plan.of(scenario(2.0, 0.5), "random", 10, seed=1, ranges=parse_ranges(same))
+    assert same
+    assert [plain.draw(number) for number in range(10)] == [asked.draw(number) for number in range(10)]
+
+
+def all_ranges() -> list[tuple[str, str, Drawn]]:
+    return [(kind, key, law) for kind in simulated_kinds() for key, law in KINDS[kind].drawn_ranges().items()]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("delay=1..2", "KIND.KEY=LOW..HIGH"),
+        ("delay.delay_ms=5", "KIND.KEY=LOW..HIGH"),
+        ("rain.mm=1..2", "must be one of"),
+        ("delay.at_s=1..2", "draws delay_ms"),
+        ("kill.nodes=1..2", "draws no parameter"),
+        ("loss.probability=0.1..1.5", "probability"),
+        ("loss.probability=0.15..0.5", "multiples of 0.1"),
+        ("delay.delay_ms=2..1", "the lower one first"),
+        ("delay.delay_ms=0..1", "delay_ms"),
+    ],
+)
+def test_a_range_that_cannot_be_drawn_is_refused(text: str, told: str) -> None:
+    with pytest.raises(ScenarioError, match=re.escape(told)):
+        parse_ranges([text])
+
+
+def test_the_reference_has_each_range_that_is_drawn() -> None:
+    text = (ROOT / "docs" / "reference" / "faults.md").read_text().partition("## What a campaign draws")[2]
+    for kind, key, law in all_ranges():
+        low, high = law.bounds
+        row = next(line for line in text.splitlines() if line.startswith(f"| `{kind}` "))
+        assert f"`{key}` {low:g} to {high:g} " in row

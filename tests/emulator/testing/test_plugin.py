@@ -278,6 +278,44 @@ def test_live_and_simulated_and_replayed_are_one_run(pytester: pytest.Pytester) 
     assert "restarted" in (again / "events.jsonl").read_text()
 
 
+def test_an_order_is_the_same_when_it_is_reproduced(pytester: pytest.Pytester) -> None:
+    result = run_tests(
+        pytester,
+        """
+async def test_order(vnet_emulation):
+    changes = {"run.order": "pct", "run.order_depth": 5, "radio.delivery_tick_us": 1000}
+    changes["program"] = "tests.support.window_programs:improvises"
+    async with vnet_emulation(TWELVE, vehicles=4, duration=1, **changes) as emu:
+        await emu.run_until(0.5)
+""",
+    )
+    result.assert_outcomes(passed=1)
+    (folder,) = (pytester.path.parent / "basetemp").glob("**/vnet-1")
+    again = pytester.path / "again"
+    command = [sys.executable, "-P", "-m", "emulator.cli", "simulate", str(folder / "scenario.toml")]
+    subprocess.run([*command, "--out", str(again)], cwd=ROOT, capture_output=True, check=False, timeout=120)
+    first, second = verdict_of(folder), verdict_of(again)
+    assert first["trace_sha256"] == second["trace_sha256"]
+    tapes = [(each / "tape.jsonl").read_text() for each in (folder, again)]
+    assert tapes[0] == tapes[1] and len(tapes[0].splitlines()) > 1
+
+
+def test_a_live_run_whose_program_cannot_be_imported_is_refused_before_it_starts(
+    pytester: pytest.Pytester,
+) -> None:
+    result = run_tests(
+        pytester,
+        """
+async def test_live(vnet_emulation):
+    async with vnet_emulation(BEACON, vehicles=2, program="nothing:main", live=True):
+        pass
+""",
+    )
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*ProgramError: program.entry = 'nothing:main': cannot import*"])
+    assert not list((pytester.path.parent / "basetemp").glob("**/vnet-1"))
+
+
 def test_the_plugin_is_installed_with_vnet() -> None:
     text = (ROOT / "pyproject.toml").read_text()
     assert '[project.entry-points.pytest11]\nvnet = "emulator.testing.plugin"' in text

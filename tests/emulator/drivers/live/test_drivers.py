@@ -179,6 +179,25 @@ def test_in_lockstep_a_process_that_does_not_yield_ends_the_run_with_its_stack(
     in_virtual_time(run(), monkeypatch)
 
 
+def test_in_lockstep_a_refused_yield_is_told_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def run() -> None:
+        def answer(node: str, message: Any) -> wire.AgentMessage | None:
+            said = yields(node, message)
+            if isinstance(said, wire.Yield) and message.time_ns == 200 * MS and node == "v02":
+                return replace(said, seq=said.seq + 7)
+            return said
+
+        play = Play(LockstepDriver, answer)
+        with pytest.raises(Stalled):
+            await play.driver.run()
+        (stalled,) = [event for event in play.stage.emulation.folder.events if event.kind == "stalled"]
+        (refused,) = [event for event in play.stage.emulation.folder.events if event.kind == "refused"]
+        assert stalled.node == refused.node == "v02"
+        assert stalled.details["refused"] == refused.details["reason"]
+
+    in_virtual_time(run(), monkeypatch)
+
+
 def test_in_lockstep_a_process_whose_instants_go_on_has_not_stalled(monkeypatch: pytest.MonkeyPatch) -> None:
     async def run() -> None:
         asked: list[int] = []
