@@ -24,7 +24,7 @@ import pyarrow as pa
 from emulator.cells.programs import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
-from emulator.checks.properties import PERIOD, Effect, Predicate, always, eventually, leads_to, never
+from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_further
 from emulator.drivers.emulation import Emulation
@@ -269,12 +269,18 @@ class RunHarness:
         self._promise(name or _name_of(predicate), judge)
 
     def leads_to(
-        self, cause: Predicate, effect: Effect, *, within_s: float, name: str | None = None, at: str = PERIOD
+        self,
+        cause: Predicate,
+        effect: Effect,
+        *,
+        within_s: float,
+        name: str | None = None,
+        at: str = ANY,
+        effect_at: str | None = None,
     ) -> None:
         """Promise that each cause is followed by an effect within so many seconds; see `properties.leads_to`."""
-        self._promise(
-            name or _name_of(effect), partial(leads_to, cause=cause, effect=effect, within_s=within_s, at=at)
-        )
+        judge = partial(leads_to, cause=cause, effect=effect, within_s=within_s, at=at, effect_at=effect_at)
+        self._promise(name or _name_of(effect), judge)
 
     def _promise(self, name: str, judge: Callable[..., Result]) -> None:
         if self._judgement is not None:
