@@ -13,9 +13,9 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.records.paper_values import paper_rmse
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import unpack
+from emulator.stream.messages import event_message, unpack
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
@@ -433,6 +433,21 @@ def test_events_in_words() -> None:
     event = {"node": "v03", "kind": "fault_started", "details": {"nodes": '["v01", "v02"]', "log": "x" * 99}}
     assert in_words(event) == f"v03 fault started: nodes v01, v02, log {'x' * 59}…"
     assert in_words({"node": None, "kind": "interrupted", "details": {}}) == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("details", "words"),
+    [
+        ({"member": "v01", "late_s": 0.5, "heard": ["v02"]}, "v02 suspect: member v01, late_s 0.5, heard v02"),
+        ({}, "v02 suspect"),
+        ({"why": "a: b"}, "v02 suspect: why a: b"),
+    ],
+)
+def test_events_of_programs_in_words(details: dict[str, object], words: str) -> None:
+    event = Event(0, "event", "v02", {"name": "suspect", "details": details})
+    assert in_words(event_message(event)) == words
+    long = Event(0, "event", "v02", {"name": "suspect", "details": {"text": "x" * 9999}})
+    assert in_words(event_message(long)).startswith("v02 suspect: text: xxx")
 
 
 def test_lengths() -> None:
