@@ -214,14 +214,18 @@ def _check_within(name: str, within_s: float) -> None:
         raise VnetError(f"{name}: within_s = {within_s!r}: 0 or more seconds are needed")
 
 
-def _ask(name: str, predicate: Callable[..., object], *moments: Moment) -> bool | None:
-    """Return the answer of a predicate; None also where a moment has no value that the predicate reads.
+def _ask(
+    name: str, predicate: Callable[..., object], *moments: Moment, missing: set[str] | None = None
+) -> bool | None:
+    """Return the answer of a predicate; None also where a moment has no value that it reads.
 
-    Numbers, as programs report them, are true or false as in Python.
+    `missing` gets the name of that value. Numbers, as programs report them, are true or false as in Python.
     """
     try:
         answer = predicate(*moments)
-    except NoValue:
+    except NoValue as error:
+        if missing is not None:
+            missing.add(error.args[0])
         return None
     if answer is None or isinstance(answer, bool | np.bool_ | int | float | np.number):
         return None if answer is None else bool(answer)
@@ -229,13 +233,15 @@ def _ask(name: str, predicate: Callable[..., object], *moments: Moment) -> bool 
 
 
 def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> Result:
-    answers = [(moment, _ask(name, predicate, moment)) for moment in moments(run, at)]
+    missing: set[str] = set()
+    answers = [(moment, _ask(name, predicate, moment, missing=missing)) for moment in moments(run, at)]
     asked = [(moment, held) for moment, held in answers if held is not None]
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:
         return _failed(run, name, failed, "does not hold" if wanted else "holds", of=len(asked))
     if not asked:
-        return Result(name, "unknown", "the predicate had nothing to say at any moment")
+        values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
+        return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")
     of = f"{len(asked):,} of " if len(asked) < len(answers) else ""
     text = f"{'true' if wanted else 'false'} at {of}{counted(len(answers), 'moment')}"
     return Result(name, "valid", text, {"moments": len(asked)})

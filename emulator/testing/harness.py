@@ -140,7 +140,7 @@ class RunHarness:
             return
         judgement = await asyncio.to_thread(self.end)
         promised = {PREFIX + name for name in self._promises} - self._named
-        broken = [each for each in judgement.checks if each.name in promised and each.verdict is Verdict.INVALID]
+        broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]
         if broken:
             raise AssertionError(self._complaint(broken))
 
@@ -246,8 +246,9 @@ class RunHarness:
     def always(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
         """Promise that a predicate is true at every moment (`emulator.checks.properties.always`).
 
-        A broken promise fails the test when its block is left, if no `check` has before. Raises VnetError for a
-        name that has been taken, and once the run has ended; so do the other promises.
+        A promise that is broken, or unknown because nothing was seen of it, fails the test when its block is left,
+        if no `check` has named it before. Raises VnetError for a name that has been taken, and once the run has
+        ended; so do the other promises.
         """
         self._promise(name or _name_of(predicate), partial(always, predicate=predicate, at=at))
 

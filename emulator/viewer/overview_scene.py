@@ -230,7 +230,7 @@ def in_words(event: Mapping[str, Any]) -> str:
         return drawable(f"{event['node']}: {event['details'].get('text', '')}")
     what, told = event["kind"].replace("_", " "), event["details"]
     if event["kind"] == "event":  # of a program, which has named it
-        what, told = told.get("name", what), _as_map(told.get("details"))
+        what, told = _short(told.get("name", what)), _as_map(told.get("details"))
     details = [f"{key} {_short(value)}".rstrip() for key, value in told.items()]
     who = f"{event['node']} " if event["node"] else ""
     return drawable(f"{who}{what}: {', '.join(details)}" if details else f"{who}{what}")

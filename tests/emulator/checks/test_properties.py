@@ -194,7 +194,7 @@ def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty:
         "does not hold: first of v02 at 0.5 s (10 of 60 in all)"
     )
     assert always(faulty, "reports", lambda m: "dead" in m).verdict == "invalid"
-    assert always(faulty, "typing error", lambda m: m["daed"] <= 1).verdict == "unknown"
+    assert always(faulty, "typing error", lambda m: m["no_such"] <= 1).verdict == "unknown"
 
 
 def test_a_test_promises_what_follows_a_fault_that_it_injects(tmp_path: Path) -> None:
@@ -290,5 +290,7 @@ def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: 
     with pytest.raises(AssertionError, match="own:same is invalid: does not hold: first of v01 at 0 s"):
         asyncio.run(story("broken", twice))
     asyncio.run(story("kept", lambda emu: emu.always(lambda moment: True, name="kept")))
+    with pytest.raises(AssertionError, match=r"own:typo is unknown: .*: none has a value 'no_such'"):
+        asyncio.run(story("typo", lambda emu: emu.always(lambda moment: moment["no_such"] >= 0, name="typo")))
     with pytest.raises(VnetError, match="own:wrong: the predicate raised ZeroDivisionError: division by zero"):
         asyncio.run(story("raises", lambda emu: emu.always(lambda moment: bool(1 / 0), name="wrong")))
