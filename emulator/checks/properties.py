@@ -1,8 +1,9 @@
 """Properties over time of a finished run: what is always, never or finally true, and what follows what.
 
 A predicate is asked at each *moment*: once for each vehicle and period in which it is in the network, and at each
-event. It answers True, False, or None where it has nothing to say. Each function returns a `Result`, for a check of
-one's own; a failure says when, who, and what had happened to the vehicle before.
+event. It answers True, False, or None where it has nothing to say. A moment that has no value of a name that the
+predicate reads, as a vehicle that is down, is skipped. Each function returns a `Result`, for a check of one's own;
+a failure says when, who, and what had happened to the vehicle before.
 """
 
 from __future__ import annotations
@@ -23,16 +24,22 @@ from vnet.units import NS_PER_S
 
 MOST_TOLD = 10
 """Failures whose time and vehicle are told."""
-PERIOD, EVENT = "period", "event"
+PERIOD, EVENT, ANY = "period", "event", "any"
+FAULT_EVENTS = ("fault_started", "fault_ended")
 _ROUNDING_S = 1e-9
+
+
+class NoValue(KeyError):
+    """A moment has no value of this name."""
 
 
 @dataclass(frozen=True)
 class Moment:
     """One vehicle at one time: at a period's start, or at an event of it.
 
-    `values` has, by name, what it reported (`m["speed_m_s"]`; None if it did not) and, of a period, the columns of
-    states, with the truth: `position_m`, `common_error_m` …; of an event its details.
+    `values` has, by name, what it reported (`m["speed_m_s"]`) and, of a period, the columns of states, with the
+    truth: `position_m`, `common_error_m` …; of an event its details. `fault_started` and `fault_ended` are events
+    of each node on which the fault acted when it started, with `fault`, its label, and `kind`.
     """
 
     time_ns: int
@@ -52,9 +59,18 @@ class Moment:
         return self.time_ns / NS_PER_S
 
     def __getitem__(self, name: str) -> Any:
-        """Return a value, or None where there is none."""
+        """Return a value. Raises NoValue where there is none: the property then skips the moment."""
+        if name not in self:
+            raise NoValue(name)
+        return self.values[name]
+
+    def __contains__(self, name: str) -> bool:
+        return self.get(name) is not None
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Return a value, or the default where there is none: the property then asks of the moment all the same."""
         value = self.values.get(name)
-        return None if isinstance(value, float) and math.isnan(value) else value
+        return default if value is None or (isinstance(value, float) and math.isnan(value)) else value
 
 
 Predicate = Callable[[Moment], bool | None]
@@ -63,27 +79,38 @@ Effect = Callable[[Moment, Moment], bool | None]
 
 
 def moments(run: Run, at: str = PERIOD) -> list[Moment]:
-    """Return the moments of a run in the order of time: `at` each "period", or each "event".
+    """Return the moments of a run in the order of time: `at` each "period", each "event", or "any" of both.
 
     Raises VnetError for another `at`.
     """
-    if at == EVENT:
-        return sorted(_events(run), key=lambda moment: moment.time_ns)
-    if at != PERIOD:
-        raise VnetError(f"at = {at!r}: must be {PERIOD!r} or {EVENT!r}")
-    rows = run.states.to_pylist()
-    there = (row for row in rows if not np.isnan(row["position_m"]).any())
-    return [Moment(row["time_ns"], row["node"], values=row) for row in there]
+    if at not in (PERIOD, EVENT, ANY):
+        raise VnetError(f"at = {at!r}: must be {PERIOD!r}, {EVENT!r} or {ANY!r}")
+    periods = _periods(run) if at != EVENT else ()
+    events = _events(run) if at != PERIOD else ()
+    return sorted([*events, *periods], key=lambda moment: moment.time_ns)
+
+
+def _periods(run: Run) -> Iterator[Moment]:
+    for row in run.states.to_pylist():
+        if not np.isnan(row["position_m"]).any():
+            yield Moment(row["time_ns"], row["node"], values=row)
 
 
 def _events(run: Run) -> Iterator[Moment]:
+    kinds = {f"{fault.title}-{number}": fault.kind for number, fault in enumerate(run.scenario.fault)}
+    affected: dict[str, list[str]] = {}
     for event in run.events:
-        if event.node is not None:
+        if event.kind in FAULT_EVENTS:
+            label, nodes = str(event.details.get("fault")), event.details.get("nodes")
+            affected.setdefault(label, nodes if isinstance(nodes, list) else [])
+            for node in affected[label]:
+                yield Moment(event.time_ns, node, event.kind, {"fault": label, "kind": kinds.get(label)})
+        elif event.node is not None:
             yield Moment(event.time_ns, event.node, event.name, event.values)
 
 
 def always(run: Run, name: str, predicate: Predicate, at: str = PERIOD) -> Result:
-    """Judge that a predicate is true at every moment; unknown if it has nothing to say at any.
+    """Judge that a predicate is true at every moment that has the values that it reads; unknown if none has.
 
     Raises VnetError for a predicate that answers anything but True, False or None; so do the other functions.
     """
@@ -115,7 +142,7 @@ def eventually(
     for moment in present if at == PERIOD else moments(run, at):
         waited_s = moment.time_s - entered_s.get(moment.node, math.inf)
         asked = moment.node not in reached and waited_s <= within_s + _ROUNDING_S
-        if asked and _answer(name, predicate(moment)):
+        if asked and _ask(name, predicate, moment):
             reached[moment.node] = waited_s
     end_s = _end_ns(run) / NS_PER_S
     late = [
@@ -145,17 +172,17 @@ def leads_to(
     effect: Effect,
     within_s: float,
     *,
-    at: str = PERIOD,
+    at: str = ANY,
     effect_at: str | None = None,
 ) -> Result:
     """Judge that each moment at which `cause` is true is followed, within so many seconds, by one of `effect`.
 
     `effect(moment, cause)` is given both moments: it says whether they belong together, for example
     `moment.node == cause.node`. A cause less than `within_s` before the end of the run counts only if its effect
-    came. `effect_at` says at what moments effects are looked for, by default those of causes.
+    came. `at` says at what moments causes are looked for, `effect_at` the same of effects, by default as `at`.
     """
     _check_within(name, within_s)
-    causes = [moment for moment in moments(run, at) if _answer(name, cause(moment))]
+    causes = [moment for moment in moments(run, at) if _ask(name, cause, moment)]
     effects = moments(run, effect_at or at)
     times_ns = np.array([moment.time_ns for moment in effects], dtype=np.int64)
     end_ns = _end_ns(run)
@@ -163,7 +190,7 @@ def leads_to(
     failed, delays_s = [], []
     for moment in causes:
         first, last = np.searchsorted(times_ns, [moment.time_ns, moment.time_ns + within_ns + 1])
-        found = next((each for each in effects[first:last] if _answer(name, effect(each, moment))), None)
+        found = next((each for each in effects[first:last] if _ask(name, effect, each, moment)), None)
         if found is not None:
             delays_s.append(found.time_s - moment.time_s)
         elif math.isinf(within_s) or moment.time_ns + within_ns < end_ns:
@@ -188,22 +215,36 @@ def _check_within(name: str, within_s: float) -> None:
         raise VnetError(f"{name}: within_s = {within_s!r}: 0 or more seconds are needed")
 
 
-def _answer(name: str, answer: object) -> bool | None:
-    """Return what a predicate has answered; numbers, as programs report them, are true or false as in Python."""
+def _ask(
+    name: str, predicate: Callable[..., object], *moments: Moment, missing: set[str] | None = None
+) -> bool | None:
+    """Return the answer of a predicate; None also where a moment has no value that it reads.
+
+    `missing` gets the name of that value. Numbers, as programs report them, are true or false as in Python.
+    """
+    try:
+        answer = predicate(*moments)
+    except NoValue as error:
+        if missing is not None:
+            missing.add(error.args[0])
+        return None
     if answer is None or isinstance(answer, bool | np.bool_ | int | float | np.number):
         return None if answer is None else bool(answer)
     raise VnetError(f"{name}: the predicate answered {answer!r}: True, False or None is needed")
 
 
 def _held(run: Run, name: str, predicate: Predicate, at: str, wanted: bool) -> Result:
-    answers = ((moment, _answer(name, predicate(moment))) for moment in moments(run, at))
+    missing: set[str] = set()
+    answers = [(moment, _ask(name, predicate, moment, missing=missing)) for moment in moments(run, at)]
     asked = [(moment, held) for moment, held in answers if held is not None]
     failed = [moment for moment, held in asked if held is not wanted]
     if failed:
         return _failed(run, name, failed, "does not hold" if wanted else "holds", of=len(asked))
     if not asked:
-        return Result(name, "unknown", "the predicate had nothing to say at any moment")
-    text = f"{'true' if wanted else 'false'} at {counted(len(asked), 'moment')}"
+        values = "".join(f": none has a value {value!r}" for value in sorted(missing)[:1])
+        return Result(name, "unknown", f"the predicate had nothing to say at any moment{values}")
+    of = f"{len(asked):,} of " if len(asked) < len(answers) else ""
+    text = f"{'true' if wanted else 'false'} at {of}{counted(len(answers), 'moment')}"
     return Result(name, "valid", text, {"moments": len(asked)})
 
 

@@ -21,7 +21,7 @@ from emulator.cli.options import (
     RunArgument,
 )
 from emulator.drivers.control import read_control_file
-from emulator.records.run_files import check_is_run
+from emulator.records.run_files import check_is_finished, check_is_run
 from emulator.records.run_folder import RECORDING
 from emulator.terminal.console import one_line_errors
 from emulator.viewer.sinks import (
@@ -51,6 +51,7 @@ def view(
         check_is_run(run)
         recording = run / RECORDING
         if not recording.exists() or not recording.stat().st_size:
+            check_is_finished(run)
             raise VnetError(f"{run}: has no {RECORDING}: make one of its files with vnet render {run}")
         if not is_closed(recording):
             recording = repair(recording)

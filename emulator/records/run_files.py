@@ -151,7 +151,7 @@ class RunFiles:
         if path.exists():
             return self._read(path, lambda: RecordedWorld.read(path))
         if self.record.format > 1:
-            raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {WORLD_FILE} in it")
+            raise not_finished(self.folder, WORLD_FILE)
         try:
             return RecordedWorld.of(build_world(load_scenario(self.folder / SCENARIO_FILE)))
         except ScenarioError as error:
@@ -240,8 +240,9 @@ class RunFiles:
         try:
             return read()
         except FileNotFoundError:
-            kind = "the folder of a finished run" if is_run_folder(self.folder) else "a run's folder"
-            raise VnetError(f"{self.folder}: not {kind}: there is no {path.name} in it") from None
+            if is_run_folder(self.folder):
+                raise not_finished(self.folder, path.name) from None
+            raise VnetError(f"{self.folder}: not a run's folder: there is no {path.name} in it") from None
         except OSError as error:
             raise VnetError(f"{path}: cannot be read: {error.strerror or error}") from None
         except (ValueError, pa.ArrowException) as error:
@@ -257,7 +258,7 @@ class RunFiles:
                 raise VnetError(f"{path}: cannot be read: not a regular file")
             if unkept := [line for line in self._unkept() if Path(line.partition(": ")[0]).name == name]:
                 raise VnetError(f"{self.folder}: its {VERDICT_FILE} says: not kept: {unkept[0]}")
-            raise VnetError(f"{self.folder}: not the folder of a finished run: there is no {name} in it")
+            raise not_finished(self.folder, name)
         wanted = self._columns.get(name)
         names = None if wanted is None else [*wanted, *self._columns_beside(path, wanted)]
         file = self._read(path, lambda: open_table(path, names))
@@ -323,6 +324,22 @@ def check_is_run(folder: Path) -> None:
     """Raise VnetError if the folder has no scenario, and so is not a run's."""
     if not (folder / SCENARIO_FILE).is_file():
         raise VnetError(f"{folder}: not a run's folder: there is no {SCENARIO_FILE} in it")
+
+
+def check_is_finished(folder: Path) -> None:
+    """Raise VnetError if the folder is that of a run without a verdict: it is on, or was killed."""
+    if (folder / SCENARIO_FILE).is_file() and not (folder / VERDICT_FILE).exists():
+        raise not_finished(folder, VERDICT_FILE)
+
+
+def not_finished(folder: Path, name: str) -> VnetError:
+    """Return the error for a run's folder without a file that the end of a run writes; it says what to do."""
+    text = f"{folder}: not the folder of a finished run: there is no {name} in it"
+    scenario = folder / SCENARIO_FILE
+    if (folder / VERDICT_FILE).exists() or not scenario.is_file():
+        return VnetError(text)
+    again = f"vnet run {shlex.quote(str(scenario))}"
+    return VnetError(f"{text}: it is on, or was killed, which leaves no tables; {again} makes the run again")
 
 
 def _parse_events(path: Path, content: bytes) -> list[Event]:

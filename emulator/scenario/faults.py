@@ -227,7 +227,7 @@ class Duplicate(LinkFault):
 
 
 class Corrupt(LinkFault):
-    """Some frames arrive with bytes changed."""
+    """Some frames arrive with bytes changed, which tests software: on the air such frames fail their FCS."""
 
     campaign_weight: ClassVar[int] = 2
 

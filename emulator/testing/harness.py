@@ -24,7 +24,7 @@ import pyarrow as pa
 from emulator.cells.programs import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
-from emulator.checks.properties import PERIOD, Effect, Predicate, always, eventually, leads_to, never
+from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
 from emulator.drivers.attachment import LiveOptions
 from emulator.drivers.conclude import conclude, judge_further
 from emulator.drivers.emulation import Emulation
@@ -147,7 +147,7 @@ class RunHarness:
             return
         judgement = await asyncio.to_thread(self.end)
         promised = {PREFIX + name for name in self._promises} - self._named
-        broken = [each for each in judgement.checks if each.name in promised and each.verdict is Verdict.INVALID]
+        broken = [each for each in judgement.checks if each.name in promised and _fails(each, allow_unknown=False)]
         if broken:
             raise AssertionError(self._complaint(broken))
 
@@ -253,8 +253,9 @@ class RunHarness:
     def always(self, predicate: Predicate, *, name: str | None = None, at: str = PERIOD) -> None:
         """Promise that a predicate is true at every moment (`emulator.checks.properties.always`).
 
-        A broken promise fails the test when its block is left, if no `check` has before. Raises VnetError for a
-        name that has been taken, and once the run has ended; so do the other promises.
+        A promise that is broken, or unknown because nothing was seen of it, fails the test when its block is left,
+        if no `check` has named it before. Raises VnetError for a name that has been taken, and once the run has
+        ended; so do the other promises.
         """
         self._promise(name or _name_of(predicate), partial(always, predicate=predicate, at=at))
 
@@ -276,12 +277,18 @@ class RunHarness:
         self._promise(name or _name_of(predicate), judge)
 
     def leads_to(
-        self, cause: Predicate, effect: Effect, *, within_s: float, name: str | None = None, at: str = PERIOD
+        self,
+        cause: Predicate,
+        effect: Effect,
+        *,
+        within_s: float,
+        name: str | None = None,
+        at: str = ANY,
+        effect_at: str | None = None,
     ) -> None:
         """Promise that each cause is followed by an effect within so many seconds; see `properties.leads_to`."""
-        self._promise(
-            name or _name_of(effect), partial(leads_to, cause=cause, effect=effect, within_s=within_s, at=at)
-        )
+        judge = partial(leads_to, cause=cause, effect=effect, within_s=within_s, at=at, effect_at=effect_at)
+        self._promise(name or _name_of(effect), judge)
 
     def _promise(self, name: str, judge: Callable[..., Result]) -> None:
         if self._judgement is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -224,13 +225,25 @@ class OverviewScene:
 
 
 def in_words(event: Mapping[str, Any]) -> str:
-    """An event in a line: `v03 died: how SIGKILL`."""
+    """An event in a line: `v03 died: how SIGKILL`, `v02 suspects: member v01`."""
     if event["kind"] == "log":
         return drawable(f"{event['node']}: {event['details'].get('text', '')}")
-    details = [f"{key} {_short(value)}" for key, value in event["details"].items()]
+    what, told = event["kind"].replace("_", " "), event["details"]
+    if event["kind"] == "event":  # of a program, which has named it
+        what, told = _short(told.get("name", what)), _as_map(told.get("details"))
+    details = [f"{key} {_short(value)}".rstrip() for key, value in told.items()]
     who = f"{event['node']} " if event["node"] else ""
-    what = event["kind"].replace("_", " ")
     return drawable(f"{who}{what}: {', '.join(details)}" if details else f"{who}{what}")
+
+
+def _as_map(details: object) -> Mapping[str, Any]:
+    """Return what a program has told of its event; in one piece where the message was too long for all of it."""
+    try:
+        told = json.loads(str(details))
+    except ValueError:
+        told = {"": details}
+    known = told if isinstance(told, dict) else {}
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in known.items()}
 
 
 def _short(value: object) -> str:

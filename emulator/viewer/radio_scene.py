@@ -129,8 +129,13 @@ class RadioScene:
             self._charts(period)
 
     def _stack(self, period: Period) -> None:
-        """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back."""
-        times_ns = (period.time_ns + self._period_ns * np.arange(2 * STROKES) // (2 * STROKES)).tolist()
+        """Frames by outcome, one layer on the other: each is a line from its lower to its upper bound and back.
+
+        The line ends with the period: joined to the next one, which has another number of frames, it would be seen
+        as frames of this outcome.
+        """
+        points = 2 * STROKES + 1
+        times_ns = (period.time_ns + self._period_ns * np.arange(points) // points).tolist()
         lower = 0.0
         for outcome, colour in OUTCOME_COLOURS.items():
             count = period.message["outcomes"].get(outcome.name, 0)
@@ -141,9 +146,8 @@ class RadioScene:
                     names=outcome.title, colors=[colour], widths=[2.5], aggregation_policy="MinMax"
                 )
                 self._canvas.log(entity, style, static=True)
-            if entity in self._announced:
-                layer = [lower, lower + count] * STROKES if count else [np.nan]
-                self._canvas.plot_at(entity, times_ns[: len(layer)], layer)
+            if count:
+                self._canvas.plot_at(entity, times_ns, [lower, lower + count] * STROKES + [np.nan])
             lower += count
 
     def _load(self, period: Period) -> None:

@@ -361,7 +361,10 @@ def repair(path: Path) -> Path:
         raise VnetError(f"{path}: was not closed, and cannot be repaired: {last}")
     repaired = repaired_path(path)
     if _is_empty(repaired):
+        from emulator.records.run_files import check_is_finished  # tables are slow to import
+
         repaired.unlink()
+        check_is_finished(path.parent)
         raise VnetError(
             f"{path}: was not closed, and there is nothing in it: vnet render {path.parent} rebuilds it"
         )

@@ -20,6 +20,7 @@ import pytest
 from emulator.cli.commands import app
 from emulator.drivers.control import ask, control_endpoint
 from emulator.drivers.status import Snapshot
+from emulator.scenario.scenario import load_scenario
 from emulator.terminal.console import run_app
 from tests.support.paths import ROOT
 from tests.support.screen import Screen
@@ -77,6 +78,8 @@ def test_a_picture_is_shown_and_the_summary_follows_on_a_clean_screen(tmp_path: 
     shown = on_screen(written)
     first, second = shown.splitlines()[:2]
     assert first == "beacon: lockstep, seed 1, 3 s of emulated time"
+    twelve = load_scenario(ROOT / "scenarios" / "twelve.toml").run
+    assert f"`twelve: lockstep, seed 1, {twelve.duration_s:g} s of emulated time`" in DOCS
     assert second.startswith("verdict: valid  checks: ")
     assert "lockstep · seed" not in shown
     assert f"files        {tmp_path}" in shown

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -131,12 +131,98 @@ def test_a_cause_near_the_end_counts_only_if_its_effect_came(run: Run) -> None:
     assert last.verdict == "unknown", last
 
 
+async def counts_the_dead(node: Node) -> None:
+    """Report the number of vehicles that were heard once, and not for 0.25 s."""
+    heard_s: dict[str, float] = {}
+    async for fix in node.gnss:
+        now_s = fix.time_ns / 1e9
+        await node.radio.broadcast(node.id.encode())
+        heard_s |= {packet.sender: now_s for packet in node.radio.drain()}
+        node.report(fix.position_m, dead=sum(now_s - last_s > 0.25 for last_s in heard_s.values()))
+
+
+def fault_scenario() -> dict[str, Any]:
+    """v02 is killed from 0.5 s to 1.5 s; a loss without losses acts on all from 0.3 s to 0.4 s."""
+    return {
+        "run": {"duration_s": 2.0, "settle_s": 0.0},
+        "network": {"vehicles": 3},
+        "radio": {"range_m": 1e6},
+        "fault": [
+            {"kind": "kill", "at_s": 0.5, "duration_s": 1.0, "nodes": {"ids": ["v02"]}},
+            {"kind": "loss", "probability": 0.0, "at_s": 0.3, "duration_s": 0.1},
+        ],
+    }
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    program = "tests.emulator.checks.test_properties:counts_the_dead"
+    return simulate(fault_scenario(), program=program, out=tmp_path_factory.mktemp("run") / "run")
+
+
+def kill(moment: Moment) -> bool:
+    return moment.event == "fault_started" and bool(moment["kind"] == "kill")
+
+
+def dead(moment: Moment, cause: Moment) -> bool:
+    return bool(moment.node != cause.node and moment["dead"] >= 1)
+
+
+def test_a_fault_is_an_event_of_each_of_its_nodes(faulty: Run) -> None:
+    told = [
+        (m.time_s, m.node, m.event, m["kind"], m["fault"])
+        for m in moments(faulty, "event")
+        if m.event in ("fault_started", "fault_ended")
+    ]
+    loss = [(0.3, "fault_started", "loss", "loss-1"), (0.4, "fault_ended", "loss", "loss-1")]
+    on_v02 = [(0.5, "v02", "fault_started", "kill", "kill-0"), (1.5, "v02", "fault_ended", "kill", "kill-0")]
+    assert told == [(t, node, *rest) for t, *rest in loss for node in ("v01", "v02", "v03")] + on_v02
+
+
+def test_a_fault_leads_to_a_reported_value(faulty: Run) -> None:
+    found = leads_to(faulty, "dead", kill, dead, within_s=1.0)
+    assert (found.verdict, found.figures) == ("valid", {"slowest_s": pytest.approx(0.3)})
+    late = leads_to(faulty, "dead", kill, dead, within_s=0.2)
+    assert late.text == "was not followed within 0.2 s: first of v02 at 0.5 s, event fault_started"
+    assert leads_to(faulty, "dead", kill, dead, 1.0, at="event", effect_at="period").verdict == "valid"
+    assert leads_to(faulty, "dead", kill, dead, 1.0, at="event").verdict == "invalid", "no event has that value"
+
+
+def test_moments_without_the_value_are_skipped_unless_they_are_asked_for(faulty: Run) -> None:
+    assert always(faulty, "few", lambda m: m["dead"] <= 1).text == "true at 50 of 60 moments"
+    assert never(faulty, "some", lambda m: m["dead"] > 1).verdict == "valid"
+    assert always(faulty, "none", lambda m: m["dead"] == 0).verdict == "invalid"
+    assert always(faulty, "reports", lambda m: m.get("dead") is not None).text == (
+        "does not hold: first of v02 at 0.5 s (10 of 60 in all)"
+    )
+    assert always(faulty, "reports", lambda m: "dead" in m).verdict == "invalid"
+    assert always(faulty, "typing error", lambda m: m["no_such"] <= 1).verdict == "unknown"
+
+
+def test_a_test_promises_what_follows_a_fault_that_it_injects(tmp_path: Path) -> None:
+    scenario = make_scenario(
+        fault_scenario() | {"fault": []}, {"program": "tests.emulator.checks.test_properties:counts_the_dead"}
+    )
+
+    async def story() -> None:
+        async with RunHarness(scenario, tmp_path / "run") as emu:
+            emu.leads_to(kill, dead, within_s=1.0)
+            emu.always(lambda m: m["dead"] <= 1, name="few")
+            await emu.run_until(0.5)
+            with emu.fault("kill", nodes=["v02"]):
+                await emu.run_until(1.5)
+            await emu.run_until(2.0)
+            emu.check("own:dead", "own:few")
+
+    asyncio.run(story())
+
+
 def test_moments_are_periods_or_events(run: Run) -> None:
     assert len(moments(run)) == 80
     events = moments(run, "event")
     assert [moment.event for moment in events if moment.node == "v01"] == ["braked"]
     assert next(m for m in events if m.event == "braked")["force"] == 0.8
-    with pytest.raises(VnetError, match="at = 'second': must be 'period' or 'event'"):
+    with pytest.raises(VnetError, match="at = 'second': must be 'period', 'event' or 'any'"):
         moments(run, "second")
 
 
@@ -206,6 +292,8 @@ def test_a_promise_that_is_broken_fails_its_test_though_no_check_asks(tmp_path: 
     with pytest.raises(AssertionError, match="own:same is invalid: does not hold: first of v01 at 0 s"):
         asyncio.run(story("broken", twice))
     asyncio.run(story("kept", lambda emu: emu.always(lambda moment: True, name="kept")))
+    with pytest.raises(AssertionError, match=r"own:typo is unknown: .*: none has a value 'no_such'"):
+        asyncio.run(story("typo", lambda emu: emu.always(lambda moment: moment["no_such"] >= 0, name="typo")))
     with pytest.raises(VnetError, match="own:wrong: the predicate raised ZeroDivisionError: division by zero"):
         asyncio.run(story("raises", lambda emu: emu.always(lambda moment: bool(1 / 0), name="wrong")))
 
@@ -219,5 +307,5 @@ def test_events_of_a_run_and_moments_of_a_property_are_named_alike() -> None:
         ("crashed", {"error": "tired"}),
         ("", {}),
     ]
-    run = cast(Run, SimpleNamespace(events=[own, vnets, foreign]))
+    run = cast(Run, SimpleNamespace(events=[own, vnets, foreign], scenario=SimpleNamespace(fault=[])))
     assert [(m.name, m.values) for m in moments(run, "event")] == [(e.name, e.values) for e in run.events]

@@ -152,3 +152,23 @@ def test_playing_can_be_ended_at_any_time(watched: Watched, end: signal.Signals)
         until(process, "playing")
         process.send_signal(end)
         assert process.wait(30) == 0
+
+
+def test_nothing_asks_to_render_a_run_that_was_killed(watched: Watched, tmp_path: Path) -> None:
+    for name in ("scenario.toml", "events.jsonl"):
+        shutil.copy(watched.folder / name, tmp_path)
+    again = f"vnet run {tmp_path / 'scenario.toml'} makes the run again\n"
+    for command in ("view", "render", "play"):
+        status, told = vnet(command, tmp_path)
+        assert status == 2 and told.endswith(again) and told.count("\n") == 1, told
+    recording = tmp_path / "recording.rrd"
+    shutil.copy(watched.folder / "live.rrd", recording)
+    with recording.open("r+b") as file:
+        file.truncate(150)  # nothing but its name
+    assert vnet("view", tmp_path)[1].endswith(again)
+
+
+def test_view_says_how_to_make_a_recording_of_a_finished_run(watched: Watched, tmp_path: Path) -> None:
+    for name in ("scenario.toml", "events.jsonl", "verdict.json"):
+        shutil.copy(watched.folder / name, tmp_path)
+    assert vnet("view", tmp_path)[1].endswith(f"make one of its files with vnet render {tmp_path}\n")

@@ -13,9 +13,9 @@ from emulator.drivers.observers import Messages
 from emulator.drivers.simulate import simulate
 from emulator.radio.outcomes import Outcome
 from emulator.records.paper_values import paper_rmse
-from emulator.records.run_folder import RunFolder
+from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.stream.messages import unpack
+from emulator.stream.messages import event_message, unpack
 from emulator.viewer.drawing import (
     OUTCOME_COLOURS,
     Canvas,
@@ -196,9 +196,9 @@ def test_layers_of_the_stack_are_as_thick_as_there_were_frames(told: Told, entit
             count = period.message["outcomes"].get(outcome.name, 0)
             if count:
                 lines = entities[f"/radio/frames/{outcome.name}"].at["Scalars:scalars"]
-                step_s = 0.1 / (2 * STROKES)
-                drawn = [v for t, (v,) in lines.items() if -1e-6 < t - period.time_s < 0.1 - step_s / 2]
-                assert sorted(set(drawn)) == [lower, lower + count]
+                drawn = [v for t, (v,) in sorted(lines.items()) if -1e-6 < t - period.time_s < 0.1 - 1e-6]
+                assert drawn[:-1] == [lower, lower + count] * STROKES
+                assert np.isnan(drawn[-1]), "no line joins it to another period"
                 seen.add(outcome)
             lower += count
         assert lower == period.pairs[:, 3].sum()
@@ -433,6 +433,21 @@ def test_events_in_words() -> None:
     event = {"node": "v03", "kind": "fault_started", "details": {"nodes": '["v01", "v02"]', "log": "x" * 99}}
     assert in_words(event) == f"v03 fault started: nodes v01, v02, log {'x' * 59}…"
     assert in_words({"node": None, "kind": "interrupted", "details": {}}) == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("details", "words"),
+    [
+        ({"member": "v01", "late_s": 0.5, "heard": ["v02"]}, "v02 suspect: member v01, late_s 0.5, heard v02"),
+        ({}, "v02 suspect"),
+        ({"why": "a: b"}, "v02 suspect: why a: b"),
+    ],
+)
+def test_events_of_programs_in_words(details: dict[str, object], words: str) -> None:
+    event = Event(0, "event", "v02", {"name": "suspect", "details": details})
+    assert in_words(event_message(event)) == words
+    long = Event(0, "event", "v02", {"name": "suspect", "details": {"text": "x" * 9999}})
+    assert in_words(event_message(long)).startswith("v02 suspect: text: xxx")
 
 
 def test_lengths() -> None:
