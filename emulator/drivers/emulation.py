@@ -250,6 +250,7 @@ class Emulation:
         details: dict[str, Any] = {}
         if ending.error:
             details = {"error": ending.error, "where": ending.details}
+            details |= {"place": ending.place} if ending.place else {}
         self._program_over(time_ns, ending.node, ending.kind, details)
 
     def died(self, time_ns: int, node: str, **details: Any) -> None:

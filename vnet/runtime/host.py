@@ -33,7 +33,7 @@ from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.unhandled import UnhandledExceptions
+from vnet.runtime.unhandled import UnhandledExceptions, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
@@ -292,13 +292,13 @@ class Host:
         gnss = [node.id for node in self.nodes.values() if node.gnss.inbox.waiting]
         return wire.Yield(nonce, seq, next_timer_ns, radio, gnss, *self._window.take_steps())
 
-    def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
+    def end(self, node: str, kind: str, error: str = "", details: str = "", place: str = "") -> None:
         """Record that a node's program is over, and cancel what it left running."""
         if not self._active[node]:
             return
         self._active[node] = False
         self.nodes[node].radio.forget_results()
-        self._outbox.endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        self._outbox.endings.append(wire.Ending(node, kind, error, details, place))  # type: ignore[arg-type]
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         for task in self._tasks_of(self.nodes[node]):
             if task is not asyncio.current_task(self._loop):
@@ -344,7 +344,8 @@ class Host:
         if isinstance(error, SystemExit) and not error.code:
             self._over(node, "finished")
         elif self._runs(node) and not self._closing:
-            self._over(node, "crashed", error_line(error), "".join(traceback.format_exception(error)[-30:]))
+            details = "".join(traceback.format_exception(error)[-30:])
+            self._over(node, "crashed", error_line(error), details, own_line(error))
         else:
             self._unhandled.add(node, error, "in main")
 
@@ -426,9 +427,9 @@ class Host:
         else:
             self._over(node, "finished")
 
-    def _over(self, node: Node, kind: str, error: str = "", details: str = "") -> None:
+    def _over(self, node: Node, kind: str, error: str = "", details: str = "", place: str = "") -> None:
         if self.nodes[node.id] is node:  # and not what is left of an earlier incarnation
-            self.end(node.id, kind, error, details)
+            self.end(node.id, kind, error, details, place)
 
     def _new_task(
         self,

@@ -105,6 +105,8 @@ class Ending(msgspec.Struct, frozen=True, array_like=True):
     kind: Literal["finished", "crashed", "spun"]
     error: str = ""
     details: str = ""
+    place: str = ""
+    """File and line of the program at which it ended, if that is known."""
 
 
 class Unhandled(msgspec.Struct, frozen=True, array_like=True):
