@@ -14,6 +14,7 @@ from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
 from vnet.runtime.mail import Mail
+from vnet.runtime.process_end import caught
 from vnet.runtime.programs import Programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
@@ -98,7 +99,7 @@ class HostedPrograms:
 
     def run(self) -> None:
         """From the first grant to the last. Raises KeyboardInterrupt."""
-        with output_kept(self._owns, self._logs):
+        with output_kept(self._owns, self._logs), caught(self._host.process_ended):
             asyncio.set_event_loop(self.loop)
             try:
                 self._run()

@@ -14,6 +14,8 @@ from collections.abc import Collection
 from contextlib import suppress
 from typing import NoReturn
 
+from vnet.runtime.process_end import exit_now
+
 
 def end_forked(status: int, shared: Collection[str]) -> NoReturn:
     """End this process with `status`, and leave the objects of the modules named in `shared` as they are.
@@ -30,4 +32,4 @@ def end_forked(status: int, shared: Collection[str]) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):  # closed, none, or without a reader
             stream.flush()
-    os._exit(status)
+    exit_now(status)

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import contextvars
 import logging
+import threading
 import traceback
 import weakref
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -32,8 +33,9 @@ from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
+from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
-from vnet.runtime.unhandled import UnhandledExceptions, own_line
+from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
@@ -83,7 +85,12 @@ class Host:
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
         self._left: list[asyncio.Task[Any]] = []
-        self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)), on_line)
+        self._fallback = next(iter(self.nodes))
+        self._unhandled = UnhandledExceptions(self._raised_ns, self._fallback, on_line)
+        self._lock = threading.Lock()
+        self._thread = threading.get_ident()
+        self._calls: list[tuple[Node, str, str]] = []
+        """Calls by which programs have ended their process, with the line of each."""
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -243,6 +250,7 @@ class Host:
 
     def take_final(self) -> wire.Traffic:
         """Return what the emulator has not been told when the process ends: exceptions and notes."""
+        self._take_process_ends()
         return self._window.take_final(self.take_traffic())
 
     # Windows (lockstep).
@@ -266,6 +274,8 @@ class Host:
 
         Returns None if there is none before the end of the window. Packets that nobody awaits make no instant.
         """
+        if self._calls:
+            self._take_process_ends()
         if self._stopped_ns:
             self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
@@ -304,6 +314,27 @@ class Host:
             if task is not asyncio.current_task(self._loop):
                 task.cancel()
         self._on_traffic()
+
+    def process_ended(self, node: Node | None, call: str) -> None:
+        """Have the vehicle die that has ended its process by `call`, from any thread (simulated).
+
+        What it has enqueued before stays; nothing of it goes further.
+        """
+        with self._lock:
+            self._calls.append((self.nodes[self._fallback] if node is None else node, call, line_of_caller()))
+        if threading.get_ident() == self._thread:
+            self._take_process_ends()
+
+    def _take_process_ends(self) -> None:
+        while self._calls:
+            with self._lock:
+                node, call, place = self._calls.pop(0)
+            if self._runs(node) and not self._closing:
+                self.end(node.id, "died", call, place=place)
+                for task in self._tasks_of(node):
+                    task.cancel()
+            elif node.id in self.nodes:
+                self._unhandled.add(node, ProcessEndedError(call), f"as it ended ({place})")
 
     def _tasks_of(self, node: Node) -> list[asyncio.Task[Any]]:
         return [task for task, owner in list(self._tasks.items()) if owner is node and not task.done()]

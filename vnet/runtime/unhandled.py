@@ -14,7 +14,7 @@ import sysconfig
 import threading
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.current_node import current_node
 from vnet.runtime.outside_loop import Job, collector
+from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import error_line, leaves
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
@@ -99,7 +100,8 @@ class UnhandledExceptions:
 
     def add(self, owner: Node, error: BaseException, place: str) -> None:
         """Take an exception that has just been caught outside asyncio."""
-        self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
+        if not isinstance(error, KeyboardInterrupt):
+            self._tell(_Failure(_nothing, self._now_ns(owner), owner, place), error)
 
     @property
     def has_any(self) -> bool:
@@ -224,7 +226,11 @@ class UnhandledExceptions:
         return _Failure(_nothing, self._now_ns(owner), owner, "in a future")
 
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
-        if failure.owner not in self._silenced and not isinstance(error, KeyboardInterrupt):
+        if not isinstance(error, KeyboardInterrupt | ProcessEndedError):  # whose vehicle's death has been told
+            self._tell(failure, error)
+
+    def _tell(self, failure: _Failure, error: BaseException) -> None:
+        if failure.owner not in self._silenced:
             unhandled = self._of(failure, error)
             with self._lock:
                 self._ready.append(unhandled)
@@ -243,7 +249,16 @@ def own_line(error: BaseException) -> str:
     leaf = leaves(error)[0]
     traces = [each.__traceback__ for each in ([error, leaf] if leaf is not error else [leaf])]
     frames = [frame for trace in traces for frame in traceback.walk_tb(trace)]
-    lines = [(frame.f_code.co_filename, number) for frame, number in frames]
+    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames])
+
+
+def line_of_caller() -> str:
+    """Return file and line of the innermost frame of the present stack that is the program's own."""
+    frames = traceback.walk_stack(None)
+    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames][::-1])
+
+
+def _own_of(lines: Sequence[tuple[str, int]]) -> str:
     own = [line for line in lines if not line[0].startswith(_NOT_THE_PROGRAM)] or lines
     return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
 

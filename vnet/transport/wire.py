@@ -99,10 +99,10 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
-    """The end of a node's program: it returned, raised, or never let time advance (`details` has the stack)."""
+    """The end of a node's program: it returned, raised, never let time advance (`details` has the stack), or died."""
 
     node: str
-    kind: Literal["finished", "crashed", "spun"]
+    kind: Literal["finished", "crashed", "spun", "died"]
     error: str = ""
     details: str = ""
     place: str = ""
