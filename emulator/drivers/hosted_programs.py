@@ -10,6 +10,7 @@ from emulator.drivers.program_output import output_kept
 from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node
+from vnet.runtime import running_node
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
@@ -77,7 +78,7 @@ class HostedPrograms:
         self._seq = 0
         self.only_programs_raise: Callable[[], bool] = lambda: True
         self.loop = VirtualTimeLoop(self._exchange, welcomes[0].spin_limit)
-        self.meter = CpuMeter()
+        self.meter = CpuMeter(shown=running_node.running)
         if folder.is_open:  # else nobody asks what programs have cost
             self.loop.measure(self.meter)
         self._logs = NodeLogs(folder.logs)
@@ -106,6 +107,7 @@ class HostedPrograms:
             finally:
                 asyncio.set_event_loop(None)
                 self.loop.close()
+                running_node.running.show("")
                 self._host.discard_abandoned()
                 if (ordered := self._host.mail.ordered) is not None:
                     self.order_steps = ordered.steps

@@ -29,7 +29,9 @@ def failure_kinds(failures: Iterable[tuple[str, Mapping[str, str]]]) -> list[Fai
         of_this_run: dict[tuple[str, str], FailureKind] = {}
         for check, text in texts.items():
             column = column_of(check)[0]
-            of_this_run.setdefault((column, _NUMBERS.sub(lambda part: part[1] or "#", text)), FailureKind(column, text, number))
+            of_this_run.setdefault(
+                (column, _NUMBERS.sub(lambda part: part[1] or "#", text)), FailureKind(column, text, number)
+            )
         for key, kind in of_this_run.items():
             before = kinds.get(key)
             kinds[key] = kind if before is None else replace(before, runs=before.runs + 1)

@@ -7,7 +7,6 @@ so far: at the end of a run all agents at once would need several times the memo
 from __future__ import annotations
 
 import atexit
-import os
 import sys
 import threading
 from collections.abc import Collection

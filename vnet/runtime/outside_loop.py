@@ -119,7 +119,7 @@ def _start_new_noted(function: Callable[..., object], *arguments: Any) -> int:
 
 
 class Job(Future[Any]):
-    """A job that a program has given to an executor itself; `is_awaited` once anybody asks, or waits, for its end."""
+    """A job that a program has given to an executor itself; `is_awaited` once anybody asks for its end."""
 
     is_awaited = False
 

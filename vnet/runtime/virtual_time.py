@@ -103,7 +103,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         return _TellingFuture(loop=self)
 
     def set_exception_handler(self, handler: Callable[[Any, dict[str, Any]], object] | None) -> None:
-        """Set the handler of what the node leaves unhandled on whose behalf this is called; other nodes keep theirs."""
+        """Set the handler of what the node leaves unhandled on whose behalf this is called; others keep theirs."""
         if (node := current_node.get()) is None:
             super().set_exception_handler(handler)
         elif handler is not None and not callable(handler):

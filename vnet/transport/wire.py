@@ -99,7 +99,7 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
-    """The end of a node's program: it returned, raised, never let time advance (`details` has the stack), or died."""
+    """The end of a program: it returned, raised, died, or did not let time advance (`details`: the stack)."""
 
     node: str
     kind: Literal["finished", "crashed", "spun", "died"]
