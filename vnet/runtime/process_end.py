@@ -70,7 +70,8 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
         call = f"os.{name}({', '.join([*map(repr, args[:1]), *(f'{key}={options[key]!r}' for key in options)])})"
         node = present_node()
         if _is_programs_own:
-            _end_as_death(node, call)
+            status = args[0] if name == "_exit" and args and isinstance(args[0], int) else 0
+            _end_as_death(node, call, status)
         if not _takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
             return original(*args, **options)
         for taker in tuple(_takers):
@@ -80,7 +81,7 @@ def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
     return end
 
 
-def _end_as_death(node: Node | None, call: str) -> NoReturn:
+def _end_as_death(node: Node | None, call: str, status: int) -> NoReturn:
     sys.stderr.write(f"vnet-agent: the program of {'a vehicle' if node is None else node.id} called {call}\n")
     sys.stderr.flush()
-    exit_now(DEATH_STATUS)
+    exit_now(status or DEATH_STATUS)
