@@ -16,7 +16,7 @@ import typer
 
 from vnet.errors import ProgramError, VnetError
 from vnet.runtime import interrupts
-from vnet.runtime.die_with_parent import signal_at_parent_death
+from vnet.runtime.die_with_parent import STARTED_BY_VNET, signal_at_parent_death
 from vnet.runtime.environment import fix_hash_seed, open_standard_descriptors, use_same_arithmetic
 from vnet.runtime.program_path import search_programs_in
 
@@ -91,9 +91,9 @@ def agent(
 
     interrupts.raise_from_now_on()
     faulthandler.register(signal.SIGUSR1)
-    # An emulator that is killed cannot continue the agents that it has paused; once continued, they find that they
-    # are orphans, and end.
-    signal_at_parent_death(signal.SIGCONT)
+    # An emulator, or host, that is killed takes along the agents that it has started, also those that are paused or
+    # in a busy loop. Agents that were started by hand find that they are orphans, and end.
+    signal_at_parent_death(signal.SIGKILL if os.environ.get(STARTED_BY_VNET) else signal.SIGCONT)
     _leave_terminal()
     _pass_breakpoints()
     search_programs_in(path or ())

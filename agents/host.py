@@ -22,6 +22,7 @@ from vnet.runtime.disks import Disks
 from vnet.runtime.forced_end import end_within
 from vnet.runtime.host import Host
 from vnet.runtime.mail import Mail
+from vnet.runtime.process_end import count_as_death
 from vnet.runtime.programs import Programs, load_programs
 from vnet.runtime.virtual_time import SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.transport import lateness, wire
@@ -68,6 +69,7 @@ def run_agent(
         stack.callback(end_within)
         set_time_slice(COMPUTING_SLICE_NS)
         welcomes = attachment.join(join_timeout_s)
+        count_as_death()
         try:
             programs = load_programs(welcomes)
         except ProgramError as error:

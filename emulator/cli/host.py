@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import typer
 
 from emulator.terminal.console import one_line_errors
 from vnet.errors import TransportError, VnetError
+from vnet.runtime.die_with_parent import STARTED_BY_VNET, signal_at_parent_death
 
 NO_EMULATOR = 3
 """Exit status of a host that was refused or has lost the emulator, as that of `vnet-agent`."""
@@ -55,6 +57,8 @@ def host(
         for each in (run, name):
             if not is_segment(each):
                 raise VnetError(f"{each!r}: names are letters, digits, '_', '.', '-', at most 64")
+        if os.environ.get(STARTED_BY_VNET):
+            signal_at_parent_death(signal.SIGKILL)
         quiet_zenoh()
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:

@@ -249,7 +249,8 @@ class Emulation:
     def _end(self, time_ns: int, ending: wire.Ending) -> None:
         details: dict[str, Any] = {}
         if ending.error:
-            details = {"error": ending.error, "where": ending.details}
+            details = {"how" if ending.kind == "died" else "error": ending.error, "where": ending.details}
+            details |= {"place": ending.place} if ending.place else {}
         self._program_over(time_ns, ending.node, ending.kind, details)
 
     def died(self, time_ns: int, node: str, **details: Any) -> None:

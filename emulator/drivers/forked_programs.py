@@ -24,10 +24,13 @@ from typing import Any, NamedTuple, NoReturn, TextIO
 from msgspec.structs import replace
 
 from emulator.drivers.hosted_programs import Changes, HostedPrograms, RunOverError, Turn
+from emulator.drivers.launch import Exit
 from emulator.records.run_folder import RunFolder
 from vnet.errors import VnetError
+from vnet.runtime import running_node
 from vnet.runtime.die_with_parent import signal_at_parent_death
 from vnet.runtime.programs import Programs, error_line
+from vnet.runtime.running_node import RunningNode
 from vnet.transport import wire
 from vnet.transport.backbone import MessageRef
 
@@ -39,6 +42,10 @@ class Ended(NamedTuple):
     cpu_ns: Mapping[str, int]
     wake_ups: Mapping[str, int]
     order_steps: Mapping[str, int]
+
+
+class ProcessDiedError(VnetError):
+    """A process has ended before its time. Its text says how, and which node's program ran."""
 
 
 class _Said(NamedTuple):
@@ -72,6 +79,7 @@ class ForkedPrograms:
     """The process of these nodes, at its parent's side. Raises VnetError if there can be none.
 
     `others` are those that have been forked before. In the process `detach` lets go of what only its parent needs.
+    What its programs print is in their logs alone unless this process `prints` it.
     """
 
     def __init__(
@@ -81,10 +89,13 @@ class ForkedPrograms:
         folder: RunFolder,
         others: Sequence[ForkedPrograms],
         detach: Callable[[], None],
+        prints: bool = True,
     ) -> None:
+        self._prints = prints
         self._nodes = [welcome.node for welcome in welcomes]
         self.pid = 0
         """Its process id."""
+        self._running = RunningNode()
         self.owes = False
         """True while it has been given a turn that it has not answered."""
         self._is_gone = False
@@ -101,27 +112,25 @@ class ForkedPrograms:
         if self.pid == 0:
             for connection in (self._connection, *(other._connection for other in others)):
                 connection.close()  # so that each process sees when its other end is gone
+            running_node.running = self._running
             _be(its, welcomes, programs, folder, detach)
         its.close()
 
     def give(self, turn: Turn | None) -> None:
-        """Give it a turn; None says that the run is over. Raises VnetError if it has ended."""
+        """Give it a turn; None says that the run is over."""
         self.owes = True
-        try:
+        with suppress(OSError):  # it has ended, which `take` tells, or the error that it has raised before
             self._connection.send_bytes(pickle.dumps(None if turn is None else _Told.of(turn)))
-        except OSError:
-            self.take()  # an error that it has raised before its first turn
-            self._raise_ended()
 
     def take(self) -> Any:
-        """Wait for its answer: a yield, or `Ended`. Raises VnetError if it has ended, and what it has raised."""
+        """Wait for its answer: a yield, or `Ended`. Raises ProcessDiedError, and what it has raised."""
         try:
             said: _Said = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
             self._raise_ended()
         self.owes = False
         for stream, text in zip((sys.stdout, sys.stderr), said.printed, strict=True):
-            if text:
+            if text and self._prints:
                 _write(stream, text)
         if isinstance(said.answer, BaseException):
             raise said.answer
@@ -130,13 +139,9 @@ class ForkedPrograms:
     def _raise_ended(self) -> NoReturn:
         _, status = os.waitpid(self.pid, 0)
         self._is_gone = True
-        code = os.waitstatus_to_exitcode(status)
-        how = signal.Signals(-code).name if code < 0 else f"status {code}"
-        first, last = self._nodes[0], self._nodes[-1]
-        raise VnetError(
-            f"the process of {first} to {last} ended with {how} in the middle of the run; "
-            "what its programs printed last is in logs/ only"
-        ) from None
+        how = Exit(os.waitstatus_to_exitcode(status), "").how
+        node = self._running.read()
+        raise ProcessDiedError(f"{how}, while {node} ran" if node and len(self._nodes) > 1 else how) from None
 
     def close(self) -> None:
         """End it, whatever it does."""

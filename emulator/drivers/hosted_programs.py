@@ -10,10 +10,12 @@ from emulator.drivers.program_output import output_kept
 from emulator.records.node_logs import NodeLogs
 from emulator.records.run_folder import RunFolder
 from vnet.node import Node
+from vnet.runtime import running_node
 from vnet.runtime.cpu_meter import CpuMeter
 from vnet.runtime.disks import Disks
 from vnet.runtime.host import Host
 from vnet.runtime.mail import Mail
+from vnet.runtime.process_end import caught
 from vnet.runtime.programs import Programs
 from vnet.runtime.virtual_time import SpinError, VirtualTimeLoop
 from vnet.transport import wire
@@ -76,7 +78,7 @@ class HostedPrograms:
         self._seq = 0
         self.only_programs_raise: Callable[[], bool] = lambda: True
         self.loop = VirtualTimeLoop(self._exchange, welcomes[0].spin_limit)
-        self.meter = CpuMeter()
+        self.meter = CpuMeter(shown=running_node.running)
         if folder.is_open:  # else nobody asks what programs have cost
             self.loop.measure(self.meter)
         self._logs = NodeLogs(folder.logs)
@@ -98,13 +100,14 @@ class HostedPrograms:
 
     def run(self) -> None:
         """From the first grant to the last. Raises KeyboardInterrupt."""
-        with output_kept(self._owns, self._logs):
+        with output_kept(self._owns, self._logs), caught(self._host.process_ended):
             asyncio.set_event_loop(self.loop)
             try:
                 self._run()
             finally:
                 asyncio.set_event_loop(None)
                 self.loop.close()
+                running_node.running.show("")
                 self._host.discard_abandoned()
                 if (ordered := self._host.mail.ordered) is not None:
                     self.order_steps = ordered.steps

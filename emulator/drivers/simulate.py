@@ -14,13 +14,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
 from emulator.drivers.collector import rare_collections
 from emulator.drivers.emulation import Emulation, PeriodView, ProcessActions
-from emulator.drivers.forked_programs import Ended, ForkedPrograms
+from emulator.drivers.forked_programs import Ended, ForkedPrograms, ProcessDiedError
 from emulator.drivers.hosted_programs import NONCE, Changes, HostedPrograms, RunOverError, Turn
 from emulator.drivers.lockstep import Lockstep
 from emulator.drivers.memory import first_over
@@ -42,6 +42,7 @@ def simulate(
     on_interrupt: Callable[[], None] = lambda: None,
     debug: DebugTarget | None = None,
     processes: int = 1,
+    apart: str | None = None,
 ) -> tuple[float, bool]:
     """Run `emulation` to its end; returns the wall-clock seconds, and whether it was interrupted.
 
@@ -50,16 +51,23 @@ def simulate(
     `before_horizon` sets the barrier's horizon: it is called before time 0, and whenever the run is held there.
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
     a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program. With `processes` above 1 so
-    many processes run the programs, and not this one; VnetError is raised if one of them ends before its time.
+    many processes run the programs, and not this one; the vehicles of one that ends before its time have died.
+    `apart` is a vehicle that has ended the process of an earlier attempt: it has a process of its own, the others
+    have another, and what they print has been printed then.
     """
     node_ids = emulation.world.node_ids
     groups = split_evenly(node_ids, processes)
+    if apart is not None:
+        groups = [group for group in ([apart], [node for node in node_ids if node != apart]) if group]
     emulation.costs.processes = len(groups)
     stop = stop or threading.Event()
     barrier = _Barrier(emulation, groups, before_horizon, stop)
     search_programs_in(emulation.scenario.program.folders)
-    apart = len(groups) > 1
-    simulation = _Apart(emulation, barrier, groups) if apart else _Together(emulation, barrier, debug)
+    simulation: _Apart | _Together
+    if len(groups) > 1 or apart is not None:
+        simulation = _Apart(emulation, barrier, groups, prints=apart is None)
+    else:
+        simulation = _Together(emulation, barrier, debug)
     emulation.folder.event(0, "started", start_up_s=0.0)
     started = time.monotonic()
     interrupted = False
@@ -172,6 +180,14 @@ class _Barrier:
             grants = self._lockstep.step()
         return self._turns(grants)
 
+    def died(self, process_id: str, how: str) -> None:
+        """Take note that a process has ended before its time, and its nodes with it."""
+        self._lockstep.died(process_id, how=how)
+
+    def tell_deaths(self) -> None:
+        """Tell of the processes that have died since, where no turn follows."""
+        self._lockstep.tell_deaths()
+
     def _turns(self, grants: Mapping[str, wire.Grant]) -> dict[str, Turn]:
         for actions in self._lockstep.take_actions():
             for process_id, nodes in self._groups.items():
@@ -241,8 +257,10 @@ class _Apart:
 
     no_signal_raises: Callable[[], bool]
 
-    def __init__(self, emulation: Emulation, barrier: _Barrier, groups: Sequence[Sequence[str]]) -> None:
-        self._emulation, self._barrier = emulation, barrier
+    def __init__(
+        self, emulation: Emulation, barrier: _Barrier, groups: Sequence[Sequence[str]], prints: bool
+    ) -> None:
+        self._emulation, self._barrier, self._prints = emulation, barrier, prints
         self._welcomes = {nodes[0]: barrier.welcomes(nodes) for nodes in groups}
         self._programs = load_programs(each for welcomes in self._welcomes.values() for each in welcomes)
         self._processes: dict[str, ForkedPrograms] = {}
@@ -253,7 +271,7 @@ class _Apart:
         return self._barrier.now_ns
 
     def run(self) -> None:
-        """From the first grant to the last. Raises KeyboardInterrupt, and VnetError if a process ends."""
+        """From the first grant to the last. Raises KeyboardInterrupt."""
         processes = self._processes
         try:
             for process_id, welcomes in self._welcomes.items():
@@ -263,6 +281,7 @@ class _Apart:
                     self._emulation.folder,
                     others=list(processes.values()),
                     detach=self._emulation.driving.detach,
+                    prints=self._prints,
                 )
                 self._barrier.pids[process_id] = processes[process_id].pid
             self._grant_all()
@@ -280,15 +299,28 @@ class _Apart:
         while turns:
             for process_id, turn in turns.items():
                 self._processes[process_id].give(turn)
-            turns = self._barrier.go_on({process_id: self._processes[process_id].take() for process_id in turns})
+            yields = {process_id: self._take(process_id) for process_id in turns}
+            turns = self._barrier.go_on(
+                {process_id: each for process_id, each in yields.items() if each is not None}
+            )
+
+    def _take(self, process_id: str) -> Any:
+        """Return the answer of a process; None if it has ended before its time, and its vehicles have died."""
+        try:
+            return self._processes[process_id].take()
+        except ProcessDiedError as death:
+            self._barrier.died(process_id, str(death))
+            return None
 
     def _end(self, time_ns: int) -> None:
         """End all processes but those that are in the midst of a window, and take what they have left to say."""
         emulation = self._emulation
-        asked = [process for process in self._processes.values() if not process.owes]
-        for process in asked:
-            process.give(None)
-        ended: list[Ended] = [process.take() for process in asked]
+        asked = [process_id for process_id, process in self._processes.items() if not process.owes]
+        for process_id in asked:
+            self._processes[process_id].give(None)
+        answers: list[Ended | None] = [self._take(process_id) for process_id in asked]
+        ended = [each for each in answers if each is not None]
+        self._barrier.tell_deaths()
         emulation.take_final(time_ns, [each.final for each in ended])
         cpu_ns, wake_ups = Counter[str](), Counter[str]()
         for each in ended:

@@ -22,6 +22,7 @@ from typing import Protocol
 from emulator.drivers.process_group import has_ended, rest_of_group_ended, wait_until_ended
 from vnet.errors import VnetError
 from vnet.runtime import forking
+from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.runtime.environment import KEPT_MEMORY, SAME_ARITHMETIC
 from vnet.runtime.own_packages import foreign_on_path
 from vnet.transport.scheduling import default_time_slice
@@ -31,6 +32,7 @@ AGENT_ENVIRONMENT = {
     "PYTHONHASHSEED": "0",
     RUNTIME_VARIABLE: AGENT_RUNTIME,
     "PYTHONUNBUFFERED": "1",
+    STARTED_BY_VNET: "1",
     **KEPT_MEMORY,
 }
 LOCKSTEP_ENVIRONMENT = {**AGENT_ENVIRONMENT, RUNTIME_VARIABLE: LOCKSTEP_AGENT_RUNTIME}

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 from emulator.testing.matrix import column_of
 
-_NUMBERS = re.compile(r"\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
-"""Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted."""
+_NUMBERS = re.compile(r"(\.py:\d+)|\b0x[0-9a-f]+\b|\d+(?:[.,]\d+)*|'[^']*'")
+"""Parts of a text that differ from run to run: numbers, names of vehicles, and what is quoted; lines do not."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,9 @@ def failure_kinds(failures: Iterable[tuple[str, Mapping[str, str]]]) -> list[Fai
         of_this_run: dict[tuple[str, str], FailureKind] = {}
         for check, text in texts.items():
             column = column_of(check)[0]
-            of_this_run.setdefault((column, _NUMBERS.sub("#", text)), FailureKind(column, text, number))
+            of_this_run.setdefault(
+                (column, _NUMBERS.sub(lambda part: part[1] or "#", text)), FailureKind(column, text, number)
+            )
         for key, kind in of_this_run.items():
             before = kinds.get(key)
             kinds[key] = kind if before is None else replace(before, runs=before.runs + 1)

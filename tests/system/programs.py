@@ -179,3 +179,10 @@ async def cuts_its_host(node: Node) -> None:
         await node.radio.broadcast(b"here")
         if node.id == node.options["vehicle"] and fix.time_ns == 1_000_000_000:
             os.system("ip link set eth0 down")
+
+
+async def computes_for_ever(node: Node) -> None:
+    """Never yields, from half a second on."""
+    await asyncio.sleep(0.5)
+    while True:
+        pass

@@ -80,17 +80,23 @@ def test_an_interruption_before_the_start_is_as_clean(tmp_path: Path) -> None:
     assert check_run(folder).exit_status == 3
 
 
-def test_agents_that_lose_the_emulator_end_with_one_line(tmp_path: Path) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [[], ["--set", "run.start=spawn"], ["--hosts", "1"]],
+    ids=["forked", "spawned", "on hosts"],
+)
+def test_agents_end_with_an_emulator_that_is_killed_also_in_a_busy_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[str]
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where a host keeps the logs of its agents
     folder = tmp_path / "run"
-    with long_run(folder, "--set", "run.orphan_timeout_s=0.5") as process:
-        agents = running_agents(folder)
+    with long_run(folder, "--program", "tests.system.programs:computes_for_ever", *options) as process:
+        agents = running_agents(tmp_path)
         assert len(agents) == 3
         process.kill()
-        wait_for_exit(agents)
-    for log in sorted((folder / "logs").iterdir()):
-        first, *rest = log.read_text().splitlines()
-        assert first == f"{log.stem} is on its way"
-        assert rest == [f"vnet-agent: {log.stem}: the emulator has been gone for 0.5 s; ending"]
+        for pid in agents:
+            assert has_ended(pid, 2.0), f"process {pid} is still there"
 
 
 def test_a_killed_run_can_still_be_read(tmp_path: Path) -> None:

@@ -9,20 +9,23 @@ from collections.abc import Callable
 
 from vnet.runtime import asyncio_internals
 from vnet.runtime.current_node import current_node
+from vnet.runtime.running_node import RunningNode
 
 
 class CpuMeter:
     """CPU time that the callbacks of each node take, and the instants at which each is woken.
 
     `clock` gives the CPU time of the loop's thread in ns; what programs compute on other threads, as in executors,
-    is not in it. A callback belongs to the node in whose context it runs; one of nobody's is not counted.
+    is not in it. A callback belongs to the node in whose context it runs; one of nobody's is not counted. The
+    node whose callback runs is written down in `shown`.
     """
 
-    def __init__(self, clock: Callable[[], int] = time.thread_time_ns) -> None:
+    def __init__(self, clock: Callable[[], int] = time.thread_time_ns, shown: RunningNode | None = None) -> None:
         self._clock = clock
         self._running: str | None = None
         self._since_ns = 0
         self._awake: set[str] = set()
+        self._shown = shown or RunningNode()
         self.cpu_ns: Counter[str] = Counter()
         self.wake_ups: Counter[str] = Counter()
 
@@ -34,11 +37,13 @@ class CpuMeter:
         if node is not None:
             self._running, self._since_ns = node.id, now_ns
             self._awake.add(node.id)
+            self._shown.show(node.id)
 
     def end(self) -> None:
         """The loop looks for callbacks: none is running."""
         if self._running is not None:
             self._charge(self._clock())
+            self._shown.show("")
 
     def end_instant(self) -> None:
         """Nothing is left to do at this instant: count a wake-up of each node that has run."""

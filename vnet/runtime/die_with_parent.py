@@ -15,6 +15,8 @@ import threading
 import time
 
 PR_SET_PDEATHSIG = 1
+STARTED_BY_VNET = "VNET_ENDS_WITH_PARENT"
+"""Variable in the environment of agents, and of hosts, that an emulator or a host has started."""
 POLL_S = 0.5
 """Seconds between two looks for the parent, on systems that do not tell."""
 

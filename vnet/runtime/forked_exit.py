@@ -7,12 +7,13 @@ so far: at the end of a run all agents at once would need several times the memo
 from __future__ import annotations
 
 import atexit
-import os
 import sys
 import threading
 from collections.abc import Collection
 from contextlib import suppress
 from typing import NoReturn
+
+from vnet.runtime.process_end import exit_now
 
 
 def end_forked(status: int, shared: Collection[str]) -> NoReturn:
@@ -30,4 +31,4 @@ def end_forked(status: int, shared: Collection[str]) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with suppress(AttributeError, OSError, ValueError):  # closed, none, or without a reader
             stream.flush()
-    os._exit(status)
+    exit_now(status)

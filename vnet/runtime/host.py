@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import contextvars
 import logging
+import threading
 import traceback
 import weakref
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -32,9 +33,10 @@ from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
+from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
 from vnet.runtime.replay_probes import call_log, scattered_heap
-from vnet.runtime.unhandled import UnhandledExceptions
+from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
 from vnet.runtime.window import Window
 from vnet.transport import wire
@@ -85,7 +87,12 @@ class Host:
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
         self._left: list[asyncio.Task[Any]] = []
-        self._unhandled = UnhandledExceptions(self._raised_ns, next(iter(self.nodes)), on_line)
+        self._fallback = next(iter(self.nodes))
+        self._unhandled = UnhandledExceptions(self._raised_ns, self._fallback, on_line)
+        self._lock = threading.Lock()
+        self._thread = threading.get_ident()
+        self._calls: list[tuple[Node, str, str]] = []
+        """Calls by which programs have ended their process, with the line of each."""
 
     def _node(self, welcome: wire.Welcome) -> Node:
         return Node(
@@ -247,6 +254,7 @@ class Host:
 
     def take_final(self) -> wire.Traffic:
         """Return what the emulator has not been told when the process ends: exceptions and notes."""
+        self._take_process_ends()
         return self._window.take_final(self.take_traffic())
 
     # Windows (lockstep).
@@ -272,6 +280,8 @@ class Host:
 
         Returns None if there is none before the end of the window. Packets that nobody awaits make no instant.
         """
+        if self._calls:
+            self._take_process_ends()
         if self._stopped_ns:
             self._settle_stopped()
         (window := self._window).end_instant(self._clock(), self.take_traffic())
@@ -298,18 +308,39 @@ class Host:
         gnss = [node.id for node in self.nodes.values() if node.gnss.inbox.waiting]
         return wire.Yield(nonce, seq, next_timer_ns, radio, gnss, *self._window.take_steps())
 
-    def end(self, node: str, kind: str, error: str = "", details: str = "") -> None:
+    def end(self, node: str, kind: str, error: str = "", details: str = "", place: str = "") -> None:
         """Record that a node's program is over, and cancel what it left running."""
         if not self._active[node]:
             return
         self._active[node] = False
         self.nodes[node].radio.forget_results()
-        self._outbox.endings.append(wire.Ending(node, kind, error, details))  # type: ignore[arg-type]
+        self._outbox.endings.append(wire.Ending(node, kind, error, details, place))  # type: ignore[arg-type]
         self._on_line(node, f"{node} {kind}\n{details}".rstrip())
         for task in self._tasks_of(self.nodes[node]):
             if task is not asyncio.current_task(self._loop):
                 task.cancel()
         self._on_traffic()
+
+    def process_ended(self, node: Node | None, call: str) -> None:
+        """Have the vehicle die that has ended its process by `call`, from any thread (simulated).
+
+        What it has enqueued before stays; nothing of it goes further.
+        """
+        with self._lock:
+            self._calls.append((self.nodes[self._fallback] if node is None else node, call, line_of_caller()))
+        if threading.get_ident() == self._thread:
+            self._take_process_ends()
+
+    def _take_process_ends(self) -> None:
+        while self._calls:
+            with self._lock:
+                node, call, place = self._calls.pop(0)
+            if self._runs(node) and not self._closing:
+                self.end(node.id, "died", call, place=place)
+                for task in self._tasks_of(node):
+                    task.cancel()
+            elif node.id in self.nodes:
+                self._unhandled.add(node, ProcessEndedError(call), f"as it ended ({place})")
 
     def _tasks_of(self, node: Node) -> list[asyncio.Task[Any]]:
         return [task for task, owner in list(self._tasks.items()) if owner is node and not task.done()]
@@ -350,7 +381,8 @@ class Host:
         if isinstance(error, SystemExit) and not error.code:
             self._over(node, "finished")
         elif self._runs(node) and not self._closing:
-            self._over(node, "crashed", error_line(error), "".join(traceback.format_exception(error)[-30:]))
+            details = "".join(traceback.format_exception(error)[-30:])
+            self._over(node, "crashed", error_line(error), details, own_line(error))
         else:
             self._unhandled.add(node, error, "in main")
 
@@ -432,9 +464,9 @@ class Host:
         else:
             self._over(node, "finished")
 
-    def _over(self, node: Node, kind: str, error: str = "", details: str = "") -> None:
+    def _over(self, node: Node, kind: str, error: str = "", details: str = "", place: str = "") -> None:
         if self.nodes[node.id] is node:  # and not what is left of an earlier incarnation
-            self.end(node.id, kind, error, details)
+            self.end(node.id, kind, error, details, place)
 
     def _new_task(
         self,

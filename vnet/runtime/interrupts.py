@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+exit_now = os._exit
+
 INTERRUPTED = 130
 """Exit status of a command that Ctrl-C has ended, as shells have it for the signal."""
 
@@ -78,8 +80,8 @@ def hold() -> None:
 def finish(status: int) -> None:
     """Have Ctrl-C end this process with `status` from now on: all is done, but for leaving."""
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, lambda number, frame: os._exit(status))
+        signal.signal(signal.SIGINT, lambda number, frame: exit_now(status))
 
 
 def _end(number: int, frame: FrameType | None) -> None:
-    os._exit(INTERRUPTED)
+    exit_now(INTERRUPTED)

@@ -8,19 +8,24 @@ on the process, and nothing that a run says may.
 
 from __future__ import annotations
 
+import _thread
 import gc
 import sys
 import threading
 import weakref
 from collections.abc import Callable
-from functools import wraps
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial, wraps
 from typing import Any
 
 from vnet.node import Node
 from vnet.runtime.current_node import current_node
 
-Taker = Callable[[Node, BaseException, str], bool]
-"""Takes an exception of a node and the place where it was raised; returns False if it is not to be taken."""
+Taker = Callable[[Node, BaseException, str, "Job | None"], bool]
+"""Takes an exception of a node, the place where it was raised, and the job that failed with it, if it was one.
+
+Returns False if it is not to be taken.
+"""
 
 
 class _Collector:
@@ -47,6 +52,7 @@ _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKey
 _watchers = 0
 _before: tuple[Any, Any] = (sys.unraisablehook, threading.excepthook)
 _start_thread = threading.Thread.start
+_start_new_thread = _thread.start_new_thread
 
 
 def watch(node: Node, taker: Taker) -> None:
@@ -62,6 +68,12 @@ def attach() -> None:
         gc.callbacks.append(collector)
     if threading.Thread.start is _start_thread:
         threading.Thread.start = _start_noted  # type: ignore[assignment, method-assign]
+    if _thread.start_new_thread is _start_new_thread:
+        _thread.start_new_thread = _start_new_noted
+    processes = sys.modules.get("concurrent.futures.process")  # slow to import, and few programs need it
+    for kind in (ThreadPoolExecutor, *([processes.ProcessPoolExecutor] if processes else [])):
+        if not hasattr(kind.submit, "__wrapped__"):
+            kind.submit = _noted(kind.submit)
     if sys.unraisablehook is not _unraisable:
         _before = (sys.unraisablehook, _before[1])
         sys.unraisablehook = _unraisable
@@ -90,6 +102,67 @@ def _start_noted(thread: threading.Thread) -> None:
     _start_thread(thread)
 
 
+@wraps(_start_new_thread)
+def _start_new_noted(function: Callable[..., object], *arguments: Any) -> int:
+    owner = present_node()
+    if owner is None or not callable(function):
+        return _start_new_thread(function, *arguments)
+
+    def run(*args: Any, **options: Any) -> None:
+        try:
+            function(*args, **options)
+        except Exception as error:
+            if not _taken(owner, error, "in a thread"):
+                raise
+
+    return _start_new_thread(run, *arguments)
+
+
+class Job(Future[Any]):
+    """A job that a program has given to an executor itself; `is_awaited` once anybody asks for its end."""
+
+    is_awaited = False
+
+    @property
+    def error(self) -> BaseException:
+        """The exception with which it has failed; to look is not to ask."""
+        error = super().exception()
+        assert error is not None
+        return error
+
+    def result(self, timeout: float | None = None) -> Any:
+        self.is_awaited = True
+        return super().result(timeout)
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        self.is_awaited = True
+        return super().exception(timeout)
+
+    def add_done_callback(self, fn: Callable[[Future[Any]], object]) -> None:
+        self.is_awaited = True
+        super().add_done_callback(fn)
+
+
+def _noted(submit: Callable[..., Future[Any]]) -> Callable[..., Future[Any]]:
+    """Return an executor's `submit` that notes on whose behalf it is called."""
+
+    @wraps(submit)
+    def submit_noted(*args: Any, **options: Any) -> Future[Any]:
+        owner, job = present_node(), submit(*args, **options)
+        if owner is not None and type(job) is Future:
+            job.__class__ = Job
+            Future.add_done_callback(job, partial(_job_done, owner))
+        return job
+
+    return submit_noted
+
+
+def _job_done(owner: Node, job: Future[Any]) -> None:
+    error = None if job.cancelled() else Future.exception(job)
+    if isinstance(job, Job) and error is not None:
+        _taken(owner, error, "in an executor job", job)
+
+
 def present_node() -> Node | None:
     """Return the node on whose behalf the present code runs: that of its context, or of its thread."""
     return current_node.get() or _started_by.get(threading.current_thread())
@@ -108,9 +181,9 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
         _before[1](failed)
 
 
-def _taken(owner: Node | None, error: BaseException, place: str) -> bool:
+def _taken(owner: Node | None, error: BaseException, place: str, job: Job | None = None) -> bool:
     reference = None if owner is None else _takers.get(owner)
     taker = None if reference is None else reference()
     if owner is None or taker is None or isinstance(error, KeyboardInterrupt | SystemExit):
         return False
-    return taker(owner, error, place)
+    return taker(owner, error, place, job)

@@ -14,17 +14,17 @@ import sysconfig
 import threading
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
 from vnet.runtime.current_node import current_node
-from vnet.runtime.outside_loop import collector
-from vnet.runtime.programs import error_line
+from vnet.runtime.outside_loop import Job, collector
+from vnet.runtime.process_end import ProcessEndedError
+from vnet.runtime.programs import error_line, leaves
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
 
@@ -76,12 +76,14 @@ class UnhandledExceptions:
         self._ready: list[Unhandled] = []
         self._lock = threading.RLock()  # of `_ready`: threads of programs and `__del__` come at any time
         self._held: list[tuple[_Failure, BaseException]] = []  # nothing is formatted while the collector runs
+        self._jobs: list[tuple[_Failure, Job]] = []
+        """Jobs that a program has given to an executor itself, and that have failed."""
         self._silenced: weakref.WeakSet[Node] = weakref.WeakSet()
 
     def attach(self, loop: SkewedLoop) -> None:
         """Have the loop of the programs tell of what fails, until `close`."""
         self._loop = loop
-        loop.on_failed, loop.on_unhandled = self._failed, self._unhandled
+        loop.on_failed, loop.on_unhandled, loop.owner_of = self._failed, self._unhandled, self._owner_of
         asyncio_internals.tell_of_failed_gatherings()
         outside_loop.attach()
 
@@ -98,7 +100,8 @@ class UnhandledExceptions:
 
     def add(self, owner: Node, error: BaseException, place: str) -> None:
         """Take an exception that has just been caught outside asyncio."""
-        self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
+        if not isinstance(error, KeyboardInterrupt):
+            self._tell(_Failure(_nothing, self._now_ns(owner), owner, place), error)
 
     @property
     def has_any(self) -> bool:
@@ -120,7 +123,10 @@ class UnhandledExceptions:
             if owner in (None, failure.owner) and future is not None and asyncio_internals.is_unretrieved(future):
                 self._failures.pop(key, None)
                 self._held.append((failure, asyncio_internals.disclaim(future)))
-        held, self._held = self._held, []
+        with self._lock:
+            jobs, self._jobs = self._jobs, []
+        held = [*self._held, *((failure, job.error) for failure, job in jobs if not job.is_awaited)]
+        self._held = []
         for failure, error in held:
             if owner not in (None, failure.owner):
                 self._held.append((failure, error))
@@ -131,19 +137,30 @@ class UnhandledExceptions:
         """Tell nothing more of this node: its process is gone."""
         self._silenced.add(owner)
         self._held = [(failure, error) for failure, error in self._held if failure.owner is not owner]
+        with self._lock:
+            self._jobs = [each for each in self._jobs if each[0].owner is not owner]
 
     def close(self) -> None:
         """Watch nothing any more."""
         if self._loop is not None:
-            self._loop.on_failed, self._loop.on_unhandled = _ignore, _only_log
+            self._loop.on_failed, self._loop.on_unhandled, self._loop.owner_of = _ignore, _only_log, _nobody
             self._loop = None
             outside_loop.detach()
 
-    def _failed_outside(self, owner: Node, error: BaseException, place: str) -> bool:
-        """Take what has left a thread or `__del__`; what comes after `close` is not taken."""
+    def _failed_outside(self, owner: Node, error: BaseException, place: str, job: Job | None) -> bool:
+        """Take what has left a thread, a job or `__del__`; what comes after `close` is not taken.
+
+        Whether somebody asks for the end of a job is known when the program ends.
+        """
         if self._loop is None:
             return False
-        self._ready_unless_silenced(_Failure(_nothing, self._now_ns(owner), owner, place), error)
+        failure = _Failure(_nothing, self._now_ns(owner), owner, place)
+        if job is None:
+            self._ready_unless_silenced(failure, error)
+        else:
+            with self._lock:
+                self._jobs = [each for each in self._jobs if not each[1].is_awaited][:MOST_HELD]
+                self._jobs.append((failure, job))
         return True
 
     # What asyncio tells.
@@ -183,6 +200,16 @@ class UnhandledExceptions:
             self._held.append((failure, error))
         return False
 
+    def _owner_of(self, context: dict[str, Any]) -> Node | None:
+        """Return the node that has left what asyncio's exception handler gets."""
+        if (handle := context.get("handle")) is not None:
+            return asyncio_internals.context_of(handle).get(current_node)
+        future = context.get("future", context.get("task"))
+        for each in () if future is None else (future, *asyncio_internals.gathered(future)):
+            if (failure := self._failures.get(id(each))) is not None:
+                return failure.owner
+        return current_node.get()
+
     def _failure_of(self, context: dict[str, Any], error: BaseException) -> _Failure:
         future = context.get("future")
         if future is None:
@@ -199,7 +226,11 @@ class UnhandledExceptions:
         return _Failure(_nothing, self._now_ns(owner), owner, "in a future")
 
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
-        if failure.owner not in self._silenced and not isinstance(error, KeyboardInterrupt):
+        if not isinstance(error, KeyboardInterrupt | ProcessEndedError):  # whose vehicle's death has been told
+            self._tell(failure, error)
+
+    def _tell(self, failure: _Failure, error: BaseException) -> None:
+        if failure.owner not in self._silenced:
             unhandled = self._of(failure, error)
             with self._lock:
                 self._ready.append(unhandled)
@@ -207,15 +238,27 @@ class UnhandledExceptions:
 
     def _of(self, failure: _Failure, error: BaseException) -> Unhandled:
         node = self._fallback if failure.owner is None else failure.owner.id
-        line = _own_line(error.__traceback__)
+        line = own_line(error)
         place = f"{failure.place} ({line})" if line else failure.place
         details = "".join(traceback.format_exception(error))[-LONGEST_TRACEBACK:]
         return Unhandled(node, failure.time_ns, error_line(error), place, details)
 
 
-def _own_line(trace: TracebackType | None) -> str:
-    """File and line of the innermost frame that is the program's own, or of the innermost of all."""
-    lines = [(frame.f_code.co_filename, number) for frame, number in traceback.walk_tb(trace)]
+def own_line(error: BaseException) -> str:
+    """Return file and line of the innermost frame that is the program's own, or of the innermost of all."""
+    leaf = leaves(error)[0]
+    traces = [each.__traceback__ for each in ([error, leaf] if leaf is not error else [leaf])]
+    frames = [frame for trace in traces for frame in traceback.walk_tb(trace)]
+    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames])
+
+
+def line_of_caller() -> str:
+    """Return file and line of the innermost frame of the present stack that is the program's own."""
+    frames = traceback.walk_stack(None)
+    return _own_of([(frame.f_code.co_filename, number) for frame, number in frames][::-1])
+
+
+def _own_of(lines: Sequence[tuple[str, int]]) -> str:
     own = [line for line in lines if not line[0].startswith(NOT_THE_PROGRAM)] or lines
     return f"{Path(own[-1][0]).name}:{own[-1][1]}" if own else ""
 
@@ -226,6 +269,10 @@ def _nothing() -> None:
 
 def _ignore(future: asyncio.Future[Any]) -> None:
     """Take no note."""
+
+
+def _nobody(context: dict[str, Any]) -> None:
+    """Stand in for the owner, whose programs are over."""
 
 
 def _only_log(context: dict[str, Any]) -> bool:

@@ -22,6 +22,7 @@ from contextvars import Context, copy_context
 from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any, NoReturn
+from weakref import WeakKeyDictionary
 
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
@@ -63,6 +64,14 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     """Called when a future, which is no task, is given an exception."""
     on_unhandled: Callable[[dict[str, Any]], bool] = staticmethod(lambda context: True)
     """Called with what asyncio's own exception handler gets; returns whether to log it."""
+    owner_of: Callable[[dict[str, Any]], Node | None] = staticmethod(lambda context: current_node.get())
+    """Called with the same; returns the node that has left the exception unhandled."""
+
+    def __init__(self, selector: selectors.BaseSelector | None = None) -> None:
+        self._handlers: WeakKeyDictionary[Node, Callable[[Any, dict[str, Any]], object] | None] = (
+            WeakKeyDictionary()
+        )
+        super().__init__(selector)
 
     @property
     def now_ns(self) -> int:
@@ -92,6 +101,36 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     def create_future(self) -> asyncio.Future[Any]:
         """Make a future that tells the loop when it fails."""
         return _TellingFuture(loop=self)
+
+    def set_exception_handler(self, handler: Callable[[Any, dict[str, Any]], object] | None) -> None:
+        """Set the handler of what the node leaves unhandled on whose behalf this is called; others keep theirs."""
+        if (node := current_node.get()) is None:
+            super().set_exception_handler(handler)
+        elif handler is not None and not callable(handler):
+            raise TypeError(f"A callable object or None is expected, got {handler!r}")
+        else:
+            self._handlers[node] = handler
+
+    def get_exception_handler(self) -> Callable[[Any, dict[str, Any]], object] | None:
+        """Return the handler of the node on whose behalf this is called."""
+        node = current_node.get()
+        return super().get_exception_handler() if node is None else self._handlers.get(node)
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Call the handler of the node that has left an exception unhandled, in a context of its own."""
+        node = self.owner_of(context) if self._handlers else None
+        handler = None if node is None else self._handlers.get(node)
+        if handler is None:
+            super().call_exception_handler(context)
+            return
+        own = Context()
+        own.run(current_node.set, node)
+        before = super().get_exception_handler()
+        super().set_exception_handler(handler)
+        try:
+            own.run(super().call_exception_handler, context)
+        finally:
+            super().set_exception_handler(before)
 
     def default_exception_handler(self, context: dict[str, Any]) -> None:
         """Log what nobody has handled, as asyncio does, and tell of it."""

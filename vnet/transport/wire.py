@@ -99,12 +99,14 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True):
-    """The end of a node's program: it returned, raised, or never let time advance (`details` has the stack)."""
+    """The end of a program: it returned, raised, died, or did not let time advance (`details`: the stack)."""
 
     node: str
-    kind: Literal["finished", "crashed", "spun"]
+    kind: Literal["finished", "crashed", "spun", "died"]
     error: str = ""
     details: str = ""
+    place: str = ""
+    """File and line of the program at which it ended, if that is known."""
 
 
 class Unhandled(msgspec.Struct, frozen=True, array_like=True):

@@ -16,6 +16,7 @@ from emulator.drivers.live.waiting import ChangeSignal
 from emulator.viewer.sinks import Sinks
 from vnet.counted import counted
 from vnet.errors import ProgramError, TransportError, VnetError, first_names
+from vnet.runtime.die_with_parent import STARTED_BY_VNET
 from vnet.transport import wire
 from vnet.transport.access import OBSERVER, host_user
 
@@ -135,7 +136,9 @@ class Joining:
             arguments = ["-P", "-m", "emulator.cli", "host", "--connect", endpoint, "--run", access.run]
             for folder in self._emulation.scenario.program.folders:
                 arguments += ["--path", str(folder)]
-            self._launcher.start(host_user(host), arguments, access.credentials(host_user(host)), {})
+            self._launcher.start(
+                host_user(host), arguments, access.credentials(host_user(host)), {STARTED_BY_VNET: "1"}
+            )
 
     def _start_recorder(self, endpoint: str, sinks: Sinks) -> None:
         arguments = ["-P", "-m", "emulator.cli", "record", "--connect", endpoint, "--run", self._options.access.run]

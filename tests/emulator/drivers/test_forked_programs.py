@@ -123,11 +123,24 @@ def test_an_interruption_is_recorded_and_leaves_no_process(tmp_path: Path, progr
     assert children() == before
 
 
-def test_a_process_that_ends_ends_the_run_in_one_line(tmp_path: Path) -> None:
+def test_vehicles_of_a_process_that_ends_have_died_and_the_others_go_on(tmp_path: Path) -> None:
     before = children()
-    with pytest.raises(VnetError, match=r"the process of v04 to v06 ended with SIGKILL .*; what .* in logs/ only"):
-        simulate(emulate(tmp_path / "run", program=entry(ends_its_process)), processes=2)
+    emulation = emulate(tmp_path / "run", program=entry(ends_its_process))
+    wall_s, _ = simulate(emulation, processes=2)
+    judgement, verdict = conclude(emulation, wall_s, "simulate")
+    assert judgement.exit_status == 1
+    died = [event for event in emulation.folder.events if event.kind == "died"]
+    assert [event.node for event in died] == ["v04", "v05", "v06"]
+    assert {event.details["how"] for event in died} == {"SIGKILL, while v05 ran"}
+    assert verdict["emulated_s"] == emulation.duration_ns / 1e9
     assert children() == before
+
+
+def test_a_vehicle_apart_dies_alone(tmp_path: Path) -> None:
+    emulation = emulate(tmp_path / "run", program=entry(ends_its_process))
+    simulate(emulation, apart="v05")
+    died = [event for event in emulation.folder.events if event.kind == "died"]
+    assert [(event.node, event.details["how"]) for event in died] == [("v05", "SIGKILL")]
     assert "the reason\n" in (tmp_path / "run" / "logs" / "v05.log").read_text()
 
 
@@ -143,8 +156,9 @@ def test_an_error_before_the_first_turn_is_told(tmp_path: Path, monkeypatch: pyt
     process = ForkedPrograms(welcomes, {}, emulation.folder, [], lambda: None)
     os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
     try:
+        process.give(None)
         with pytest.raises(VnetError, match="no room for programs"):
-            process.give(None)
+            process.take()
     finally:
         process.close()
 

@@ -2,10 +2,12 @@
 
 import asyncio
 import gc
+import json
 import logging
 import signal
 import sys
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -224,6 +226,21 @@ async def awaits_a_job(node: Node) -> None:
 async def has_a_handler(node: Node) -> None:
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
     await forgets_a_task(node)
+
+
+async def handles_what_is_its_own(node: Node) -> None:
+    if node.id != "v01":
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
+        assert asyncio.get_running_loop().get_exception_handler() is not None
+    else:
+        assert asyncio.get_running_loop().get_exception_handler() is None
+    await forgets_a_task(node)
+
+
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_an_exception_handler_is_that_of_its_vehicle_alone(run: Run) -> None:
+    emulation = run(scenario_of([], entry(handles_what_is_its_own), run={"nodes_per_process": 2}))
+    assert [event.node for event in exceptions(emulation)] == ["v01"]
 
 
 HANDLED = [
@@ -477,3 +494,35 @@ def test_a_failure_that_another_thread_forgets_meanwhile_is_told_all_the_same() 
     assert told._unhandled({"future": future, "exception": future.exception()}) is False
     assert [each.error for each in told.take()] == ["ValueError: x"]
     loop.close()
+
+
+async def crashes_in_a_group(node: Node) -> None:
+    async with asyncio.TaskGroup() as group, asyncio.TaskGroup() as inner:
+        inner.create_task(fails())
+        group.create_task(asyncio.sleep(1.0))
+
+
+async def crashes_in_a_library(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    json.loads("{")
+
+
+async def a_group_fails_in_a_task(node: Node) -> None:
+    held.append(asyncio.create_task(crashes_in_a_group(node)))
+    await sends(node)
+
+
+@pytest.mark.parametrize("run", [run_together, run_forked])
+def test_a_group_is_told_as_its_first_exception_in_the_program_s_own_line(run: Run) -> None:
+    line = fails.__code__.co_firstlineno + 2
+    for program, kind in ((crashes_in_a_group, "crashed"), (a_group_fails_in_a_task, "exception")):
+        event = next(e for e in run(scenario_of([], entry(program))).folder.events if e.kind == kind)
+        assert event.details["error"] == "ValueError: boom"
+        assert f"{Path(__file__).name}:{line}" in event.details["place"]
+
+
+def test_a_crash_in_a_library_is_told_at_the_program_s_own_line() -> None:
+    emulation = run_together(scenario_of([], entry(crashes_in_a_library)))
+    (kind,) = kinds_of(event for event in emulation.folder.events if event.kind == "crashed")
+    line = crashes_in_a_library.__code__.co_firstlineno + 2
+    assert f"{Path(__file__).name}:{line}" in str(kind)

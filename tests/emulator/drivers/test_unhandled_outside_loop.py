@@ -1,10 +1,13 @@
 """Exceptions in threads that programs start and in `__del__` count like those that asyncio tells of."""
 
+import _thread
 import asyncio
+import contextlib
 import gc
 import sys
 import threading
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -87,7 +90,31 @@ async def ignores_the_end_of_a_generator(node: Node) -> None:
     await sends(node)
 
 
+async def fails_in_a_raw_thread(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    over = threading.Event()
+
+    def fail() -> None:
+        try:
+            int("x")
+        finally:
+            over.set()
+
+    _thread.start_new_thread(fail, ())
+    over.wait()
+    await asyncio.sleep(0.1)
+    await sends(node)
+
+
+async def submits_and_forgets(node: Node) -> None:
+    await asyncio.sleep(0.5)
+    with ThreadPoolExecutor(1) as executor:
+        executor.submit(int, "x")
+    await sends(node)
+
+
 TOLD: dict[Program, tuple[str, float]] = {
+    submits_and_forgets: ("in an executor job", 0.5),
     fails_in_a_thread: ("in a thread", 0.5),
     fails_in_a_thread_of_a_thread: ("in a thread", 0.5),
     fails_in_a_thread_of_a_job: ("in a thread", 0.5),
@@ -115,7 +142,35 @@ def test_what_the_loop_never_sees_is_told_with_its_instant(program: Program, run
     assert judged(emulation).verdict is Verdict.INVALID
 
 
+def test_a_thread_without_an_object_is_told_of() -> None:
+    emulation = run_together(scenario_of([], entry(fails_in_a_raw_thread), vehicles=2))
+    assert sorted((event.node or "") for event in exceptions(emulation)) == ["v01", "v02"]
+
+
 # Programs that are not.
+
+
+async def submits_and_asks(node: Node) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        job = executor.submit(int, "x")
+        awaited = asyncio.wrap_future(executor.submit(int, "x"))
+        called_back = executor.submit(int, "x")
+        called_back.add_done_callback(lambda job: None)
+    await asyncio.sleep(1.0)
+    with contextlib.suppress(ValueError):
+        job.result()
+    with contextlib.suppress(ValueError):
+        await awaited
+    await sends(node)
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_job_whose_end_somebody_asks_for_is_handled(run: str) -> None:
+    drive, nodes_per_process = RUNS[run]
+    emulation: Emulation = drive(
+        scenario_of([], entry(submits_and_asks), vehicles=2, run={"nodes_per_process": nodes_per_process})
+    )
+    assert exceptions(emulation) == []
 
 
 async def leaves_a_thread(node: Node) -> None:

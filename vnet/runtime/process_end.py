@@ -1,0 +1,87 @@
+"""Ends of a process that its programs ask for: `os._exit` and `os.exec*` are the death of a vehicle.
+
+Where programs share a process with the emulator (`caught`), the vehicle alone has died, and the program goes no
+further. In a process of their own (`count_as_death`) it ends, with a status other than 0: 0 is that of a run's end.
+"""
+
+from __future__ import annotations
+
+import os
+import posix
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from typing import Any, NoReturn
+
+from vnet.node import Node
+from vnet.runtime.outside_loop import present_node
+
+exit_now = os._exit
+"""End this process at once: `os._exit` as it is."""
+DEATH_STATUS = 71
+"""Exit status of a process whose program has ended it with status 0, or has put another program in its place."""
+JOBS = "vnet"
+"""Prefix of the names of threads of the default executor, whose jobs are nobody's."""
+
+_takers: list[Callable[[Node | None, str], None]] = []
+_process = os.getpid()
+_is_programs_own = False
+
+
+class ProcessEndedError(BaseException):
+    """A program has ended its process: its vehicle has died, which has been told."""
+
+
+@contextmanager
+def caught(taker: Callable[[Node | None, str], None]) -> Iterator[None]:
+    """Call `taker` within the block with each node that ends this process, and with the call that does."""
+    global _process
+    _replace()
+    _process = os.getpid()
+    _takers.append(taker)
+    try:
+        yield
+    finally:
+        _takers.remove(taker)
+
+
+def count_as_death() -> None:
+    """Have this process, which is that of its programs, end with a status other than 0 if one of them ends it."""
+    global _process, _is_programs_own
+    _replace()
+    _process, _is_programs_own = os.getpid(), True
+
+
+def _replace() -> None:
+    for name in ("_exit", "execv", "execve"):
+        original = getattr(os, name)
+        if not hasattr(original, "__wrapped__"):
+            for module in (os, posix):
+                setattr(module, name, _replacement(name, original))
+
+
+def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+    @wraps(original)
+    def end(*args: Any, **options: Any) -> Any:
+        if os.getpid() != _process:  # a process that a program has forked
+            return original(*args, **options)
+        call = f"os.{name}({', '.join([*map(repr, args[:1]), *(f'{key}={options[key]!r}' for key in options)])})"
+        node = present_node()
+        if _is_programs_own:
+            status = args[0] if name == "_exit" and args and isinstance(args[0], int) else 0
+            _end_as_death(node, call, status)
+        if not _takers or (node is None and not threading.current_thread().name.startswith(f"{JOBS}_")):
+            return original(*args, **options)
+        for taker in tuple(_takers):
+            taker(node, call)
+        raise ProcessEndedError(call)
+
+    return end
+
+
+def _end_as_death(node: Node | None, call: str, status: int) -> NoReturn:
+    sys.stderr.write(f"vnet-agent: the program of {'a vehicle' if node is None else node.id} called {call}\n")
+    sys.stderr.flush()
+    exit_now(status or DEATH_STATUS)
