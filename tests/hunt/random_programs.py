@@ -204,11 +204,11 @@ async def passes_through_queues(v: Vehicle) -> None:
             queue.task_done()
             await asyncio.sleep(v.delay_s())
 
-    takers = [asyncio.create_task(takes()) for _ in range(2)]
+    takings = [asyncio.create_task(takes()) for _ in range(2)]
     await asyncio.gather(*(queue.put(each) for each in v.names()))
     await queue.join()
-    for taker in {*takers}:
-        taker.cancel()
+    for taking in {*takings}:
+        taking.cancel()
 
 
 async def times_out(v: Vehicle) -> None:

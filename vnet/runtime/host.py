@@ -89,7 +89,7 @@ class Host:
         self.news = News()
         self._paused: set[str] = set()
         self._late: list[tuple[str, str, object]] = []
-        """What finalizers of paused programs send: in a process of its own the collector runs after the pause."""
+        """Sends of finalizers of paused programs: in a process of its own the collector runs after the pause."""
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
