@@ -87,6 +87,7 @@ sumo: $(READY)
 
 hunt: $(READY)
 	$(BIN)/python -m tests.hunt
+	$(BIN)/python -m tests.hunt.layouts
 
 soak: $(READY)
 	$(BIN)/python -m benchmarks.soak

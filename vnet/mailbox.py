@@ -19,10 +19,12 @@ class Mailbox(Generic[T]):
     `waiting` tells the transport that a task of the program waits here: only then does an arrival wake the node;
     otherwise the program finds the item when it next runs. `refill` is called before the program reads, so that a
     transport may leave items in its own buffer until then (real time).
+    `guard` is called before that, and raises where the program may not read.
     """
 
     def __init__(self) -> None:
         self.refill: Callable[[], None] = lambda: None
+        self.guard: Callable[[], None] = lambda: None
         self._items: deque[T] = deque(maxlen=INBOX_LIMIT)
         self._waiters: deque[asyncio.Future[None]] = deque()
 
@@ -45,6 +47,7 @@ class Mailbox(Generic[T]):
 
     async def get(self) -> T:
         """Remove and return the oldest item; wait for one if there is none. Cancelling it loses no item."""
+        self.guard()
         self.refill()
         while not self._items:
             waiter = asyncio.get_running_loop().create_future()
@@ -58,6 +61,7 @@ class Mailbox(Generic[T]):
 
     def drain(self) -> list[T]:
         """Remove and return all items, oldest first, without waiting."""
+        self.guard()
         self.refill()
         items = list(self._items)
         self._items.clear()

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,6 +147,8 @@ class Node:
     ) -> None:
         self._is_text: dict[str, bool] = {}  # by the name of each reported value
         self.id = node_id
+        self._hashes = count(crc32(node_id.encode()))  # of its tasks and futures
+        self._task_names = count(1)
         self.radio = Radio(node_id, transport, max_payload, abilities)
         self.gnss = GnssReceiver()
         self.map = lane_map

@@ -15,6 +15,9 @@ names what is missing or different when a new version of Python changes it. What
   `_children`.
 - Callbacks run in `Handle._run`, a function in Python, which lets SystemExit and KeyboardInterrupt through.
 - `gather` makes an `asyncio.tasks._GatheringFuture`, and lets it fail with `set_exception`.
+- `call_soon`, `call_soon_threadsafe` and tasks make their handles in `_call_soon`. What writes to the self-pipe
+  wakes the selector. An async generator is told of to `_asyncgen_firstiter_hook` when it begins, and to
+  `_asyncgen_finalizer_hook` when it is discarded before its end, which calls `call_soon_threadsafe`.
 - `_default_executor`, `_check_closed`, `Handle._context` (public since Python 3.12), `Task._log_destroy_pending`.
 """
 
@@ -74,14 +77,26 @@ def default_executor(loop: asyncio.AbstractEventLoop, thread_name_prefix: str) -
     return cast("ThreadPoolExecutor", _private(loop)._default_executor)
 
 
+def push_ready(loop: asyncio.AbstractEventLoop, handle: asyncio.Handle) -> None:
+    """Add a callback to the queue of those that are ready, as `_call_soon` does."""
+    if _private(handle)._source_traceback:
+        del _private(handle)._source_traceback[-1]
+    _private(loop)._ready.append(handle)
+
+
+def wake(loop: asyncio.AbstractEventLoop) -> None:
+    """Have the loop look for what is there, from any thread."""
+    _private(loop)._write_to_self()
+
+
+def generators(loop: asyncio.AbstractEventLoop) -> list[Any]:
+    """Return the async generators that have begun and are there yet."""
+    return list(_private(loop)._asyncgens)
+
+
 def context_of(handle: asyncio.Handle) -> Context:
     """Return the context in which a callback will run."""
     return cast("Context", _private(handle)._context)
-
-
-def callback_of(handle: asyncio.Handle) -> Callable[..., object] | None:
-    """Return what a callback that is ready will call; None if it has been cancelled."""
-    return cast("Callable[..., object] | None", _private(handle)._callback)
 
 
 def handle_that_raised(error: BaseException) -> asyncio.Handle | None:
@@ -153,11 +168,14 @@ def gathered(future: asyncio.Future[Any]) -> Sequence[asyncio.Future[Any]]:
     return cast("Sequence[asyncio.Future[Any]]", getattr(future, "_children", ()))
 
 
+_set_exception = asyncio.Future.set_exception  # asyncio's own; while programs run, the name is another's
+
+
 def tell_of_failed_gatherings() -> None:
     """Have what `asyncio.gather` returns call `on_failed` of its loop, if it has one, when it fails."""
 
     def set_exception(future: asyncio.Future[Any], exception: type | BaseException) -> None:
-        asyncio.Future.set_exception(future, exception)
+        _set_exception(future, exception)
         on_failed = getattr(future.get_loop(), "on_failed", None)
         if on_failed is not None:
             on_failed(future)
@@ -165,14 +183,27 @@ def tell_of_failed_gatherings() -> None:
     _private(asyncio.tasks)._GatheringFuture.set_exception = set_exception
 
 
+def hash_gatherings_by(hash_of: Callable[[asyncio.Future[Any]], int]) -> None:
+    """Have what `asyncio.gather` returns hash by `hash_of`."""
+    _private(asyncio.tasks)._GatheringFuture.__hash__ = hash_of
+
+
+class NodeHandle(asyncio.Handle):
+    """A callback that is ready, with its node."""
+
+    __slots__ = ("node",)
+    node: object
+
+
 class NumberedTimer(asyncio.TimerHandle):
     """A timer with a number: timers of one instant fire in the order in which they were set.
 
     asyncio leaves that order to the shape of its heap, and so to how many other nodes share the loop. Where other
-    orders are tried, `setter` has the name of what has set the timer, and its callback.
+    orders are tried, `setter` has the name of what has set the timer, and its callback. `node` is whose it is.
     """
 
-    __slots__ = ("_number", "setter")
+    __slots__ = ("_number", "node", "setter")
+    node: object
     setter: tuple[str, object]
 
     def __init__(self, number: int, *rest: Any) -> None:

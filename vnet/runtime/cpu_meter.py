@@ -7,8 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from vnet.runtime import asyncio_internals
-from vnet.runtime.current_node import current_node
+from vnet.runtime.ready_queue import node_of
 from vnet.runtime.running_node import RunningNode
 
 
@@ -33,7 +32,7 @@ class CpuMeter:
         """A callback begins, and the one before it is over."""
         now_ns = self._clock()
         self._charge(now_ns)
-        node = asyncio_internals.context_of(handle).get(current_node)
+        node = node_of(handle)
         if node is not None:
             self._running, self._since_ns = node.id, now_ns
             self._awake.add(node.id)

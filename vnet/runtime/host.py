@@ -13,18 +13,19 @@ import logging
 import threading
 import traceback
 import weakref
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from vnet.driving import Action
+from vnet.mailbox import Mailbox
 from vnet.node import Fix, Node
 from vnet.radio import RadioAbilities, SendOptions
 from vnet.reports import NoteDetail, Report
 from vnet.roads.road_map import map_from_wire
 from vnet.runtime import asyncio_internals
 from vnet.runtime.busy_ratios import MeasuredBusyRatios
-from vnet.runtime.current_node import current_node
+from vnet.runtime.current_node import current_node, present_node
 from vnet.runtime.disks import Disks
 from vnet.runtime.event_order import Chooser, chooser_of
 from vnet.runtime.log_handler import LONGEST_NOTE, NodeLines, NodeLogHandler
@@ -33,8 +34,10 @@ from vnet.runtime.mail_delivery import MailDelivery
 from vnet.runtime.news import News
 from vnet.runtime.node_clocks import NodeClocks
 from vnet.runtime.outbox import Outbox
+from vnet.runtime.own_asyncio import Task
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import Program, Programs, error_line
+from vnet.runtime.ready_queue import node_of
 from vnet.runtime.replay_probes import call_log, scattered_heap
 from vnet.runtime.unhandled import UnhandledExceptions, line_of_caller, own_line
 from vnet.runtime.virtual_time import LoopAbandonedError, SkewedLoop, SpinError, VirtualTimeLoop
@@ -42,9 +45,13 @@ from vnet.runtime.window import Window
 from vnet.transport import wire
 from vnet.transport.backbone import SentMessage, arrived_in_full
 from vnet.transport.orders import Deviation, Order
+from vnet.units import NS_PER_S
 
 if TYPE_CHECKING:  # pdb, which few runs need
     from vnet.runtime.debugger import NodeDebugger
+
+COLLECTION_NS = NS_PER_S
+"""Emulated time between two collections of garbage, at the nearest multiple of the period of fixes."""
 
 
 class Host:
@@ -66,15 +73,16 @@ class Host:
     ) -> None:
         self._debugger = debugger
         self._disks = disks or Disks()
-        self._calls, self._heap = call_log(), scattered_heap()
+        self._call_log, self._heap = call_log(), scattered_heap()
         self._clock = clock
         self._on_traffic = on_traffic
         self._on_line = on_line
         self._outbox = Outbox()
         self._lines = NodeLines(on_line, clock)
-        self._log_handler = NodeLogHandler(lambda node: self.nodes.get(node.id) is node)
+        self._log_handler = NodeLogHandler(self._log)
         self._window = Window()
         self._tasks: weakref.WeakKeyDictionary[asyncio.Task[Any], Node | None] = weakref.WeakKeyDictionary()
+        self._thread: int | None = None  # of the loop, in lockstep
         self.nodes = {welcome.node: self._node(welcome) for welcome in welcomes}
         self._active = {welcome.node: welcome.runs for welcome in welcomes}
         self._clocks = NodeClocks(clock)
@@ -83,6 +91,8 @@ class Host:
         self.busy = MeasuredBusyRatios([*self.nodes], clock)
         self.news = News()
         self._paused: set[str] = set()
+        self._late: list[tuple[str, str, object]] = []
+        """Sends of finalizers of paused programs: in a process of its own the collector runs after the pause."""
         self._killed: dict[Node, list[asyncio.Task[Any]]] = {}
         self._stopped_ns: dict[Node, int] = {}
         self._closing = False
@@ -90,12 +100,11 @@ class Host:
         self._fallback = next(iter(self.nodes))
         self._unhandled = UnhandledExceptions(self._raised_ns, self._fallback, on_line)
         self._lock = threading.Lock()
-        self._thread = threading.get_ident()
         self._calls: list[tuple[Node, str, str]] = []
         """Calls by which programs have ended their process, with the line of each."""
 
     def _node(self, welcome: wire.Welcome) -> Node:
-        return Node(
+        node = Node(
             welcome.node,
             self,
             lane_map=map_from_wire(welcome.lane_map),
@@ -109,31 +118,59 @@ class Host:
             disk=partial(self._disks.of, welcome.node),
             unit=welcome.unit,
         )
+        inboxes: dict[str, Mailbox[Any]] = {"radio": node.radio.inbox, "gnss": node.gnss.inbox}
+        if node.backbone is not None:
+            inboxes["backbone"] = node.backbone.inbox
+        for name, inbox in inboxes.items():
+            inbox.guard = partial(self._check_thread, node.id, f"{name}.drain() or receive()")
+        return node
+
+    def _check_thread(self, node: str, call: str) -> None:
+        if self._thread is not None and self._thread != threading.get_ident():
+            raise RuntimeError(
+                f"{node}: node.{call} in another thread than the event loop's: in lockstep nothing says at which "
+                "emulated time it acts; give the thread what it needs, return what it has found from "
+                'asyncio.to_thread(), and call it in the task; or run.pacing = "realtime"'
+            )
 
     # What nodes ask of their link.
 
     def now_ns(self, node: str) -> int:
         """Emulated time in nanoseconds, by the clock of `node`."""
+        self._check_thread(node, "now_ns")
         return self._clocks.now_of(node)
 
     def send_frame(self, node: str, payload: bytes, options: SendOptions) -> None:
         """Take a frame for the radio; a node that has ended is silent."""
-        self._enqueue(node, self._outbox.frames, wire.Frame(node, payload, *options))
+        self._check_thread(node, "radio.broadcast() or send()")
+        self._enqueue(node, "frames", wire.Frame(node, payload, *options))
 
     def send_message(self, node: str, to: str | None, payload: bytes) -> None:
         """Take a message for the backbone; a node that has ended is silent."""
-        self._enqueue(node, self._outbox.messages, SentMessage(node, next(self._outbox.numbers), to, payload))
+        self._check_thread(node, "backbone.broadcast() or send()")
+        self._enqueue(node, "messages", SentMessage(node, next(self._outbox.numbers), to, payload))
 
     def busy_ratio(self, node: str) -> float | None:
         """Return the channel busy ratio that a node knows now."""
+        self._check_thread(node, "radio.busy_ratio")
         return self.busy.of(node)
 
     def send_report(self, report: Report) -> None:
         """Take a report."""
-        self._enqueue(report.node, self._outbox.reports, report)
+        self._check_thread(report.node, "report()")
+        self._enqueue(report.node, "reports", report)
 
     def send_note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         """Take a line of a log or an event of a program; the line is written at once."""
+        self._check_thread(node, "log() or event()")
+        self._note(node, kind, level, text, details)
+
+    def _log(self, node: Node, level: str, text: str) -> None:
+        """Take a line that a program has given to `logging`, in any thread; one that has ended is silent."""
+        if self.nodes.get(node.id) is node:
+            self._note(node.id, "log", level, text, {})
+
+    def _note(self, node: str, kind: str, level: str, text: str, details: dict[str, NoteDetail]) -> None:
         note = wire.Note(node, self._clock(), kind, level, text[:LONGEST_NOTE], details)  # type: ignore[arg-type]
         self._outbox.notes.append(note)
         self._lines.add(node, kind, level, text, details)
@@ -141,13 +178,16 @@ class Host:
 
     def send_action(self, action: Action) -> None:
         """Take what a program asks its vehicle to do."""
-        self._enqueue(action.node, self._outbox.actions, action)
+        self._check_thread(action.node, "drive()")
+        self._enqueue(action.node, "actions", action)
 
-    def _enqueue(self, node: str, queue: list[Any], item: object) -> None:
-        if self._active[node]:
-            queue.append(item)
-            if self._calls is not None:
-                self._calls.add(node, self._clock(), item)
+    def _enqueue(self, node: str, queue: str, item: object) -> None:
+        if node in self._paused:
+            self._late.append((node, queue, item))
+        elif self._active[node]:
+            getattr(self._outbox, queue).append(item)
+            if self._call_log is not None:
+                self._call_log.add(node, self._clock(), item)
             self._on_traffic()
 
     # What the transport asks of the host.
@@ -165,7 +205,11 @@ class Host:
         self._programs = programs
         if self._debugger is not None:
             self._debugger.attach(self._is_debugged, self._clock)
-        loop.set_task_factory(self._new_task)  # type: ignore[arg-type]
+        loop.on_task = self._new_task
+        if isinstance(loop, VirtualTimeLoop):
+            self._thread = threading.get_ident()
+            period_ns = next(iter(self.nodes.values())).period_ns
+            loop.collect_every(max(1, round(COLLECTION_NS / period_ns)) * period_ns)
         for node in self.nodes.values():
             if self._active[node.id]:
                 self._start(node)
@@ -181,7 +225,7 @@ class Host:
 
     def _is_debugged(self) -> bool:
         """Return whether code runs on behalf of the node that is debugged, and its program goes on."""
-        node, debugger = current_node.get(), self._debugger
+        node, debugger = present_node(), self._debugger
         if node is None or debugger is None or self._closing:
             return False
         return debugger.stops_in(node.id) and self._runs(node)
@@ -197,6 +241,7 @@ class Host:
         gone = self.nodes[node]
         gone.disconnect()
         self._active[node] = False
+        self._late = [entry for entry in self._late if entry[0] != node]
         self._window.drop(node)
         self.news.drop(node)
         if killed:
@@ -226,13 +271,16 @@ class Host:
         """Pause these nodes from now on, and no others: their callbacks wait (simulated)."""
         self._paused = set(nodes)
         self._hold()
+        late, self._late = self._late, []
+        for node, queue, item in late:
+            self._enqueue(node, queue, item)
 
     def _hold(self) -> None:
         assert isinstance(self._loop, VirtualTimeLoop)
         self._loop.hold(self._is_paused)
 
     def _is_paused(self, handle: asyncio.Handle) -> bool:
-        owner = _owner(handle)
+        owner = node_of(handle)
         return owner is not None and (owner.id in self._paused or owner in self._killed)
 
     def apply_clock_error(self, clocks: Iterable[wire.ClockError], loop: SkewedLoop) -> None:
@@ -351,10 +399,10 @@ class Host:
         What spins on although it was cancelled loses its callbacks.
         """
         ready = asyncio_internals.ready_queue(loop)
-        owners = dict.fromkeys(_owner(handle) for handle in ready)
+        owners = dict.fromkeys(node_of(handle) for handle in ready)
         spinning = [owner for owner in owners if owner is not None] or list(self.nodes.values())
         if not any(self._runs(node) for node in spinning):
-            kept = [handle for handle in ready if _owner(handle) not in spinning]
+            kept = [handle for handle in ready if node_of(handle) not in spinning]
             ready.clear()
             ready.extend(kept)
         for node in spinning:
@@ -372,7 +420,7 @@ class Host:
                 self._exited(owner, leave)
                 return
         handle = asyncio_internals.handle_that_raised(leave)
-        owner = None if handle is None else _owner(handle)
+        owner = None if handle is None else node_of(handle)
         if owner is None:
             raise leave
         self._exited(owner, leave)
@@ -468,20 +516,6 @@ class Host:
         if self.nodes[node.id] is node:  # and not what is left of an earlier incarnation
             self.end(node.id, kind, error, details, place)
 
-    def _new_task(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        coroutine: Generator[Any, None, Any],
-        context: contextvars.Context | None = None,
-        **options: Any,  # from Python 3.13.3 on: the name, and whatever else a task takes
-    ) -> asyncio.Task[Any]:
-        task: asyncio.Task[Any] = asyncio.Task(coroutine, loop=loop, context=context, **options)
-        owner = current_node.get() if context is None else context.get(current_node)
-        self._tasks[task] = owner
-        self._unhandled.watch(task, owner)
-        return task
-
-
-def _owner(handle: asyncio.Handle) -> Node | None:
-    """The node on whose behalf a callback is scheduled."""
-    return asyncio_internals.context_of(handle).get(current_node)
+    def _new_task(self, task: Task) -> None:
+        self._tasks[task] = task.node
+        self._unhandled.watch(task, task.node)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 from vnet.node import Node
-from vnet.runtime.current_node import current_node
+from vnet.runtime.current_node import present_node
 from vnet.units import NS_PER_S
 
 LONGEST_NOTE = 4000
@@ -17,30 +17,30 @@ MOST_LINES = 100_000
 
 
 class NodeLogHandler(logging.Handler):
-    """Hands records to `Node.log` of the nodes that are `its_own`.
+    """Hands records to `write`, with the node on whose behalf they are made and their level.
 
     Records on nobody's behalf, and asyncio's own, go the way of `logging.lastResort`, as without this handler.
     """
 
-    def __init__(self, its_own: Callable[[Node], bool]) -> None:
+    def __init__(self, write: Callable[[Node, str, str], None]) -> None:
         super().__init__()
-        self._its_own = its_own
+        self._write = write
 
     def createLock(self) -> None:
-        """Make no lock: `Node.log` needs none, and may wait for the emulator while others log."""
+        """Make no lock: `write` needs none, and may wait for the emulator while others log."""
         self.lock = None
 
     def emit(self, record: logging.LogRecord) -> None:
         """Take a record."""
-        node = current_node.get()
+        node = present_node()
         if node is None or record.name == "asyncio":
             last = logging.lastResort
             alone = logging.getLogger().handlers == [self]
             if alone and last is not None and record.levelno >= last.level:
                 last.handle(record)
-        elif self._its_own(node):
+        else:
             try:
-                node.log(f"{record.name}: {self.format(record)}", level_name(record.levelno))
+                self._write(node, level_name(record.levelno), f"{record.name}: {self.format(record)}")
             except Exception:
                 self.handleError(record)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from vnet.runtime.current_node import current_node
+from vnet.runtime.current_node import present_node
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import ClockError
 
@@ -27,7 +27,7 @@ class NodeClocks:
         loop.clock_error_of = self._error_of_task if self._errors else lambda: None
 
     def _error_of_task(self) -> ClockError | None:
-        node = current_node.get()
+        node = present_node()
         return None if node is None else self._errors.get(node.id)
 
     def now_of(self, node: str) -> int:

@@ -13,13 +13,14 @@ import gc
 import sys
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial, wraps
 from typing import Any
 
 from vnet.node import Node
-from vnet.runtime.current_node import current_node
+from vnet.runtime import current_node, own_asyncio
 
 Taker = Callable[[Node, BaseException, str, "Job | None"], bool]
 """Takes an exception of a node, the place where it was raised, and the job that failed with it, if it was one.
@@ -47,12 +48,46 @@ class _Collector:
 
 
 collector = _Collector()
+MOST_UNCOLLECTED = 2_000_000
+"""Objects that programs may make, less those that are freed, before Python collects garbage when it likes: a
+program that makes so many between two instants needs the memory."""
+_lock = threading.Lock()
+_schedules = 0
+_before_schedules: tuple[tuple[int, int, int], bool] = (gc.get_threshold(), False)
 _takers: weakref.WeakKeyDictionary[Node, weakref.WeakMethod[Taker]] = weakref.WeakKeyDictionary()
 _started_by: weakref.WeakKeyDictionary[threading.Thread, Node] = weakref.WeakKeyDictionary()
 _watchers = 0
 _before: tuple[Any, Any] = (sys.unraisablehook, threading.excepthook)
 _start_thread = threading.Thread.start
 _start_new_thread = _thread.start_new_thread
+
+
+@contextmanager
+def collected_by_schedule() -> Iterator[None]:
+    """Leave it to the loops of programs when garbage is collected, within the block.
+
+    What is there at its beginning is not searched for garbage: it would cost more than the rest. A collector that
+    is switched off by its threshold stays so.
+    """
+    global _schedules, _before_schedules
+    with _lock:
+        _schedules += 1
+        if _schedules == 1:
+            freezes = gc.get_freeze_count() == 0
+            _before_schedules = gc.get_threshold(), freezes
+            if freezes:
+                gc.freeze()
+            if gc.get_threshold()[0]:
+                gc.set_threshold(MOST_UNCOLLECTED, *gc.get_threshold()[1:])
+    try:
+        yield
+    finally:
+        with _lock:
+            _schedules -= 1
+            if _schedules == 0:
+                gc.set_threshold(*_before_schedules[0])
+                if _before_schedules[1]:
+                    gc.unfreeze()
 
 
 def watch(node: Node, taker: Taker) -> None:
@@ -64,6 +99,7 @@ def watch(node: Node, taker: Taker) -> None:
 def attach() -> None:
     """Take the hooks of Python and of the collector; each call is followed by one of `detach`."""
     global _watchers, _before
+    own_asyncio.attach()
     if collector not in gc.callbacks:
         gc.callbacks.append(collector)
     if threading.Thread.start is _start_thread:
@@ -86,6 +122,7 @@ def attach() -> None:
 def detach() -> None:
     """Give the hooks back when nobody watches any more, unless a program has put others in their place."""
     global _watchers
+    own_asyncio.detach()
     _watchers -= 1
     if _watchers == 0:
         if sys.unraisablehook is _unraisable:
@@ -164,8 +201,8 @@ def _job_done(owner: Node, job: Future[Any]) -> None:
 
 
 def present_node() -> Node | None:
-    """Return the node on whose behalf the present code runs: that of its context, or of its thread."""
-    return current_node.get() or _started_by.get(threading.current_thread())
+    """Return the node on whose behalf the present code runs: that of its callback, its context, or its thread."""
+    return current_node.present_node() or _started_by.get(threading.current_thread())
 
 
 def _unraisable(ignored: sys.UnraisableHookArgs) -> None:

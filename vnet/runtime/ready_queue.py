@@ -12,7 +12,6 @@ later, and an order of events is one that a machine can show. What one callback 
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
@@ -22,9 +21,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 from vnet.errors import printable
-from vnet.runtime import asyncio_internals
 from vnet.runtime.asyncio_internals import NumberedTimer
-from vnet.runtime.current_node import current_node
 from vnet.runtime.event_order import GO_ON, Chooser, Option
 from vnet.transport.orders import Deviation
 
@@ -32,8 +29,9 @@ if TYPE_CHECKING:
     from vnet.node import Node
 
 
-def nothing() -> None:
-    """Do nothing: scheduled only to wake the loop, when a job is done."""
+def node_of(handle: asyncio.Handle) -> Node | None:
+    """Return the node whose callback this is."""
+    return getattr(handle, "node", None)
 
 
 LONGEST_NAME = 100
@@ -54,6 +52,10 @@ class ReadyQueue(deque[asyncio.Handle]):
         super().__init__(ready)
         self._holds: Callable[[asyncio.Handle], bool] = lambda handle: False
         self._held: list[asyncio.Handle] = []
+        self.running: asyncio.Handle | None = None
+        """The callback that runs; None while the loop waits."""
+        self.has_run = False
+        """True if a callback has run since this was set to False."""
 
     def append(self, handle: asyncio.Handle) -> None:
         """Add a callback behind the others, unless it is held."""
@@ -64,7 +66,8 @@ class ReadyQueue(deque[asyncio.Handle]):
 
     def popleft(self) -> asyncio.Handle:
         """Remove and return the next callback, which is about to run."""
-        handle = super().popleft()
+        self.running = handle = super().popleft()
+        self.has_run = True
         if self.on_taken is not None:
             self.on_taken(handle)
         return handle
@@ -160,9 +163,6 @@ class OrderedQueue(ReadyQueue):
         self._sources: dict[int, str] = {}
         self.steps: Counter[str] = Counter()
         """Decisions of each node so far."""
-        self._thread = threading.get_ident()
-        self._called_back = False
-        """True if a job has called into the loop from its thread: it may wait for an answer."""
         self.decides = True
         """False: as FIFO from now on, because the programs are ended."""
         for handle in ready:
@@ -172,9 +172,7 @@ class OrderedQueue(ReadyQueue):
 
     def append(self, handle: asyncio.Handle) -> None:
         """Take a callback that is ready, or a timer that is due."""
-        node = asyncio_internals.context_of(handle).get(current_node)
-        if threading.get_ident() != self._thread and not handle.cancelled():
-            self._called_back = self._called_back or asyncio_internals.callback_of(handle) is not nothing
+        node = node_of(handle)
         if node is None or self._holds(handle):
             super().append(handle)
         elif isinstance(handle, NumberedTimer):
@@ -231,8 +229,7 @@ class OrderedQueue(ReadyQueue):
     def popleft(self) -> asyncio.Handle:
         """Remove and return the next callback, which is about to run."""
         handle = super().popleft()
-        node = asyncio_internals.context_of(handle).get(current_node)
-        self._running = node, self._sources.pop(id(handle), STARTED), object()
+        self._running = node_of(handle), self._sources.pop(id(handle), STARTED), object()
         return handle
 
     def compose(self) -> bool:
@@ -261,12 +258,10 @@ class OrderedQueue(ReadyQueue):
             rounds.events.clear()
             return
         while (event := rounds.awaited or self._next(node, rounds)) is not None:
-            if event.job is not None and not event.job.done() and not self._called_back:
+            if event.job is not None and not event.job.done():
                 rounds.awaited = event
                 return
             rounds.awaited = None
-            if event.job is not None and not event.job.done():  # it may wait for what is ready
-                break
             (rounds.events if event.job is None else rounds.jobs).remove(event)
             self._running = node, event.source, event
             event.show()

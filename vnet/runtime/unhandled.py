@@ -9,7 +9,6 @@ program ends: nothing here depends on when the collector runs.
 from __future__ import annotations
 
 import asyncio
-import contextvars
 import sysconfig
 import threading
 import traceback
@@ -21,10 +20,11 @@ from typing import Any
 
 from vnet.node import Node
 from vnet.runtime import asyncio_internals, outside_loop
-from vnet.runtime.current_node import current_node
+from vnet.runtime.current_node import NOBODY, current_node, present_node
 from vnet.runtime.outside_loop import Job, collector
 from vnet.runtime.process_end import ProcessEndedError
 from vnet.runtime.programs import error_line, leaves
+from vnet.runtime.ready_queue import node_of
 from vnet.runtime.virtual_time import SkewedLoop
 from vnet.transport.wire import Unhandled
 
@@ -39,7 +39,6 @@ NOT_THE_PROGRAM = (
     *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
 )
 """Folders of code that is no program: vnet, the standard library, installed packages."""
-_NO_CONTEXT = contextvars.Context()
 _SHIELDED = "exception in shielded future"
 """End of asyncio's message, from Python 3.14 on, about a future whose caller was cancelled: that is legal."""
 
@@ -94,7 +93,7 @@ class UnhandledExceptions:
             if asyncio_internals.is_unretrieved(task):
                 self._note(task, owner, "in a task")
 
-        task.add_done_callback(done, context=_NO_CONTEXT)
+        task.add_done_callback(done, context=NOBODY)
         if owner is not None:
             outside_loop.watch(owner, self._failed_outside)
 
@@ -168,7 +167,7 @@ class UnhandledExceptions:
     def _failed(self, future: asyncio.Future[Any]) -> None:
         """A future, which is no task, was given an exception."""
         context = getattr(future, "job_context", None)
-        owner = current_node.get() if context is None else context.get(current_node)
+        owner = present_node() if context is None else context.get(current_node)
         place = "in a future" if context is None else "in an executor job"
         for each in asyncio_internals.gathered(future):
             failure = self._failures.get(id(each))
@@ -203,18 +202,18 @@ class UnhandledExceptions:
     def _owner_of(self, context: dict[str, Any]) -> Node | None:
         """Return the node that has left what asyncio's exception handler gets."""
         if (handle := context.get("handle")) is not None:
-            return asyncio_internals.context_of(handle).get(current_node)
+            return node_of(handle)
         future = context.get("future", context.get("task"))
         for each in () if future is None else (future, *asyncio_internals.gathered(future)):
             if (failure := self._failures.get(id(each))) is not None:
                 return failure.owner
-        return current_node.get()
+        return present_node()
 
     def _failure_of(self, context: dict[str, Any], error: BaseException) -> _Failure:
         future = context.get("future")
         if future is None:
             handle = context.get("handle")
-            owner = current_node.get() if handle is None else asyncio_internals.context_of(handle).get(current_node)
+            owner = present_node() if handle is None else node_of(handle)
             return _Failure(_nothing, self._now_ns(owner), owner, "in a callback")
         for each in (future, *asyncio_internals.gathered(future)):
             failure = self._failures.get(id(each))
@@ -222,7 +221,7 @@ class UnhandledExceptions:
                 if each is future:
                     self._failures.pop(id(each), None)  # `_forget_retrieved` may have, in another thread
                 return failure
-        owner = current_node.get()
+        owner = present_node()
         return _Failure(_nothing, self._now_ns(owner), owner, "in a future")
 
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:

@@ -13,11 +13,14 @@ virtual loop spins for ever (cpython#116342).
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import selectors
 import sys
+import threading
 from collections.abc import Callable, Coroutine
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
+from concurrent.futures import Future as Job
 from contextvars import Context, copy_context
 from functools import partial
 from itertools import count
@@ -26,11 +29,13 @@ from weakref import WeakKeyDictionary
 
 from vnet.errors import VirtualTimeError
 from vnet.runtime import asyncio_internals
-from vnet.runtime.asyncio_internals import NumberedTimer
+from vnet.runtime.asyncio_internals import NodeHandle, NumberedTimer
 from vnet.runtime.cpu_meter import CpuMeter
-from vnet.runtime.current_node import current_node
+from vnet.runtime.current_node import current_node, present_node
 from vnet.runtime.event_order import Chooser
-from vnet.runtime.ready_queue import OrderedQueue, ReadyQueue, nothing
+from vnet.runtime.outside_loop import collected_by_schedule
+from vnet.runtime.own_asyncio import Future, Task
+from vnet.runtime.ready_queue import OrderedQueue, ReadyQueue
 from vnet.transport.orders import Deviation
 from vnet.transport.wire import ClockError
 from vnet.units import NS_PER_S
@@ -38,6 +43,8 @@ from vnet.units import NS_PER_S
 if TYPE_CHECKING:
     from vnet.node import Node
 
+MOST_GENERATORS = 10_000
+"""Async generators whose nodes are remembered before those that are gone are forgotten."""
 LATEST_S = 1e9
 """Timers after this, more than thirty years, are for never."""
 
@@ -64,14 +71,18 @@ class SkewedLoop(asyncio.SelectorEventLoop):
     """Called when a future, which is no task, is given an exception."""
     on_unhandled: Callable[[dict[str, Any]], bool] = staticmethod(lambda context: True)
     """Called with what asyncio's own exception handler gets; returns whether to log it."""
-    owner_of: Callable[[dict[str, Any]], Node | None] = staticmethod(lambda context: current_node.get())
+    owner_of: Callable[[dict[str, Any]], Node | None] = staticmethod(lambda context: present_node())
     """Called with the same; returns the node that has left the exception unhandled."""
+    on_task: Callable[[Task], None] = staticmethod(lambda task: None)
+    """Called with each new task."""
 
     def __init__(self, selector: selectors.BaseSelector | None = None) -> None:
         self._handlers: WeakKeyDictionary[Node, Callable[[Any, dict[str, Any]], object] | None] = (
             WeakKeyDictionary()
         )
+        self._factories: WeakKeyDictionary[Node, Any] = WeakKeyDictionary()
         super().__init__(selector)
+        super().set_task_factory(self._new_task)
 
     @property
     def now_ns(self) -> int:
@@ -92,19 +103,59 @@ class SkewedLoop(asyncio.SelectorEventLoop):
 
     def stop(self) -> None:
         """Stop the loop; programs may not. Raises RuntimeError for them."""
-        if current_node.get() is not None:
-            raise RuntimeError(
-                "loop.stop(): the loop is not the program's own; return from main to end the program"
-            )
+        self._check_not_a_program("stop", "return from main to end the program")
         super().stop()
+
+    async def shutdown_default_executor(self, *timeout: Any, **options: Any) -> None:
+        """Shut the threads of jobs down; programs may not. Raises RuntimeError for them."""
+        self._check_not_a_program("shutdown_default_executor", "use an executor of your own to shut one down")
+        await super().shutdown_default_executor(*timeout, **options)
+
+    async def shutdown_asyncgens(self) -> None:
+        """Close all async generators; programs may not. Raises RuntimeError for them."""
+        self._check_not_a_program("shutdown_asyncgens", "close your own generators by aclose()")
+        await super().shutdown_asyncgens()
+
+    def _check_not_a_program(self, call: str, instead: str) -> None:
+        if present_node() is not None:
+            raise RuntimeError(f"loop.{call}(): the loop is not the program's own; {instead}")
 
     def create_future(self) -> asyncio.Future[Any]:
         """Make a future that tells the loop when it fails."""
-        return _TellingFuture(loop=self)
+        return Future(loop=self)
+
+    def set_task_factory(self, factory: Any) -> None:
+        """Have tasks made by `factory`: those of the program that asks, and of nobody else."""
+        node = present_node()
+        if node is None:
+            super().set_task_factory(factory)
+        else:
+            self._factories[node] = factory
+
+    def get_task_factory(self) -> Any:
+        """Return what makes tasks for the program that asks, None if it has set nothing."""
+        node = present_node()
+        return super().get_task_factory() if node is None else self._factories.get(node)
+
+    def _new_task(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        coroutine: Any,
+        context: Context | None = None,
+        **options: Any,  # from Python 3.13.3 on: the name, and whatever else a task takes
+    ) -> asyncio.Task[Any]:
+        factory = self._factories.get(node) if self._factories and (node := present_node()) is not None else None
+        if factory is None:
+            return Task(coroutine, loop=loop, context=context, **options)
+        if factory is getattr(asyncio, "eager_task_factory", None):
+            return Task(coroutine, loop=loop, context=context, eager_start=True, **options)
+        if context is not None:
+            options["context"] = context
+        return factory(loop, coroutine, **options)  # type: ignore[no-any-return]
 
     def set_exception_handler(self, handler: Callable[[Any, dict[str, Any]], object] | None) -> None:
         """Set the handler of what the node leaves unhandled on whose behalf this is called; others keep theirs."""
-        if (node := current_node.get()) is None:
+        if (node := present_node()) is None:
             super().set_exception_handler(handler)
         elif handler is not None and not callable(handler):
             raise TypeError(f"A callable object or None is expected, got {handler!r}")
@@ -113,7 +164,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
 
     def get_exception_handler(self) -> Callable[[Any, dict[str, Any]], object] | None:
         """Return the handler of the node on whose behalf this is called."""
-        node = current_node.get()
+        node = present_node()
         return super().get_exception_handler() if node is None else self._handlers.get(node)
 
     def call_exception_handler(self, context: dict[str, Any]) -> None:
@@ -143,7 +194,7 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         """Run a job as asyncio does; the future knows on whose behalf."""
         context = Context() if executor is None else copy_context()  # the default executor's threads are nobody's
         outer = context.run(super().run_in_executor, executor, func, *args)
-        if isinstance(outer, _TellingFuture):
+        if isinstance(outer, Future):
             outer.job_context = copy_context()
         return outer
 
@@ -157,18 +208,6 @@ class SkewedLoop(asyncio.SelectorEventLoop):
         """Time on the loop's own clock at which the clock of the task that asks shows `when`."""
         clock_error = self.clock_error_of()
         return when if clock_error is None else self.own_time() + (when - self.time()) / (1 + clock_error.rate)
-
-
-class _TellingFuture(asyncio.Future[Any]):
-    """A future that tells its loop when it fails; `job_context` is that of the executor job whose result it is."""
-
-    job_context: Context | None = None
-
-    def set_exception(self, exception: type | BaseException, /) -> None:
-        super().set_exception(exception)
-        loop = self.get_loop()
-        assert isinstance(loop, SkewedLoop)
-        loop.on_failed(self)
 
 
 class VirtualTimeLoop(SkewedLoop):
@@ -185,12 +224,18 @@ class VirtualTimeLoop(SkewedLoop):
         self._rounds = 0
         self._now_ns = 0
         self._ending = False
-        self._jobs: list[tuple[Future[Any], asyncio.Future[Any]]] = []
+        self._jobs: list[tuple[Job[Any], asyncio.Future[Any]]] = []
         self._timers = count()
         self._meter: CpuMeter | None = None
         self._ordered: OrderedQueue | None = None
-        self.before_job: Callable[[], None] = nothing
+        self._thread: int | None = None
+        self._collect_every_ns: int | None = None
+        self._collection_ns: int | None = None
+        self._generators: dict[int, Node] = {}
+        self.before_job: Callable[[], None] = lambda: None
         super().__init__(_YieldingSelector(self._wait))
+        self._queue = ReadyQueue(())
+        asyncio_internals.replace_ready_queue(self, self._queue)
         asyncio_internals.set_clock_resolution(self, 0.5 / NS_PER_S)  # no timer fires before its nanosecond
 
     @property
@@ -204,7 +249,7 @@ class VirtualTimeLoop(SkewedLoop):
 
     def measure(self, meter: CpuMeter) -> None:
         """Let `meter` measure what the callbacks cost, from the next round on."""
-        self._ready_queue().on_taken = meter.begin
+        self._queue.on_taken = meter.begin
         self._meter = meter
 
     def order(
@@ -215,25 +260,18 @@ class VirtualTimeLoop(SkewedLoop):
         Returns the queue in which events of this instant are put. `on_deviation` is told of choices that are not
         FIFO's. To be called before anything runs.
         """
-        ready = self._ready_queue()
-        self._ordered = OrderedQueue(ready, chooser_of, lambda: self._now_ns, on_deviation)
+        ready = self._queue
+        self._queue = self._ordered = OrderedQueue(ready, chooser_of, lambda: self._now_ns, on_deviation)
         self._ordered.on_taken = ready.on_taken
         asyncio_internals.replace_ready_queue(self, self._ordered)
         return self._ordered
-
-    def _ready_queue(self) -> ReadyQueue:
-        ready = asyncio_internals.ready_queue(self)
-        if not isinstance(ready, ReadyQueue):
-            ready = ReadyQueue(ready)
-            asyncio_internals.replace_ready_queue(self, ready)
-        return ready
 
     def hold(self, held: Callable[[asyncio.Handle], bool]) -> None:
         """Put aside, from now on, the callbacks that `held` says; the others go on. Called again, ends that.
 
         Timers that became due meanwhile are due when they are released: after what has come in by then, in order.
         """
-        for timer in self._ready_queue().release(held):
+        for timer in self._queue.release(held):
             asyncio_internals.push_timer(self, timer)
 
     def own_time(self) -> float:
@@ -245,14 +283,90 @@ class VirtualTimeLoop(SkewedLoop):
     ) -> asyncio.TimerHandle:
         """Call at `when` on the clock of the task that asks, at the nearest nanosecond."""
         asyncio_internals.check_not_closed(self)
+        self._check_thread()
         when = self._own_when(when)
         if when < LATEST_S:
             when = round(when * NS_PER_S) / NS_PER_S
         timer = NumberedTimer(next(self._timers), when, callback, args, self, context)
+        timer.node = self._node_of(timer, callback)
         if self._ordered is not None:
-            timer.setter = self._ordered.setter(current_node.get(), asyncio.current_task(self))
+            timer.setter = self._ordered.setter(present_node(), asyncio.current_task(self))
         asyncio_internals.push_timer(self, timer)
         return timer
+
+    # Whose a callback is: its context says so, unless it is one of the program's own making.
+
+    @property
+    def running_node(self) -> Node | None:
+        """Node of the callback that runs."""
+        return getattr(self._queue.running, "node", None)
+
+    def _call_soon(self, callback: Callable[..., object], args: Any, context: Context | None) -> asyncio.Handle:
+        self._check_thread()
+        handle = NodeHandle(callback, args, self, context)
+        handle.node = self._node_of(handle, callback)
+        asyncio_internals.push_ready(self, handle)
+        return handle
+
+    def _node_of(self, handle: asyncio.Handle, callback: Callable[..., object]) -> Node | None:
+        node = asyncio_internals.context_of(handle).get(current_node, self)
+        if node is not self:
+            return node  # type: ignore[return-value]
+        task = getattr(callback, "__self__", None)
+        return task.node if isinstance(task, Task) else self.running_node
+
+    def _check_thread(self) -> None:
+        if self._thread is not None and self._thread != threading.get_ident():
+            raise RuntimeError(
+                "a thread calls into the event loop (loop.call_soon_threadsafe(), a future's set_result(), "
+                "asyncio.run_coroutine_threadsafe()): in lockstep nothing says at which emulated time it acts; "
+                "return a value from asyncio.to_thread() or loop.run_in_executor(), and act on it in the task; or "
+                'run.pacing = "realtime"'
+            )
+
+    def _asyncgen_firstiter_hook(self, generator: Any) -> None:
+        super()._asyncgen_firstiter_hook(generator)  # type: ignore[misc]
+        node = present_node()
+        if node is not None:
+            self._generators[id(generator)] = node
+        if len(self._generators) > MOST_GENERATORS:
+            living = {id(each) for each in asyncio_internals.generators(self)}
+            self._generators = {key: node for key, node in self._generators.items() if key in living}
+
+    def _asyncgen_finalizer_hook(self, generator: Any) -> None:
+        context = Context()
+        context.run(current_node.set, self._generators.pop(id(generator), None))
+        context.run(super()._asyncgen_finalizer_hook, generator)  # type: ignore[misc]
+
+    # The garbage collector: what it discards may act, so it runs at instants that depend on emulated time alone.
+
+    def collect_every(self, time_ns: int) -> None:
+        """Have garbage collected at multiples of `time_ns`, before anything else, after which anything has run."""
+        self._collect_every_ns = time_ns
+
+    def run_forever(self) -> None:
+        """Run until the loop is stopped."""
+        self._thread = threading.get_ident()
+        try:
+            with collected_by_schedule():
+                super().run_forever()
+        finally:
+            self._thread = None
+
+    def _pass_on(self, next_timer_ns: int | None) -> None:
+        """Yield until the next timer, or the next collection."""
+        every_ns = self._collect_every_ns
+        if self._queue.has_run and every_ns is not None and self._collection_ns is None:
+            self._collection_ns = (self._now_ns // every_ns + 1) * every_ns
+        self._queue.has_run = False
+        if self._collection_ns is None:
+            self._now_ns = self._exchange(next_timer_ns)
+            return
+        wake_ns = self._collection_ns if next_timer_ns is None else min(next_timer_ns, self._collection_ns)
+        self._now_ns = self._exchange(wake_ns)
+        if self._now_ns >= self._collection_ns:
+            self._collection_ns = None
+            gc.collect()
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
@@ -266,6 +380,7 @@ class VirtualTimeLoop(SkewedLoop):
         """Yield, in place of the selector's sleep."""
         if os.getpid() != self._process:
             _end_fork()
+        self._queue.running = None
         if self._meter is not None:
             self._meter.end()
         if self._ordered is not None:
@@ -287,7 +402,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._rounds = 0
         if self._meter is not None:
             self._meter.end_instant()
-        self._now_ns = self._exchange(next_timer_ns)
+        self._pass_on(next_timer_ns)
         return []
 
     def _count_round(self) -> None:
@@ -317,16 +432,15 @@ class VirtualTimeLoop(SkewedLoop):
         else:
             context = copy_context()
         job = context.run(executor.submit, func, *args)
-        outer = _TellingFuture(loop=self)
+        outer = Future(loop=self)
         outer.job_context = copy_context()
-        node = current_node.get()
+        node = present_node()
         if self._ordered is None or node is None:
             self._jobs.append((job, outer))
         else:
             name = getattr(func, "__qualname__", "a job")
             self._ordered.add_job(node, name, job, partial(_copy_result, job, outer))
-        # In nobody's context: a job that is done already calls back here, and it is no event of the node's.
-        job.add_done_callback(lambda _: self.call_soon_threadsafe(nothing, context=Context()))
+        job.add_done_callback(lambda _: asyncio_internals.wake(self))
         return outer
 
     def _wait_for_jobs(self, poll: Callable[[float | None], list[Any]]) -> list[Any]:
@@ -367,7 +481,7 @@ class _YieldingSelector(selectors.DefaultSelector):
         return self._wait(timeout, super().select)
 
 
-def _copy_result(job: Future[Any], outer: asyncio.Future[Any]) -> None:
+def _copy_result(job: Job[Any], outer: asyncio.Future[Any]) -> None:
     if outer.done():
         return
     if job.cancelled():

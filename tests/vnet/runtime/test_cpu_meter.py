@@ -1,22 +1,19 @@
 """CPU time and wake-ups of each node on a loop that hosts several."""
 
 import asyncio
-import contextvars
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
-from vnet.node import Node
+from vnet.runtime.asyncio_internals import NodeHandle
 from vnet.runtime.cpu_meter import CpuMeter
-from vnet.runtime.current_node import current_node
 
 
 def handle_of(node: str | None, loop: asyncio.AbstractEventLoop) -> asyncio.Handle:
-    """A callback in the context of a node."""
-    context = contextvars.copy_context()
-    if node is not None:
-        context.run(current_node.set, cast(Node, SimpleNamespace(id=node)))
-    return asyncio.Handle(lambda: None, [], loop, context)
+    """A callback of a node."""
+    handle = NodeHandle(lambda: None, [], loop)
+    handle.node = None if node is None else SimpleNamespace(id=node)
+    return handle
 
 
 def clock(*times_ns: int) -> Callable[[], int]:

@@ -154,14 +154,18 @@ def test_executor_results_appear_in_the_order_of_submission(loop: VirtualTimeLoo
     assert order == [0, 1, 2]
 
 
-def test_an_executor_job_may_call_back_into_the_loop(loop: VirtualTimeLoop) -> None:
-    async def answer() -> int:
-        return 7
+@pytest.mark.parametrize("call", ["call_soon", "call_soon_threadsafe", "call_later"])
+def test_a_thread_may_not_call_into_the_loop(loop: VirtualTimeLoop, call: str) -> None:
+    """Nothing says at which emulated time what it wants happens, nor in which order with what others do."""
 
-    async def program() -> int:
-        return await asyncio.to_thread(lambda: asyncio.run_coroutine_threadsafe(answer(), loop).result(10))
+    def job() -> None:
+        getattr(loop, call)(*((1.0, int) if call == "call_later" else (int,)))
 
-    assert run(loop, program) == 7
+    async def program() -> None:
+        with pytest.raises(RuntimeError, match=r"asyncio\.to_thread"):
+            await asyncio.to_thread(job)
+
+    run(loop, program)
 
 
 def test_an_exception_in_an_executor_reaches_the_program(loop: VirtualTimeLoop) -> None:

@@ -1,0 +1,15 @@
+"""Programs that do what asyncio offers give one trace, however their vehicles are divided into processes."""
+
+import pytest
+
+from tests.hunt.layouts import LIVE, SIMULATED, differences
+
+
+@pytest.mark.slow
+def test_random_programs_give_one_trace_in_simulated_layouts() -> None:
+    assert differences(range(6), SIMULATED) == []
+
+
+@pytest.mark.slow
+def test_a_random_program_gives_one_trace_in_all_layouts() -> None:
+    assert differences([2, 3], SIMULATED | LIVE) == []
