@@ -219,7 +219,7 @@ def _why_not_decided_again(recorded: RecordedRun) -> str:
         "in real time the machine has a part in it": run.pacing == "realtime",
         "the order of events was not FIFO": run.order != "fifo" or run.tape is not None,
         "the run was cut short": bool(recorded.event("interrupted", "stalled", "spun", "died")),
-        f"more than {MOST_RECEPTIONS:,} receptions": len(recorded.trace) > MOST_RECEPTIONS,
+        f"receptions: more than {MOST_RECEPTIONS:,}": len(recorded.trace) > MOST_RECEPTIONS,
         f"more than {MOST_BYTES:,} bytes": int(np.maximum(_originals(recorded)[3], 0).sum()) > MOST_BYTES,
         "programs send to single vehicles": bool((recorded.attempt > 0).any()),
         "programs choose power or bit rate": "gain_db" in recorded.trace.column_names,

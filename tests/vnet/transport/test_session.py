@@ -20,7 +20,7 @@ LEASE_MS = 10_000
 
 
 def test_what_is_too_large_does_not_reach_the_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(wire, "LARGEST_MESSAGE_BYTES", 2**20)
+    monkeypatch.setattr(wire, "LARGEST_BUNDLE_BYTES", 2**20)
     access, key = Access.create("r", [["v01"]]), keys.node_tx("r", "v01")
     received: zenoh.handlers.FifoChannel[zenoh.Sample] = zenoh.handlers.FifoChannel(10)
     with open_router("tcp/127.0.0.1:0", access, LEASE_MS) as router:
