@@ -162,7 +162,6 @@ def test_vehicles_that_stand_still_do_not_outlive_the_run(tmp_path: Path, number
 
 
 def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -> None:
-    """After the emulator was away once, and said for how long at most, agents wait as they did before."""
     faults = [
         {"kind": "emulator_restart", "at_s": 0.1, "down_s": 0.1},
         {"kind": "kill", "at_s": 0.3, "duration_s": 3000, "nodes": {"ids": ["v01"]}},
@@ -175,9 +174,6 @@ def test_a_killed_lockstep_run_leaves_no_process_and_no_router(tmp_path: Path) -
             assert process.poll() is None
         process.kill()
         wait_until_all_are_gone(folder)
-    for node in ("v02", "v03", "v04"):
-        last = (folder / "logs" / f"{node}.log").read_text().splitlines()[-1]
-        assert last == f"vnet-agent: {node}: the emulator has been gone for 0.5 s; ending"
 
 
 def test_in_real_time_processes_are_killed_restarted_and_paused_and_none_is_left(tmp_path: Path) -> None:

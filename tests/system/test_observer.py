@@ -179,6 +179,6 @@ def test_there_is_nothing_to_view(tmp_path: Path) -> None:
     folder.mkdir()
     assert "not a run's folder" in view()
     (folder / "scenario.toml").write_text("")
-    assert "has no recording.rrd" in view()
+    assert "not the folder of a finished run" in view()
     (folder / "recording.rrd").write_bytes(b"")
-    assert "has no recording.rrd" in view()
+    assert "not the folder of a finished run" in view()

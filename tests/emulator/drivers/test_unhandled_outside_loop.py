@@ -4,6 +4,7 @@ import _thread
 import asyncio
 import contextlib
 import gc
+import os
 import sys
 import threading
 from collections.abc import Awaitable, Callable
@@ -92,16 +93,10 @@ async def ignores_the_end_of_a_generator(node: Node) -> None:
 
 async def fails_in_a_raw_thread(node: Node) -> None:
     await asyncio.sleep(0.5)
-    over = threading.Event()
-
-    def fail() -> None:
-        try:
-            int("x")
-        finally:
-            over.set()
-
-    _thread.start_new_thread(fail, ())
-    over.wait()
+    before = _thread._count()
+    _thread.start_new_thread(int, ("x",))
+    while _thread._count() > before:  # no object to join
+        os.sched_yield()
     await asyncio.sleep(0.1)
     await sends(node)
 

@@ -114,7 +114,7 @@ def test_plain_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_goes_wrong_has_a_line_at_once(tmp_path: Path) -> None:
     file = io.StringIO()
     told(tmp_path / "run", PlainLines, file, program=CRASHING)
-    assert "   0.5 s  v02 crashed: RuntimeError: the battery is flat" in file.getvalue().splitlines()
+    assert "   0.5 s  v02 crashed: RuntimeError: the battery is flat, programs.py:" in file.getvalue()
 
 
 def test_plain_lines_of_joining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
