@@ -64,8 +64,8 @@ def test_a_leak_is_noted_with_its_rate_and_memory_taken_once_is_not(
         (["run"], ["v01"]),
         (["run", "--set", "run.nodes_per_process=2"], ["v01", "v02"]),
         (["run", "--hosts", "2"], ["v01"]),
-        (["simulate"], ["v01", "v02", "v03", "v04"]),
-        (["simulate", "--processes", "2"], ["v01", "v02"]),
+        (["simulate", "--quiet"], ["v01", "v02", "v03", "v04"]),
+        (["simulate", "--quiet", "--processes", "2"], ["v01", "v02"]),
     ],
 )
 def test_a_process_over_its_limit_ends_the_run_as_unknown(
