@@ -310,8 +310,8 @@ class Launcher:
     def stop(self, patience_s: float = 1.0) -> dict[str, Exit]:
         """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL.
 
-        Returns how those ended that ended by themselves, and those that were not going to, awake or asleep: one that
-        wanted to run and got no processor may have been about to end.
+        Returns the ends of those that ended by themselves, and of those that were not going to, awake or asleep:
+        one that wanted to run and got no processor may have been about to end.
         """
         before_ns = {name: cpu_time_ns(pid) or 0 for name, pid in self.pids.items()}
         ends = self._wait(patience_s, self._services)

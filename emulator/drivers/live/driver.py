@@ -53,7 +53,7 @@ class Driver(ABC):
         parts.inbox.handlers[self.message_type] = self.take
         parts.inbox.handlers[wire.Final] = self.take_final
         self._so_far: dict[str, wire.Traffic] = {}
-        """What is unhandled in processes that are to end, and from which nothing has come since."""
+        """Exceptions left unhandled so far in processes that are to end, until their last message comes."""
         self._sent: Contents[SentMessage] = Contents()
         """Messages that units have put on the backbone, and to which nothing has referred yet."""
         parts.inbox.on_sent = self.take_sent

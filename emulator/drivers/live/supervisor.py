@@ -107,7 +107,7 @@ class Supervisor:
         self._there: Collection[str] = ()
         """Processes that were there when all were told to end."""
         self._ends: dict[str, tuple[Exit, bool]] = {}
-        """How processes have ended, until it is told as a death, and whether all had been told to end by then."""
+        """Ends of processes until they are told as deaths, and whether all had been told to end by then."""
 
     def begin(self, processes: Iterable[Sequence[str]]) -> None:
         """Give each process (its nodes, its id first) a state, now that every node that must be there is ready."""
