@@ -12,7 +12,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 import zenoh
 from msgspec.structs import replace
@@ -22,6 +22,8 @@ from vnet.errors import TransportError, WireError
 from vnet.transport import keys, wire
 
 HELLO_PERIOD_S = 0.5
+TOLD_S = 5.0
+"""Seconds for which an agent waits for the answer of the emulator to what it has left unhandled, at most."""
 
 _WHERE = wire.encode(wire.StackRequest())
 
@@ -119,6 +121,16 @@ class Attachment:
         if self.units is not None:
             message = self.units.put(message)
         self._publishers[self.nodes[0]].put(wire.encode(message))
+
+    def say_so_far(self, traffic: wire.Traffic | None) -> None:
+        """Say what is unhandled before programs are ended, and wait until it has come: they may end the process."""
+        if traffic is None:
+            return
+        self.say(wire.Final(self.nonce, traffic, provisional=True))
+        deadline = time.monotonic() + TOLD_S
+        with suppress(RunOverError, TransportError):
+            while (wait_s := deadline - time.monotonic()) > 0:
+                self._next(wait_s)
 
     def publish(self, traffic: wire.Traffic) -> None:
         """Put a copy of each report on its key, where somebody listens."""

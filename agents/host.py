@@ -131,6 +131,7 @@ def _run_lockstep(
                 host.end_exited(leave)
     except RunOverError:
         ahead.close()
+        attachment.say_so_far(host.unhandled_so_far())
         host.close(loop)
         attachment.say(wire.Final(attachment.nonce, host.take_final()))
     finally:
@@ -201,6 +202,7 @@ class _RealTimeAgent:
         try:
             await self._over
         except RunOverError:
+            self._attachment.say_so_far(self._host.unhandled_so_far())
             await self._host.cancel()
             self._flush(final=True)
         finally:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from emulator.drivers.cpu_watch import cpu_time_ns
 from emulator.drivers.debugging import DebugPoint
 from emulator.drivers.process_group import GroupProcess
 from emulator.drivers.zygote import AGENT_ENVIRONMENT, ForkedProcess, Process, Zygote, ZygoteGoneError
@@ -28,9 +29,12 @@ from vnet.runtime.environment import SAME_ARITHMETIC
 from vnet.transport.access import Access, node_user
 from vnet.transport.credentials import Credentials
 from vnet.transport.scheduling import default_time_slice
+from vnet.units import NS_PER_S
 
 LOG_TAIL_LINES = 12
 LOWEST_PRIORITY = 19
+STARVED = 0.1
+"""Share of a processor below which a process that wants to run has got none: its machine keeps it from ending."""
 MOST_ZYGOTES = 3
 """Attempts to fork an agent: a zygote that has ended is started again."""
 
@@ -41,10 +45,14 @@ class Exit:
 
     status: int
     log_tail: str
+    overdue_s: float | None = None
+    """Seconds in which a process that was told to end has not, so that it was killed."""
 
     @property
     def how(self) -> str:
-        """In words: an exit status, or the signal that ended it."""
+        """In words: an exit status, or the signal that ended it, or that it did not end."""
+        if self.overdue_s is not None:
+            return f"did not end within {self.overdue_s:g} s"
         if self.status >= 0:
             return f"exit status {self.status}"
         try:
@@ -299,9 +307,17 @@ class Launcher:
         with suppress(KeyError, subprocess.TimeoutExpired):
             self._processes[name].wait(timeout_s)
 
-    def stop(self, patience_s: float = 1.0) -> None:
-        """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL."""
-        self._wait(patience_s, self._services)
+    def stop(self, patience_s: float = 1.0) -> dict[str, Exit]:
+        """End every process: wait for those that end by themselves, then SIGTERM, then SIGKILL.
+
+        Returns the ends of those that ended by themselves, and of those that were not going to, awake or asleep:
+        one that wanted to run and got no processor may have been about to end.
+        """
+        before_ns = {name: cpu_time_ns(pid) or 0 for name, pid in self.pids.items()}
+        ends = self._wait(patience_s, self._services)
+        for name, pid in self.pids.items():
+            if name not in self._services and not _is_starved(pid, before_ns[name], patience_s):
+                ends[name] = Exit(-signal.SIGKILL, self.log_tail(name), patience_s)
         for process in self._processes.values():
             process.terminate()
         self._wait(0.5)
@@ -312,17 +328,30 @@ class Launcher:
         self._processes.clear()
         if self._zygote is not None:
             self._zygote.close()
+        return ends
 
-    def _wait(self, timeout_s: float, but: Set[str] = frozenset()) -> None:
-        """Wait until all but these have ended."""
+    def _wait(self, timeout_s: float, but: Set[str] = frozenset()) -> dict[str, Exit]:
+        """Wait until all but these have ended; returns how those ended that have."""
         deadline = time.monotonic() + timeout_s
+        ends: dict[str, Exit] = {}
         while time.monotonic() < deadline:
             for name, process in list(self._processes.items()):
-                if process.poll() is not None:
+                if (status := process.poll()) is not None:
                     del self._processes[name]
+                    ends[name] = Exit(status, self.log_tail(name))
             if self._processes.keys() <= but:
-                return
+                break
             time.sleep(0.01)
+        return ends
+
+
+def _is_starved(pid: int, before_ns: int, wall_s: float) -> bool:
+    """Return whether a process wants to run, or waits for a disk, and has had less than a tenth of a processor."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:  # it has just ended, or this system does not say
+        return True
+    return state in "RD" and (cpu_time_ns(pid) or 0) - before_ns < STARVED * wall_s * NS_PER_S
 
 
 def _cannot_start(name: str, reason: str | None) -> VnetError:

@@ -300,6 +300,11 @@ class Host:
         """Return everything that the nodes have enqueued since the last call."""
         return self._outbox.take(self._unhandled.take())
 
+    def unhandled_so_far(self) -> wire.Traffic | None:
+        """Return the exceptions that nobody has handled by now, if there are any, and leave them."""
+        unhandled = self._unhandled.so_far()
+        return wire.Traffic(unhandled=unhandled) if unhandled else None
+
     def take_final(self) -> wire.Traffic:
         """Return what the emulator has not been told when the process ends: exceptions and notes."""
         self._take_process_ends()

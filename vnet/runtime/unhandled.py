@@ -39,6 +39,8 @@ NOT_THE_PROGRAM = (
     *(f"{sysconfig.get_path(name)}/" for name in ("stdlib", "purelib", "platlib")),
 )
 """Folders of code that is no program: vnet, the standard library, installed packages."""
+_NOT_ITS_OWN = (KeyboardInterrupt, ProcessEndedError)
+"""Exceptions that vnet has raised: the death of their vehicle has been told."""
 _SHIELDED = "exception in shielded future"
 """End of asyncio's message, from Python 3.14 on, about a future whose caller was cancelled: that is legal."""
 
@@ -114,6 +116,18 @@ class UnhandledExceptions:
         with self._lock:
             ready, self._ready = self._ready, []
         return sorted(ready, key=lambda each: (each.time_ns is None, each.time_ns))
+
+    def so_far(self) -> list[Unhandled]:
+        """Return what `settle` and `take` would, and leave it all: programs may still handle some of it."""
+        futures = [(failure, failure.future()) for failure in list(self._failures.values())]
+        unretrieved = [(each, f) for each, f in futures if f is not None and asyncio_internals.is_unretrieved(f)]
+        failed = [(failure, asyncio_internals.error_of(future)) for failure, future in unretrieved]
+        with self._lock:
+            ready, jobs = list(self._ready), list(self._jobs)
+        failed += [*self._held, *((failure, job.error) for failure, job in jobs if not job.is_awaited)]
+        heard = [(failure, error) for failure, error in failed if failure.owner not in self._silenced]
+        own = [(failure, error) for failure, error in heard if not isinstance(error, _NOT_ITS_OWN)]
+        return [*ready, *(self._of(failure, error) for failure, error in own if error is not None)]
 
     def settle(self, owner: Node | None = None) -> None:
         """Tell of everything that nobody has retrieved by now, of all nodes or of one whose program has ended."""
@@ -225,7 +239,7 @@ class UnhandledExceptions:
         return _Failure(_nothing, self._now_ns(owner), owner, "in a future")
 
     def _ready_unless_silenced(self, failure: _Failure, error: BaseException) -> None:
-        if not isinstance(error, KeyboardInterrupt | ProcessEndedError):  # whose vehicle's death has been told
+        if not isinstance(error, _NOT_ITS_OWN):
             self._tell(failure, error)
 
     def _tell(self, failure: _Failure, error: BaseException) -> None:

@@ -220,10 +220,15 @@ class Frames(Message, frozen=True):
 
 
 class Final(Message, frozen=True):
-    """Lockstep: what the programs of a process told as they were ended, after `End`."""
+    """What the programs of a process told as they were ended, after `End`; in lockstep, unless `provisional`.
+
+    Provisional, in both pacings, is what is unhandled before they are ended: it counts if nothing follows. The
+    emulator answers it with another `End`.
+    """
 
     nonce: bytes
     traffic: Traffic
+    provisional: bool = False
 
 
 class StackDump(Message, frozen=True):

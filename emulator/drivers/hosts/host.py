@@ -312,7 +312,9 @@ class HostProcess:
         self._up.put([*self._relay.take_bundle(), messages.HandingIn()])
         for thread in self._leaving.values():
             thread.join()
-        self._launcher.stop(order.patience_s)
+        for process_id, how in self._launcher.stop(order.patience_s).items():
+            serial = self._serials[process_id]
+            self._up.put([messages.Ended(process_id, serial, how.status, how.log_tail, how.overdue_s)])
         for item in self._left_behind():
             self._up.put([item])
 

@@ -162,12 +162,16 @@ class Token(Message, frozen=True):
 
 
 class Ended(Message, frozen=True):
-    """A process has ended without an order, or could not be started: serial number, status and end of its log."""
+    """A process has ended without an order, or could not be started: serial number, status and end of its log.
+
+    `overdue_s` is for how many seconds it was waited for, if it was killed because it did not end.
+    """
 
     process_id: str
     serial: int
     status: int
     log_tail: str
+    overdue_s: float | None = None
 
 
 class LogTail(Message, frozen=True):

@@ -51,6 +51,9 @@ class Driver(ABC):
         self._send = parts.attachment.send
         parts.supervisor.begin(processes)
         parts.inbox.handlers[self.message_type] = self.take
+        parts.inbox.handlers[wire.Final] = self.take_final
+        self._so_far: dict[str, wire.Traffic] = {}
+        """Exceptions left unhandled so far in processes that are to end, until their last message comes."""
         self._sent: Contents[SentMessage] = Contents()
         """Messages that units have put on the backbone, and to which nothing has referred yet."""
         parts.inbox.on_sent = self.take_sent
@@ -68,6 +71,17 @@ class Driver(ABC):
     @abstractmethod
     def take(self, process_id: str, message: Any) -> None:
         """Take a message of a process. Raises ProtocolError to refuse it."""
+
+    def take_final(self, process_id: str, message: wire.Final) -> None:
+        """Take what is unhandled in a process before its programs are ended. Raises ProtocolError to refuse it."""
+        check_ownership(self._parts.members.nodes_with(process_id), message.traffic)
+        if message.provisional:
+            self._so_far[process_id] = message.traffic
+            self._send(process_id, wire.End(message.nonce, "taken"))
+
+    def _tell_so_far(self, time_ns: int) -> None:
+        """Tell what is unhandled in processes that have gone without their last message."""
+        self._emulation.take_final(time_ns, self._so_far.values())
 
     @abstractmethod
     def take_sent(self, message: SentMessage) -> None:

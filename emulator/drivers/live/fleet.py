@@ -275,11 +275,11 @@ class Fleet:
             case messages.Token(node, alive):
                 self._check_node(host, node)
                 self.on_token(node, alive)
-            case messages.Ended(process_id, serial, status, log_tail):
+            case messages.Ended(process_id, serial, status, log_tail, overdue_s):
                 self._check_node(host, process_id)
                 if self._serials.get(process_id) == serial:
                     del self._serials[process_id]
-                    self.on_ended(process_id, Exit(status, log_tail))
+                    self.on_ended(process_id, Exit(status, log_tail, overdue_s))
             case messages.LogTail(process_id, text):
                 self._check_node(host, process_id)
                 self._log_tails[process_id] = text

@@ -14,7 +14,6 @@ from emulator.drivers.live.driver import Driver, Parts
 from emulator.drivers.live.supervisor import DEATH_GRACE_S, ProcessState
 from emulator.drivers.live.waiting import Stalled
 from emulator.drivers.lockstep import Lockstep
-from emulator.drivers.protocol import check_ownership
 from vnet.counted import counted
 from vnet.transport import wire
 from vnet.transport.backbone import SentMessage
@@ -53,7 +52,6 @@ class LockstepDriver(Driver):
         self._completed = False
         self._incomplete: dict[str, wire.Yield] = {}
         """Yields that refer to messages of the backbone that have not come."""
-        parts.inbox.handlers[wire.Final] = self._take_final
 
     @property
     def time_ns(self) -> int:
@@ -111,10 +109,13 @@ class LockstepDriver(Driver):
             lockstep.died(process_id, **details)
         self._completed = True
 
-    def _take_final(self, process_id: str, message: wire.Final) -> None:
-        check_ownership(self._parts.members.nodes_with(process_id), message.traffic)
-        self._finals[process_id] = message.traffic
-        self._changes.set()
+    def take_final(self, process_id: str, message: wire.Final) -> None:
+        """Take the last message of a process, or what it may leave unhandled."""
+        super().take_final(process_id, message)
+        if not message.provisional:
+            self._so_far.pop(process_id, None)
+            self._finals[process_id] = message.traffic
+            self._changes.set()
 
     async def finish(self, deadline_s: float) -> None:
         """Take what programs told as they were ended."""
@@ -122,10 +123,12 @@ class LockstepDriver(Driver):
         await self._all_final(there, deadline_s)
         time_ns = self._emulation.duration_ns if self._completed else self.time_ns
         self._emulation.take_final(time_ns, self._finals.values())
+        self._tell_so_far(time_ns)
 
     async def _await_final(self, process_id: str, time_ns: int) -> None:
         await self._all_final([process_id], time.monotonic() + FINAL_WAIT_S)
-        if (traffic := self._finals.pop(process_id, None)) is not None:
+        so_far = self._so_far.pop(process_id, None)
+        if (traffic := self._finals.pop(process_id, so_far)) is not None:
             self._emulation.take_final(time_ns, [traffic])
 
     async def _all_final(self, process_ids: Collection[str], deadline_s: float) -> None:

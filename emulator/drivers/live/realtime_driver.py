@@ -48,6 +48,8 @@ class RealTimeDriver(Driver):
                 self._late.update(missing)
             message = replace(message, traffic=replace(message.traffic, messages=here))
         self._realtime.receive(self.time_ns, process_id, message)
+        if message.final:
+            self._so_far.pop(process_id, None)
         self._changes.set()
 
     def take_sent(self, message: SentMessage) -> None:
@@ -100,6 +102,7 @@ class RealTimeDriver(Driver):
         while self._late and await self._changes.wait(deadline_s - time.monotonic()):
             pass
         self._realtime.gaps += len(self._late)
+        self._tell_so_far(self._emulation.duration_ns)
         self._realtime.finish()
         await self._supervisor.all_ended()
 

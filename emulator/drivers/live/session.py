@@ -49,7 +49,9 @@ LEASE_MS = 60_000
 PATIENCE_S = 0.5
 """Seconds for which a run that did not come to its end waits for its processes to end by themselves."""
 FULL_PATIENCE_S = 5.0
-"""Seconds for which a run that came to its end does."""
+"""Seconds for which a run that came to its end waits for processes that others have started."""
+END_LIMIT_S = 30.0
+"""Seconds for which it waits for those that it has started. Long: one that has not ended by then never does."""
 RECORDER_WAIT_S = 20.0
 """Seconds for which a run that came to its end waits for its recorder to write all down."""
 MEMORY_LOOK_S = 0.2
@@ -314,18 +316,22 @@ class LiveSession:
         for node in self._members.joined:
             self._attachment.send(node, wire.End(None, "the run is over"))
         self._supervisor.all_told_to_end()
-        deadline_s = time.monotonic() + (FULL_PATIENCE_S if completed else SHUT_DOWN_S)
+        patience_s = (END_LIMIT_S if self._options.launch else FULL_PATIENCE_S) if completed else PATIENCE_S
+        deadline_s = time.monotonic() + (patience_s if completed else SHUT_DOWN_S)
         if self._driver is not None:
             await self._driver.finish(deadline_s)
         if not self._options.launch:  # whoever closes at once may take the last messages along
             while self._inbox.connected and await self._changes.wait(deadline_s - time.monotonic()):
                 pass
         if self._fleet is not None:
-            await self._fleet.hand_in(FULL_PATIENCE_S if completed else PATIENCE_S)
+            await self._fleet.hand_in(patience_s)
         self._feed.end()
         if self._options.record is not None:
             self._launcher.wait_for(RECORDER, RECORDER_WAIT_S if completed else PATIENCE_S)
-        self._launcher.stop(FULL_PATIENCE_S if completed else PATIENCE_S)
+        ends = self._launcher.stop(patience_s)
+        for process_id, details in self._supervisor.take_last_deaths(ends).items() if completed else ():
+            for node in self._members.nodes_with(process_id):
+                self._emulation.folder.event(self._emulation.duration_ns, "died", node, **details)
 
     def _time_ns(self) -> int:
         """Emulated time for events; 0 before the start."""

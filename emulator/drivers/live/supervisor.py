@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -104,6 +104,10 @@ class Supervisor:
         self.reconnecting = False
         """True while the emulator itself is disconnected: lost connections then mean nothing."""
         self._all_told_to_end = False
+        self._there: Collection[str] = ()
+        """Processes that were there when all were told to end."""
+        self._ends: dict[str, tuple[Exit, bool]] = {}
+        """Ends of processes until they are told as deaths, and whether all had been told to end by then."""
 
     def begin(self, processes: Iterable[Sequence[str]]) -> None:
         """Give each process (its nodes, its id first) a state, now that every node that must be there is ready."""
@@ -205,8 +209,21 @@ class Supervisor:
         return returned
 
     def all_told_to_end(self) -> None:
-        """Take note that every process has been told to end: one that ends from now on has not died."""
+        """Take note that all have been told to end: a process that ends with status 0 from now on has not died."""
         self._all_told_to_end = True
+        self._there = self.processes_in(ProcessState.RUNNING, ProcessState.PAUSED)
+
+    def take_last_deaths(self, ends: Mapping[str, Exit]) -> dict[str, dict[str, Any]]:
+        """Return the deaths since all were told to end, and those not taken before; `ends` have just been seen.
+
+        A process lives until it has ended: with status 0, and by itself.
+        """
+        deaths = self.take_deaths()
+        for process_id, (how, told) in {**self._ends, **{name: (how, True) for name, how in ends.items()}}.items():
+            if process_id in self._there and (how.status or not told):
+                after = ", after the run was over" if told else ""
+                deaths[process_id] = {"how": f"{how.how}{after}", "log_tail": how.log_tail}
+        return deaths
 
     async def all_ended(self) -> None:
         """Wait for those that have been told to end."""
@@ -240,6 +257,7 @@ class Supervisor:
     def child_ends(self, name: str, how: Exit) -> None:
         """Take note that a process has just ended: its last messages may still arrive."""
         loop = asyncio.get_running_loop()
+        self._ends[name] = how, self._all_told_to_end
         loop.call_later(DEATH_GRACE_S, self.child_ended, name, how, self._all_told_to_end)
 
     def host_lost(self, process_ids: Sequence[str], how: str) -> None:
@@ -250,6 +268,8 @@ class Supervisor:
     def child_ended(self, name: str, how: Exit, told_to_end: bool = False) -> None:
         """Take note that a process that the run has started has ended, `told_to_end` or by itself."""
         is_host = name in map(host_user, self._options.access.hosts)
+        if not told_to_end:
+            self._ends.pop(name, None)
         if not self._attachment.knows(name) and not is_host:
             self._folder.event(self._time_ns(), "observer_ended", name, how=how.how)
         elif not self._processes:

@@ -55,9 +55,10 @@ class HostLauncher(FakeLauncher):
             del self.pids[name]
         return ends
 
-    def stop(self, patience_s: float) -> None:
+    def stop(self, patience_s: float) -> dict[str, Exit]:
         self.pids.clear()
         self.done.append(("stop", str(patience_s)))
+        return {}
 
 
 class Sides:
