@@ -32,9 +32,11 @@ def main() -> None:
     if command is not None and command.runs_programs:
         fix_hash_seed("emulator.cli")  # before any import that takes long, because it starts this process again
     from emulator.cli.application import build_app
+    from emulator.cli.own_child import this_process_is_a_command
     from emulator.terminal import console, standard_streams
 
     standard_streams.tolerate_failures()
+    this_process_is_a_command()
     status = console.run_app(build_app([] if command is None else [command]), arguments)
     interrupts.finish(status)
     if failure := standard_streams.failure():

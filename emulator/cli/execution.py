@@ -94,8 +94,11 @@ def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[
         _run_live(emulation, options, request.asked, request.output)
 
 
-def run_simulated(request: Request, processes: str) -> None:
-    """Run the programs in this process, or in so many others, without Zenoh; exits with the verdict's status."""
+def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], None], apart: str | None) -> None:
+    """Run the programs in this process, or in so many others, without Zenoh; exits with the verdict's status.
+
+    `on_folder` is told the run's folder once it is made; `apart` is a vehicle that needs a process of its own.
+    """
     request = request.with_order_steps()
     world = build_world(request.scenario)
     count = process_count(processes, len(world.node_ids))
@@ -104,6 +107,7 @@ def run_simulated(request: Request, processes: str) -> None:
     for entry in entries_of(request.scenario):
         load_program(entry)
     emulation.folder.open(request.scenario)
+    on_folder(emulation.folder.path)
     request.output.keep_in(emulation.folder.logs)
     with _progress(emulation, request.asked) as progress:
         with ExitStack() as stack:
@@ -112,7 +116,9 @@ def run_simulated(request: Request, processes: str) -> None:
             say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
             debug = request.asked.debug
             stack.enter_context(calls_recorded(emulation.folder.path, request.asked.check_determinism is not None))
-            wall_s, interrupted = run_simulation(emulation, on_interrupt=say, debug=debug, processes=count)
+            wall_s, interrupted = run_simulation(
+                emulation, on_interrupt=say, debug=debug, processes=count, apart=apart
+            )
         _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
 
 

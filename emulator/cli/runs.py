@@ -45,6 +45,7 @@ from emulator.cli.options import (
     host_names,
     load,
 )
+from emulator.cli.own_child import OwnChild, may_fork
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, one_line_errors, say_first
 from emulator.terminal.standard_output import result_only
@@ -145,10 +146,13 @@ def simulate(
             raise VnetError("--debug and --processes exclude each other")
         asked = replace(asked, debug=debug_target(debug, loaded, asked.only_the_result))
         _announce(loaded, asked)
+        child, apart = OwnChild(), None
+        if processes == "1" and asked.debug is None and may_fork():
+            apart = child.fork()
         with ended_at_once():
             from emulator.cli.execution import Request, run_simulated
 
-        run_simulated(Request(loaded, scenario, out, sinks, asked, output), processes)
+        run_simulated(Request(loaded, scenario, out, sinks, asked, output), processes, child.told, apart)
 
 
 def emulator(
