@@ -60,7 +60,7 @@ class OwnChild:
         forwarded |= signal.sigpending() & set(FORWARDED)
         signal.signal(signal.SIGCHLD, handler)
         vehicle, ended = running_node.running.read(), os.waitstatus_to_exitcode(status)
-        if vehicle and not forwarded:
+        if vehicle and not forwarded and ended != -signal.SIGKILL:  # which the system sends if memory is short
             running_node.running.show("")
             if folder := self._folder[:].rstrip(b"\0"):
                 shutil.rmtree(os.fsdecode(folder), ignore_errors=True)

@@ -220,9 +220,9 @@ class Frames(Message, frozen=True):
 
 
 class Final(Message, frozen=True):
-    """What the programs of a process told as they were ended, after `End`; in lockstep, unless `provisional`.
+    """The last traffic of a process whose programs were ended, after `End`; in lockstep, unless `provisional`.
 
-    Provisional, in both pacings, is what is unhandled before they are ended: it counts if nothing follows. The
+    Provisional, in both pacings, are exceptions unhandled before they are ended: they count if nothing follows. The
     emulator answers it with another `End`.
     """
 
