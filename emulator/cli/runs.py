@@ -136,7 +136,7 @@ def simulate(
     verbose: VerboseOption = False,
     report: ReportOption = True,
 ) -> None:
-    """Run a scenario without Zenoh, in lockstep, in this one process or in a few: the same trace, faster."""
+    """Run a scenario without Zenoh, in lockstep, in one process or in a few: the same trace, faster."""
     asked = OutputOptions(log_format, quiet, check_determinism, report, verbose)
     with one_line_errors(log_format), result_only(asked.only_the_result) as output:
         order_asked = OrderOptions(order, order_seed, tape)
