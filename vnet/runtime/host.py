@@ -477,6 +477,7 @@ class Host:
         self._left = asyncio_internals.abandon_pending(tasks)
         del tasks  # it would keep their exceptions from being discarded
         self._settle()
+        self._thread = None  # what is left of programs is silent, and any thread's collector may find it
 
     def discard_abandoned(self) -> None:
         """Discard what is left of programs that were killed or wait at the end, after the loop has been closed."""

@@ -58,8 +58,9 @@ def _replace() -> None:
     for name in ("_exit", "execv", "execve"):
         original = getattr(os, name)
         if not hasattr(original, "__wrapped__"):
+            replacement = _replacement(name, original)  # one, so that it can be pickled by its name
             for module in (os, posix):
-                setattr(module, name, _replacement(name, original))
+                setattr(module, name, replacement)
 
 
 def _replacement(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
