@@ -14,12 +14,16 @@ class RunningNode:
     def __init__(self) -> None:
         self._memory = mmap.mmap(-1, LONGEST_ID)
         self._shown = ""
+        self._written: dict[str, bytes] = {}
+        """What stands for each node in the memory."""
 
     def show(self, node: str) -> None:
         """Write down that this node's code runs; "" is nobody's."""
         if node != self._shown:
             self._shown = node
-            self._memory[:] = node.encode().ljust(LONGEST_ID, b"\0")[:LONGEST_ID]
+            if (written := self._written.get(node)) is None:
+                written = self._written[node] = node.encode().ljust(LONGEST_ID, b"\0")[:LONGEST_ID]
+            self._memory[:] = written
 
     def read(self) -> str:
         """Return what was written down last, by any process."""

@@ -43,6 +43,8 @@ from vnet.units import NS_PER_S
 if TYPE_CHECKING:
     from vnet.node import Node
 
+OLD_A_YOUNG = 10
+"""Collections of young garbage for one of all: a full one looks at everything, and empties Python's free lists."""
 MOST_GENERATORS = 10_000
 """Async generators whose nodes are remembered before those that are gone are forgotten."""
 LATEST_S = 1e9
@@ -230,7 +232,8 @@ class VirtualTimeLoop(SkewedLoop):
         self._ordered: OrderedQueue | None = None
         self._thread: int | None = None
         self._collect_every_ns: int | None = None
-        self._collection_ns: int | None = None
+        self._collections_ns: dict[int, int] = {}
+        """When garbage of each generation is collected next; nothing is due for those that are not in it."""
         self._generators: dict[int, Node] = {}
         self.before_job: Callable[[], None] = lambda: None
         super().__init__(_YieldingSelector(self._wait))
@@ -341,7 +344,10 @@ class VirtualTimeLoop(SkewedLoop):
     # The garbage collector: what it discards may act, so it runs at instants that depend on emulated time alone.
 
     def collect_every(self, time_ns: int) -> None:
-        """Have garbage collected at multiples of `time_ns`, before anything else, after which anything has run."""
+        """Have young garbage collected at multiples of `time_ns`, and all of it at multiples of ten times that.
+
+        It is collected before anything else of the instant, and only if anything has run since the last time.
+        """
         self._collect_every_ns = time_ns
 
     def run_forever(self) -> None:
@@ -355,18 +361,21 @@ class VirtualTimeLoop(SkewedLoop):
 
     def _pass_on(self, next_timer_ns: int | None) -> None:
         """Yield until the next timer, or the next collection."""
-        every_ns = self._collect_every_ns
-        if self._queue.has_run and every_ns is not None and self._collection_ns is None:
-            self._collection_ns = (self._now_ns // every_ns + 1) * every_ns
+        if self._queue.has_run and self._collect_every_ns is not None:
+            self._plan_collections(self._collect_every_ns)
         self._queue.has_run = False
-        if self._collection_ns is None:
-            self._now_ns = self._exchange(next_timer_ns)
-            return
-        wake_ns = self._collection_ns if next_timer_ns is None else min(next_timer_ns, self._collection_ns)
-        self._now_ns = self._exchange(wake_ns)
-        if self._now_ns >= self._collection_ns:
-            self._collection_ns = None
-            gc.collect()
+        wakes_ns = [*self._collections_ns.values()] + ([] if next_timer_ns is None else [next_timer_ns])
+        self._now_ns = self._exchange(min(wakes_ns, default=None))
+        for generation, time_ns in list(self._collections_ns.items()):
+            if self._now_ns >= time_ns:
+                del self._collections_ns[generation]
+                if gc.collect(generation) and self._collect_every_ns is not None:
+                    self._plan_collections(self._collect_every_ns)  # what was discarded may have left more
+
+    def _plan_collections(self, every_ns: int) -> None:
+        for generation, period_ns in ((1, every_ns), (2, OLD_A_YOUNG * every_ns)):
+            if generation not in self._collections_ns:
+                self._collections_ns[generation] = (self._now_ns // period_ns + 1) * period_ns
 
     def finish(self, main: Coroutine[Any, Any, None]) -> None:
         """Run until `main` is done without ever yielding again. Raises LoopAbandonedError if it waits."""
