@@ -15,7 +15,7 @@ class RunningNode:
         self._memory = mmap.mmap(-1, LONGEST_ID)
         self._shown = ""
         self._written: dict[str, bytes] = {}
-        """What stands for each node in the memory."""
+        """The bytes that stand for each node."""
 
     def show(self, node: str) -> None:
         """Write down that this node's code runs; "" is nobody's."""

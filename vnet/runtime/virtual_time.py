@@ -233,7 +233,7 @@ class VirtualTimeLoop(SkewedLoop):
         self._thread: int | None = None
         self._collect_every_ns: int | None = None
         self._collections_ns: dict[int, int] = {}
-        """When garbage of each generation is collected next; nothing is due for those that are not in it."""
+        """The next collection of each generation; one that is not in it is not due."""
         self._generators: dict[int, Node] = {}
         self.before_job: Callable[[], None] = lambda: None
         super().__init__(_YieldingSelector(self._wait))
