@@ -8,14 +8,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
+from emulator.drivers.session import Session
 from emulator.drivers.status import Course, Snapshot
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import load_scenario
 from emulator.terminal.dashboard import Dashboard
 from emulator.terminal.painter import EVERY_S, Painter
-from emulator.world.world import build_world
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "faults.toml"
 OVERRIDES = ["network.vehicles=50", "program.entry=agents.beacon:main"]
@@ -25,12 +22,12 @@ def measure(width: int = 100, height: int = 30) -> dict[str, float]:
     """Medians in ms, and the share of a core, of a picture in which something changes at every redraw."""
     with tempfile.TemporaryDirectory() as folder:
         scenario = load_scenario(SCENARIO, OVERRIDES)
-        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(Path(folder) / "run", scenario))
-        course = Course(emulation)
+        session = Session(scenario, Path(folder) / "run").open()
+        course = Course(session.emulation)
         shots: list[Snapshot] = []
         snapshot_ms: list[float] = []
-        emulation.watch(lambda view: snapshot_ms.append(_ms(lambda: shots.append(course.snapshot()))))
-        simulate(emulation)
+        session.emulation.watch(lambda view: snapshot_ms.append(_ms(lambda: shots.append(course.snapshot()))))
+        session.run()
     with Path("/dev/null").open("w") as nobody:
         console = Console(file=nobody, force_terminal=True, width=width, height=height, color_system="truecolor")
         painter = Painter(console, lambda: Dashboard(shots[0]))

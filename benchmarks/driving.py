@@ -5,11 +5,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
+from emulator.drivers.session import Session
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 
 SCENARIO: dict[str, Any] = {
     "run": {"name": "driving", "duration_s": 20.0},
@@ -42,7 +39,8 @@ def measure() -> dict[str, float]:
 def measured(scenario: Scenario) -> dict[str, float]:
     """Return emulated by processor time, and the share of the vehicles' motion in it."""
     with tempfile.TemporaryDirectory(prefix="vnet-bench-") as folder:
-        emulation = Emulation(scenario, build_world(scenario), RunFolder.create(Path(folder) / "run", scenario))
+        session = Session(scenario, Path(folder) / "run").open()
+        emulation = session.emulation
         advance, moving_s = emulation.driving.advance_to, [0.0]
 
         def timed(time_ns: int) -> bool:
@@ -53,7 +51,7 @@ def measured(scenario: Scenario) -> dict[str, float]:
 
         emulation.driving.advance_to = timed  # type: ignore[method-assign]
         begun_s = time.process_time()
-        simulate(emulation)
+        session.run()
         cpu_s = time.process_time() - begun_s
     return {
         "emulated_by_cpu_time": scenario.run.duration_s / cpu_s,

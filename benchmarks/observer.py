@@ -19,13 +19,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from emulator.drivers.emulation import Emulation
 from emulator.drivers.observers import Messages
-from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RECORDING, RunFolder
+from emulator.drivers.session import Session
+from emulator.records.run_folder import RECORDING
 from emulator.scenario.scenario import Scenario
 from emulator.viewer.bound import HearsAllBound
-from emulator.world.world import build_world
 from vnet.transport import keys, wire
 from vnet.transport.access import OBSERVER, Access
 from vnet.transport.session import open_router, router_endpoint
@@ -80,11 +78,11 @@ def _told(folder: Path, vehicles: int, duration_s: float) -> list[tuple[str, dic
             "program": {"entry": "agents.cooperative:main"},
         }
     )
-    emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder / "run", scenario))
-    messages = Messages(emulation)
+    session = Session(scenario, folder / "run").open()
+    messages = Messages(session.emulation)
     told = [("scene", messages.scene())]
-    emulation.watch(lambda view: told.append(("period", messages.period(view))))
-    simulate(emulation)
+    session.emulation.watch(lambda view: told.append(("period", messages.period(view))))
+    session.run()
     return [*told, ("end", messages.end())]
 
 

@@ -12,12 +12,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.simulate import simulate
-from emulator.records.run_folder import RunFolder
+from emulator.drivers.session import Session
 from emulator.scenario.scenario import Scenario
 from emulator.world.driven.sumo_world import SumoWorld
-from emulator.world.world import build_world
 
 RUNS = 3
 PROGRAMS, VEHICLES = 50, 590
@@ -58,19 +55,19 @@ def _run(folder: Path, out: Path) -> dict[str, Any]:
     network |= {"start_s": START_S, "max_vehicles": PROGRAMS}
     scenario = Scenario.model_validate(SCENARIO | {"network": network})
     begun_s = time.monotonic()
-    world = build_world(scenario)
+    session = Session(scenario, out).open()
     start_s = time.monotonic() - begun_s
+    world = session.emulation.world
     assert isinstance(world, SumoWorld)
     background = world.vehicles.in_all - PROGRAMS
-    emulation = Emulation(scenario, world, RunFolder.create(out, scenario))
     cpu_s = time.process_time()
-    wall_s, _ = simulate(emulation)
+    session.run()
     return {
-        "factor": DURATION_S / wall_s,
+        "factor": DURATION_S / session.wall_s,
         "by_cpu": DURATION_S / (time.process_time() - cpu_s),
         "start_s": start_s,
         "background": background,
-        "trace": emulation.engine.trace.sha256(),
+        "trace": session.emulation.engine.trace.sha256(),
     }
 
 

@@ -7,7 +7,6 @@ run here all the same, and then the verdict says that a replay is not warranted.
 
 from __future__ import annotations
 
-import asyncio
 import contextvars
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -24,26 +23,12 @@ from emulator.cells.programs import (
     with_folder_of,
 )
 from emulator.cells.worker import Place, Worker, call_fitly, is_fit
-from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.join import split_into_processes
-from emulator.drivers.live import run_live
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.process_count import Processes, process_count
-from emulator.drivers.program_check import program_check
-from emulator.drivers.simulate import simulate as run_simulation
-from emulator.records.code_digest import entries_of
-from emulator.records.run_folder import RunFolder
+from emulator.drivers.process_count import Processes
+from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.report.notebook import Run
 from emulator.scenario.scenario import Scenario
 from emulator.scenario.source import Source, hinting, scenario_of
-from emulator.world.world import build_world
-from vnet.errors import ScenarioError
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import Program, given_programs, load_program
-from vnet.transport.access import Access
-from vnet.transport.session import quiet_zenoh
+from vnet.runtime.programs import Program, given_programs
 
 
 @hinting
@@ -110,8 +95,6 @@ def run(
     require_importable(program, "run")
     changes = _changes(program, seed, duration_s, set) | {"run.pacing": pacing}
     loaded = with_folder_of(checked_function(program), scenario_of(scenario, changes, checks))
-    if any(fault.kind == "router_restart" for fault in loaded.fault):
-        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
     worker = Worker(Place.here(loaded))  # of its own: Zenoh's threads stay in it
     try:
         return Run.open(worker.call(run_into, loaded, None if out is None else Path(out)))
@@ -127,36 +110,25 @@ def simulate_into(
     processes: Processes = 1,
 ) -> Path:
     """Simulate from this process and judge the run; returns its folder. `replay` says why none is warranted."""
-    search_programs_in(scenario.program.folders)
-    scenario = with_order_steps(scenario)
-    world = build_world(scenario)
-    count = process_count(processes, len(world.node_ids))
-    emulation = Emulation(scenario, world, RunFolder.prepare(out, scenario))
-    for entry in entries_of(scenario):
-        load_program(entry)
-    emulation.folder.open(scenario)
-    wall_s, interrupted = run_simulation(emulation, stop=stop, processes=count)
-    conclude(emulation, wall_s, "simulate", replay)
-    if interrupted:
-        raise KeyboardInterrupt
-    return emulation.folder.path.absolute()
+    session = Session(scenario, out, Local(processes)).open()
+    session.run(stop=stop)
+    session.close(replay)
+    return _folder_of(session)
 
 
 def run_into(scenario: Scenario, out: Path | None) -> Path:
     """Run with real processes and judge the run; returns its folder."""
-    quiet_zenoh()
-    scenario = with_order_steps(scenario)
-    with program_check(scenario) as check:
-        emulation = Emulation(scenario, build_world(scenario), RunFolder.prepare(out, scenario))
-        check.wait()
-    groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
-    options = LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
-    emulation.folder.open(scenario)
-    wall_s, interrupted = asyncio.run(run_live(emulation, options))
-    conclude(emulation, wall_s, "run")
-    if interrupted:
+    session = Session(scenario, out, over_zenoh).open()
+    session.run()
+    session.close()
+    return _folder_of(session)
+
+
+def _folder_of(session: Session) -> Path:
+    """Return the folder of a run that is over. Raises KeyboardInterrupt if it was interrupted."""
+    if session.interrupted:
         raise KeyboardInterrupt
-    return emulation.folder.path.absolute()
+    return session.folder.path.absolute()
 
 
 def _interruptible(work: Callable[[threading.Event], Path]) -> Path:

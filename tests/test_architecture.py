@@ -199,6 +199,18 @@ def test_no_package_holds_more_than_an_eighth_and_no_file_is_too_long() -> None:
     assert names.keys() - FLAT_LISTS == set(), names
 
 
+def test_a_session_alone_builds_an_emulation() -> None:
+    """Each recipe of its own for making a run is one that can differ from the others."""
+    files = [*source_files().values(), *(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "docs").rglob("*.py")]
+    called = {
+        path.relative_to(ROOT).as_posix()
+        for path in files
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Emulation"
+    }
+    assert called == {"emulator/drivers/session.py"}
+
+
 def test_no_package_is_called_run() -> None:
     packages = {path.parent.name for path in source_files().values() if path.name == "__init__.py"}
     assert "run" not in packages

@@ -8,7 +8,6 @@ and are written there, aside and then renamed: a cell that runs twice, or is kil
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import tempfile
@@ -25,22 +24,11 @@ import pyarrow.parquet as pq
 from emulator.cells.executors import each_done, progress_bar
 from emulator.cells.measure import judged_figures, measure
 from emulator.cells.worker import modules_of
-from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.join import split_into_processes
-from emulator.drivers.live import run_live
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.program_check import program_check
-from emulator.drivers.simulate import simulate
+from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.records.atomic import atomically, disk_errors, write_atomically
 from emulator.records.code_digest import digests_of
-from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario, dump_scenario
-from emulator.world.world import build_world
 from vnet.errors import VnetError
-from vnet.transport.access import Access
-from vnet.transport.session import quiet_zenoh
 
 FORMAT = 2
 BROKEN = ("died", "crashed", "exception", "spun", "stalled", "rule_failed")
@@ -118,26 +106,16 @@ def compute(cell: Cell, live: bool = False) -> CellResult:
 
 
 def _compute(cell: Cell, path: Path, live: bool) -> CellResult:
-    scenario = with_order_steps(cell.scenario)
-    if live:
-        with program_check(scenario) as check:
-            check.wait()
-    folder = RunFolder.create(path, scenario)
-    emulation = Emulation(scenario, build_world(scenario), folder)
-    if live:
-        quiet_zenoh()
-        groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
-        options = LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
-        wall_s, interrupted = asyncio.run(run_live(emulation, options, lambda state: None))
-    else:
-        wall_s, interrupted = simulate(emulation)
-    if interrupted:
+    session = Session(cell.scenario, path, over_zenoh if live else Local()).open()
+    session.run()
+    if session.interrupted:
         raise KeyboardInterrupt
+    emulation = session.emulation
     if cell.is_judged:
-        _, verdict = conclude(emulation, wall_s, "run" if live else "simulate")
+        _, verdict = session.close()
         figures, metrics = judged_figures(verdict), emulation.metrics.metrics_table()
     else:
-        if broken := [event for event in folder.events if event.kind in BROKEN]:
+        if broken := [event for event in session.folder.events if event.kind in BROKEN]:
             event = broken[0]
             raise VnetError(f"{event.node} {event.kind}: {event.details.get('error', '')}")
         figures, metrics = measure(emulation, cell.from_s)

@@ -5,11 +5,10 @@ Importing this module takes longer than reading a scenario: commands import it o
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,18 +20,13 @@ from emulator.cli.new_run import prepare_folder
 from emulator.cli.options import DEFAULT_ADDRESS, DEFAULT_LISTEN, OutputOptions
 from emulator.cli.report import report_at_end
 from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude
 from emulator.drivers.determinism import calls_recorded, run_again
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.live import run_live
 from emulator.drivers.observers import Messages
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.process_count import process_count
-from emulator.drivers.program_check import program_check
 from emulator.drivers.router import SeparateRouter
+from emulator.drivers.session import Local, Programs, Session
 from emulator.drivers.signals import first_interrupt_told, signals_ignored
-from emulator.drivers.simulate import simulate as run_simulation
-from emulator.records.code_digest import entries_of
+from emulator.records.run_folder import RunFolder
 from emulator.scenario.scenario import Scenario
 from emulator.terminal.console import LogFormat, say_first, tell
 from emulator.terminal.progress import Progress, show_progress
@@ -40,11 +34,8 @@ from emulator.terminal.safe_console import SafeConsole
 from emulator.terminal.standard_output import StandardOutput
 from emulator.terminal.summary import print_summary
 from emulator.viewer.sinks import Sinks
-from emulator.world.world import World, build_world
+from emulator.world.world import World
 from vnet.errors import VnetError, did_you_mean, printable
-from vnet.runtime.program_path import search_programs_in
-from vnet.runtime.programs import load_program
-from vnet.transport.session import quiet_zenoh
 
 
 @dataclass(frozen=True)
@@ -58,40 +49,35 @@ class Request:
     asked: OutputOptions
     output: StandardOutput
 
-    def with_order_steps(self) -> Request:
-        """Return the request with what its order of events needs to know of the run."""
-        return replace(self, scenario=with_order_steps(self.scenario))
-
-    def prepare(self, world: World) -> Emulation:
+    def session(self, programs: Programs, loads_programs: bool = True) -> Session:
         """Return the run, with a folder that is not made yet. Raises VnetError for what cannot be done."""
+        return Session(self.scenario, self._folder, programs, loads_programs)
+
+    def _folder(self, scenario: Scenario, world: World) -> RunFolder:
         if self.sinks is not None and self.sinks.vehicle is not None and self.sinks.vehicle not in world.node_ids:
             raise VnetError(f"--rerun-vehicle {self.sinks.vehicle}: no such vehicle")
         if (debug := self.asked.debug) is not None and debug.node not in world.node_ids:
             meant = did_you_mean(debug.node, world.node_ids)
             raise VnetError(f"--debug {printable(debug.node)}: no such vehicle{meant}")
-        folder = prepare_folder(self.out, self.file, self.scenario, self.asked.log_format, world.notes)
-        return Emulation(self.scenario, world, folder)
+        return prepare_folder(self.out, self.file, scenario, self.asked.log_format, world.notes)
 
 
 def run_with_processes(request: Request, separate_router: bool, hosts: Sequence[str]) -> None:
     """Run the emulator, these hosts, if any, and a process a vehicle; exits with the verdict's status."""
-    request = request.with_order_steps()
-    scenario = request.scenario
-    with program_check(scenario) as check:
-        world = build_world(scenario)
-        access = create_access(scenario, world, hosts=hosts)
-        emulation = request.prepare(world)
-        check.wait()
     with ExitStack() as stack:
-        separate = None
-        if separate_router:
-            private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
-            separate = SeparateRouter(access, Path(private))
-        options = LiveOptions(
-            access, router=separate, record=request.sinks, start_hosts=True, debug=request.asked.debug
-        )
-        emulation.folder.open(scenario)
-        _run_live(emulation, options, request.asked, request.output)
+
+        def programs(emulation: Emulation) -> LiveOptions:
+            access = create_access(emulation.scenario, emulation.world, hosts=hosts)
+            separate = None
+            if separate_router:
+                private = stack.enter_context(TemporaryDirectory(prefix="vnet-"))
+                separate = SeparateRouter(access, Path(private))
+            return LiveOptions(
+                access, router=separate, record=request.sinks, start_hosts=True, debug=request.asked.debug
+            )
+
+        session = request.session(programs).open()
+        _run_live(session, request.asked, request.output)
 
 
 def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], None], apart: str | None) -> None:
@@ -99,14 +85,8 @@ def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], 
 
     `on_folder` is told the run's folder once it is made; `apart` is a vehicle that needs a process of its own.
     """
-    request = request.with_order_steps()
-    world = build_world(request.scenario)
-    count = process_count(processes, len(world.node_ids))
-    emulation = request.prepare(world)
-    search_programs_in(request.scenario.program.folders)
-    for entry in entries_of(request.scenario):
-        load_program(entry)
-    emulation.folder.open(request.scenario)
+    session = request.session(Local(processes, request.asked.debug, apart)).open()
+    emulation = session.emulation
     on_folder(emulation.folder.path)
     request.output.keep_in(emulation.folder.logs)
     with _progress(emulation, request.asked) as progress:
@@ -114,12 +94,9 @@ def run_simulated(request: Request, processes: str, on_folder: Callable[[Path], 
             if request.sinks is not None:
                 _record_here(emulation, request.sinks, stack)
             say = partial(_say, request.asked, "interrupted, as soon as the programs yield; Ctrl-C again: at once")
-            debug = request.asked.debug
             stack.enter_context(calls_recorded(emulation.folder.path, request.asked.check_determinism is not None))
-            wall_s, interrupted = run_simulation(
-                emulation, on_interrupt=say, debug=debug, processes=count, apart=apart
-            )
-        _finish(emulation, progress, wall_s, interrupted, "simulate", request.asked, request.output)
+            session.run(on_interrupt=say)
+        _finish(session, progress, request.asked, request.output)
 
 
 def _progress(emulation: Emulation, asked: OutputOptions) -> Progress:
@@ -146,77 +123,70 @@ def run_for_agents(
     scenario = request.scenario
     if scenario.run.order == "pct" and scenario.run.order_steps is None:
         raise VnetError("run.order_steps: how many decisions a vehicle makes; needed where agents start by hand")
-    world = build_world(scenario)
-    emulation = request.prepare(world)
-    folder = emulation.folder
-    place = access or folder.path / "access"
-    users = load_or_create_access(scenario, world, place, listen or DEFAULT_LISTEN, connect is not None, hosts)
-    endpoint = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
+
+    def programs(emulation: Emulation) -> LiveOptions:
+        place = access or emulation.folder.path / "access"
+        address = listen or DEFAULT_LISTEN
+        users = load_or_create_access(scenario, emulation.world, place, address, connect is not None, hosts)
+        endpoint = listen or (DEFAULT_LISTEN if users.tls is None else f"tls/{DEFAULT_ADDRESS}")
+        return LiveOptions(users, endpoint, connect, launch=bool(users.hosts), record=request.sinks)
+
+    session = request.session(programs, loads_programs=False)
+    assert session.live is not None
+    options = session.live
 
     def create() -> str:
         """Make the run's folder, and the users' files if they are new."""
-        folder.open(scenario)
-        place = access or folder.path / "access"
+        session.folder.open(scenario)
+        place = access or session.folder.path / "access"
         if not (place / "access.json").exists():
-            users.save(place, endpoint, place.resolve())
-        who, file = ("hosts", "host-NAME.json") if users.hosts else ("agents", "NODE.json")
+            options.access.save(place, options.listen, place.resolve())
+        who, file = ("hosts", "host-NAME.json") if options.access.hosts else ("agents", "NODE.json")
         return f"credentials of the {who}: {place}/credentials/{file}"
 
-    options = LiveOptions(users, endpoint, connect, launch=bool(users.hosts), record=request.sinks)
-    _run_live(emulation, options, request.asked, request.output, create)
+    _run_live(session, request.asked, request.output, create)
 
 
 def _run_live(
-    emulation: Emulation,
-    options: LiveOptions,
-    asked: OutputOptions,
-    output: StandardOutput,
-    create: Callable[[], str] = lambda: "",
+    session: Session, asked: OutputOptions, output: StandardOutput, create: Callable[[], str] = lambda: ""
 ) -> None:
     """A live run to its summary; exits with the verdict's status.
 
     `create` makes the run's folder, if it is not there yet, once the emulator's endpoint is open; it returns a line
     for the user, or "".
     """
-    quiet_zenoh()
-    with _progress(emulation, asked) as progress:
+    assert session.live is not None
+    record, folder = session.live.record, session.folder
+    with _progress(session.emulation, asked) as progress:
 
         def on_open() -> None:
             if line := create():
                 progress.state(line)
-            output.keep_in(emulation.folder.logs)
+            output.keep_in(folder.logs)
 
-        if options.record is not None and options.record.serve is not None:
-            progress.state(options.record.serve.announcement())
+        if record is not None and record.serve is not None:
+            progress.state(record.serve.announcement())
         with signals_ignored():  # a second Ctrl-C must not lose the records
-            running = run_live(emulation, options, progress.state, on_missing=progress.awaits, on_open=on_open)
-            with calls_recorded(emulation.folder.path, asked.check_determinism is not None):
-                wall_s, interrupted = asyncio.run(running)
-            _finish(emulation, progress, wall_s, interrupted, "run", asked, output)
+            with calls_recorded(folder.path, asked.check_determinism is not None):
+                session.run(on_state=progress.state, on_missing=progress.awaits, on_open=on_open)
+            _finish(session, progress, asked, output)
 
 
-def _finish(
-    emulation: Emulation,
-    progress: Progress,
-    wall_s: float,
-    interrupted: bool,
-    command: str,
-    asked: OutputOptions,
-    output: StandardOutput,
-) -> None:
+def _finish(session: Session, progress: Progress, asked: OutputOptions, output: StandardOutput) -> None:
     """Judge a run and print its summary; exits with the verdict's status. A second Ctrl-C ends that, too."""
     say = partial(_say, asked, "the run is being judged and written; Ctrl-C again ends without")
     with first_interrupt_told(say):
         progress.judging()
-        judgement, verdict = conclude(emulation, wall_s, command)
+        judgement, verdict = session.close()
         progress.close()
-        for line in emulation.folder.unkept:
+        for line in session.folder.unkept:
             tell(line, asked.log_format)
-        if asked.check_determinism is not None and not interrupted:
+        if asked.check_determinism is not None and not session.interrupted:
             again = ["--quiet"] if asked.only_the_result else []
-            verdict = run_again(emulation, judgement, verdict, command, asked.check_determinism, again)
-        status = 130 if interrupted else judgement.exit_status
-        folder = emulation.folder.path
+            how = asked.check_determinism
+            verdict = run_again(session.emulation, judgement, verdict, session.command, how, again)
+        status = 130 if session.interrupted else judgement.exit_status
+        folder = session.folder.path
         progress.ended(verdict, str(folder), status)
         if asked.log_format is LogFormat.JSON:
             output.print(json.dumps(verdict))

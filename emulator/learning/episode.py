@@ -18,13 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from emulator.drivers.conclude import conclude
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.simulate import simulate
+from emulator.drivers.session import Session
 from emulator.records.run_folder import Event, RunFolder
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 from vnet.node import Fix, Node
 from vnet.radio import Packet
 from vnet.runtime.programs import given_programs
@@ -87,15 +84,13 @@ class Episode:
     def __init__(self, scenario: Scenario, behaviour: Behaviour, out: Path | None) -> None:
         self._behaviour = behaviour
         self._scratch = TemporaryDirectory(prefix="vnet-episode-") if out is None else None
-        scenario = with_order_steps(scenario)
-        if self._scratch is None:
-            folder = RunFolder.prepare(out, scenario)
-        else:
-            folder = RunFolder.scratch(Path(self._scratch.name))
-        self.emulation = Emulation(scenario, build_world(scenario), folder)
-        if out is not None:
-            folder.open(scenario)
+        self._session = Session(
+            scenario, out if self._scratch is None else RunFolder.scratch(Path(self._scratch.name))
+        )
+        self.emulation = self._session.emulation
         self._keeps = out is not None
+        if self._keeps:
+            self._session.folder.open(self.emulation.scenario)
         self._asking: dict[str, tuple[Any, asyncio.Future[Any]]] = {}
         self._turns: SimpleQueue[Turn] = SimpleQueue()
         self._answers: SimpleQueue[Mapping[str, Any] | None] = SimpleQueue()
@@ -136,9 +131,9 @@ class Episode:
     def _run(self) -> None:
         try:
             with given_programs({ENTRY: self._vehicle}):
-                wall_s, _ = simulate(self.emulation, stop=self._stop)
+                self._session.run(stop=self._stop)
             if self._keeps:
-                conclude(self.emulation, wall_s, "simulate", NO_REPLAY)
+                self._session.close(NO_REPLAY)
         except BaseException as error:
             self._turns.put(Turn(0, {}, over=True, error=error))
         else:

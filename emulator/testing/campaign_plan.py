@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from emulator.checks.own import load_checks
-from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.session import with_order_steps
 from emulator.radio.own_rules import load_rules
 from emulator.scenario.fault_families import OwnRule
 from emulator.scenario.faults import KINDS

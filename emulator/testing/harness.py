@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import math
 import shlex
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -25,26 +24,18 @@ from emulator.cells.programs import rule_entry
 from emulator.checks.judge import CheckResult, Judgement, Verdict
 from emulator.checks.own import PREFIX, Result, finding_of, load_checks
 from emulator.checks.properties import ANY, PERIOD, Effect, Predicate, always, eventually, leads_to, never
-from emulator.drivers.attachment import LiveOptions
-from emulator.drivers.conclude import conclude, judge_further
-from emulator.drivers.emulation import Emulation
-from emulator.drivers.join import split_into_processes
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.program_check import program_check
+from emulator.drivers.conclude import judge_further
+from emulator.drivers.session import Local, Session, over_zenoh
 from emulator.faults.plan import PlannedFault
 from emulator.radio.own_rules import Rule, load_rules
 from emulator.records.period_figures import PeriodFigures
 from emulator.records.run import Run
-from emulator.records.run_folder import SCENARIO_FILE, Event, RunFolder
+from emulator.records.run_folder import SCENARIO_FILE, Event
 from emulator.scenario.fault_families import LONGEST_S, Fault, OwnRule
 from emulator.scenario.faults import parse_fault
 from emulator.scenario.modules import with_rules
 from emulator.scenario.scenario import Scenario
-from emulator.testing.stepping import SimulatedRun, SteppedLiveRun, SteppedRun
-from emulator.world.world import build_world
 from vnet.errors import ScenarioError, VnetError
-from vnet.transport.access import Access
-from vnet.transport.session import quiet_zenoh
 from vnet.units import NS_PER_S
 
 
@@ -61,30 +52,19 @@ class RunHarness:
             raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
         load_checks(scenario.program)
         load_rules(scenario.fault, scenario.program)
-        with ThreadPoolExecutor(1) as pool:  # a test's thread may run an event loop
-            scenario = pool.submit(with_order_steps, scenario).result()
-        if live:
-            with program_check(scenario) as check:
-                check.wait()
         self.folder = folder
         self.live = live
-        self._emulation = Emulation(scenario, build_world(scenario), RunFolder.create(folder, scenario))
-        self._run: SteppedRun = self._live_run() if live else SimulatedRun(self._emulation)
+        with ThreadPoolExecutor(1) as pool:  # a test's thread may run an event loop
+            self._run = pool.submit(Session, scenario, folder, over_zenoh if live else Local()).result()
+        self._run.folder.open(self._run.emulation.scenario)
+        self._emulation = self._run.emulation
         self._now_ns = 0
-        self._wall_s = 0.0
         self._open: list[str] = []
         self._folders: list[Path] = []
         self._judgement: Judgement | None = None
         self._promises: dict[str, Callable[[Run], Result]] = {}
         self._named: set[str] = set()
         """Names of the checks that the test has asked for: their failures have been told."""
-
-    def _live_run(self) -> SteppedRun:
-        quiet_zenoh()
-        scenario = self._emulation.scenario
-        groups = split_into_processes(self._emulation.world.node_ids, scenario.run.nodes_per_process)
-        access = Access.create(scenario.run.name, groups, units=scenario.unit_ids)
-        return SteppedLiveRun(self._emulation, LiveOptions(access))
 
     # What there is to see.
 
@@ -166,9 +146,7 @@ class RunHarness:
         if time_ns == self._now_ns:
             return
         self._now_ns = time_ns
-        started = time.monotonic()
         await self._wait(self._run.go(time_ns))
-        self._wall_s += time.monotonic() - started
         if self._run.over:
             self._now_ns = self._emulation.emulated_ns
             last = self.events[-1]
@@ -314,7 +292,7 @@ class RunHarness:
         """End the run where it stands, or once all planned faults have healed, and judge it. Again: the same."""
         if self._judgement is None:
             self._finish()
-            self._judgement, verdict = conclude(self._emulation, self._wall_s, self._run.command)
+            self._judgement, verdict = self._run.close()
             if self._promises:
                 findings = [finding_of(result) for result in self._kept()]
                 judge_further(self._emulation, self._judgement, verdict, findings)
@@ -336,9 +314,7 @@ class RunHarness:
             self._heal(planned)
         last_ns = max(self._now_ns, self._emulation.faults.last_end_ns, self._emulation.world.period_ns)
         self._emulation.end_at(min(last_ns, self._emulation.duration_ns))
-        started = time.monotonic()
         self._run.go(None).result()
-        self._wall_s += time.monotonic() - started
         self._now_ns = self._emulation.duration_ns
 
     def check(self, *names: str, within_s: float | None = None, allow_unknown: bool = False) -> Judgement:

@@ -24,15 +24,12 @@ from emulator.cells.executors import WorkerPool, worker_died
 from emulator.cells.worker import Place, WorkerTimeoutError, call_fitly
 from emulator.checks.judge import Verdict
 from emulator.checks.replay import compare_tables, first_call
-from emulator.drivers.conclude import conclude, judge_unkept
 from emulator.drivers.determinism import calls_recorded, scattered
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.order_length import with_order_steps
-from emulator.drivers.simulate import simulate
+from emulator.drivers.session import Local, Session
 from emulator.records.run_folder import PROGRAMS_LOG, RunFolder
 from emulator.records.tape import TapeEntry
 from emulator.scenario.scenario import Scenario
-from emulator.world.world import build_world
 from vnet.errors import VnetError
 
 GREATEST = 1e6
@@ -78,14 +75,11 @@ def run_trial(scenario: Scenario, folder: RunFolder, twice: bool = False) -> Tri
     In a folder that is open its files are written, as of any other run. `twice` has it made again in another way.
     """
     started = time.monotonic()
-    scenario = with_order_steps(scenario)
-    emulation = Emulation(scenario, build_world(scenario), folder)
+    session = Session(scenario, folder)
+    emulation = session.emulation
     with calls_recorded(folder.path, twice):
-        wall_s, _ = simulate(emulation)
-    if folder.is_open:
-        judgement, _ = conclude(emulation, wall_s, "simulate")
-    else:
-        judgement = judge_unkept(emulation, wall_s)
+        session.run()
+    judgement = session.close()[0] if folder.is_open else session.judge()
     verdicts = {check.name: check.verdict for check in judgement.checks}
     texts = {check.name: check.text for check in judgement.checks if check.verdict is not Verdict.VALID}
     greatest = _greatest(emulation)
@@ -107,10 +101,10 @@ def _difference_of_another(emulation: Emulation) -> str:
     scenario = scenario.model_copy(update={"run": scenario.run.model_copy(update={"windows": False})})
     with tempfile.TemporaryDirectory(prefix="vnet-again-") as name:
         folder = RunFolder.scratch(Path(name) / "run")
-        again = Emulation(scenario, build_world(scenario), folder)
+        again = Session(scenario, folder, Local(processes=2))
         with calls_recorded(folder.path, True), scattered():
-            simulate(again, processes=2)
-        found = compare_tables(_tables(emulation), _tables(again))
+            again.run()
+        found = compare_tables(_tables(emulation), _tables(again.emulation))
         if found.verdict is Verdict.VALID:
             return ""
         call, _ = first_call(emulation.folder.path, folder.path)

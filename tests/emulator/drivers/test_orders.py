@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from emulator.drivers.emulation import Emulation
-from emulator.drivers.order_length import with_order_steps
+from emulator.drivers.session import with_order_steps
 from emulator.records.tape import MediumOrder, TapeEntry, dump_tape, first_left, read_tape
 from emulator.scenario.scenario import Scenario
 from tests.emulator.drivers.test_windows import fingerprint, same, scenarios

@@ -1,0 +1,244 @@
+"""A run from its scenario to its verdict: `Session` is the one way to make and to drive a run.
+
+Commands, the Python API, tests, cells, campaigns, learning and benchmarks are its clients. They differ in where the
+programs are (`Local`, or `LiveOptions` for processes over Zenoh), in the files that are kept, and in who watches.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from contextlib import nullcontext, redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from queue import SimpleQueue
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from emulator.checks.judge import Judgement
+from emulator.drivers.attachment import LiveOptions
+from emulator.drivers.conclude import conclude, judge_unkept
+from emulator.drivers.emulation import Emulation
+from emulator.drivers.join import split_into_processes
+from emulator.drivers.lockstep import Lockstep
+from emulator.drivers.process_count import Processes, process_count
+from emulator.drivers.program_check import program_check
+from emulator.drivers.simulate import simulate
+from emulator.records.code_digest import entries_of
+from emulator.records.run_folder import RunFolder
+from emulator.scenario.scenario import Scenario
+from emulator.world.world import World, build_world
+from vnet.errors import ScenarioError
+from vnet.runtime.debug_target import DebugTarget
+from vnet.runtime.program_path import search_programs_in
+from vnet.runtime.programs import load_program
+from vnet.transport.access import Access
+from vnet.transport.session import quiet_zenoh
+
+
+@dataclass(frozen=True)
+class Local:
+    """Programs in this process, or in so many `processes` that are forked from it, without Zenoh.
+
+    `debug` has a debugger stop in a program. `apart` is a vehicle that gets a process of its own, because it has
+    ended the process of an earlier attempt.
+    """
+
+    processes: Processes | str = 1
+    debug: DebugTarget | None = None
+    apart: str | None = None
+
+
+def over_zenoh(emulation: Emulation) -> LiveOptions:
+    """Return the options of a run with a process for each vehicle, or each group of them, on this machine.
+
+    Raises ScenarioError for a fault that this cannot show.
+    """
+    scenario = emulation.scenario
+    if any(fault.kind == "router_restart" for fault in scenario.fault):
+        raise ScenarioError("fault router_restart: needs a router of its own: vnet run --router separate")
+    groups = split_into_processes(emulation.world.node_ids, scenario.run.nodes_per_process)
+    return LiveOptions(Access.create(scenario.run.name, groups, units=scenario.unit_ids))
+
+
+Programs = Local | Callable[[Emulation], LiveOptions]
+"""The place of the programs of a run. Options of a live run are made when all else is ready."""
+Folder = RunFolder | Callable[[Scenario, World], RunFolder] | Path | None
+"""The folder of a run: one that is there, what prepares it, its path, or None for the next of `runs/`."""
+
+
+class Session:
+    """One run: made ready, then driven by `run`, or by `start` and `go` step by step, and judged.
+
+    emulation: the run's parts.
+    command: the vnet command that makes the same run, "simulate" or "run".
+    wall_s: wall-clock seconds that driving has taken.
+    interrupted: True if Ctrl-C or `stop` has ended the run before its time.
+
+    Nothing is written before `open`, unless `folder` is one that is there. Raises VnetError for what cannot be run:
+    a world, a program, or the order of events, which may need a run of its own.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        folder: Folder = None,
+        programs: Programs = Local(),
+        loads_programs: bool = True,
+    ) -> None:
+        """`loads_programs` has live ones loaded in a process aside first, to tell of what is wrong with them."""
+        scenario = with_order_steps(scenario)
+        is_local = isinstance(programs, Local)
+        with nullcontext() if is_local or not loads_programs else program_check(scenario) as check:
+            world = build_world(scenario)
+            self._local = programs if isinstance(programs, Local) else Local()
+            self._processes = process_count(self._local.processes, len(world.node_ids))
+            self.emulation = Emulation(scenario, world, _folder(folder, scenario, world))
+            self.live: LiveOptions | None = None
+            if not isinstance(programs, Local):
+                quiet_zenoh()
+                self.live = programs(self.emulation)
+            if check is not None:
+                check.wait()
+        self.command = "simulate" if is_local else "run"
+        self.wall_s = 0.0
+        self.interrupted = False
+        self.over = False
+        """True once a run that was stepped has come to its end."""
+        self.stands: Future[None] = Future()
+        """Done when a run that is stepped is held or over."""
+        self._thread = threading.Thread(target=self._run_held, name=f"vnet {self.command}", daemon=True)
+        self._horizons: SimpleQueue[int | None] = SimpleQueue()
+        self._give: Callable[[int | None], Any] = self._horizons.put
+        self._went_at: float | None = None
+
+    @property
+    def folder(self) -> RunFolder:
+        """The run's folder."""
+        return self.emulation.folder
+
+    def open(self) -> Session:
+        """Make the run's folder, once the programs that run in this process have proved to load."""
+        scenario = self.emulation.scenario
+        if self.live is None:
+            search_programs_in(scenario.program.folders)
+            for entry in entries_of(scenario):
+                load_program(entry)
+        self.folder.open(scenario)
+        return self
+
+    def run(
+        self,
+        stop: threading.Event | None = None,
+        on_interrupt: Callable[[], None] = lambda: None,
+        on_state: Callable[[str], None] = lambda text: None,
+        on_missing: Callable[[Sequence[str]], None] = lambda nodes: None,
+        on_open: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Drive the run to its end, or to Ctrl-C.
+
+        Setting `stop` ends a local run as Ctrl-C does, and `on_interrupt` is called when that comes. The others are
+        of live runs: `on_state` is told how it goes, `on_missing` which nodes have not joined, and `on_open` that
+        the emulator's endpoint is open; it may make the run's folder.
+        """
+        if self.live is None:
+            where = self._local
+            self.wall_s, self.interrupted = simulate(
+                self.emulation, None, stop, on_interrupt, where.debug, self._processes, where.apart
+            )
+        else:
+            from emulator.drivers.live import run_live  # slow to import, and simulations do without
+
+            running = run_live(self.emulation, self.live, on_state, on_missing=on_missing, on_open=on_open)
+            self.wall_s, self.interrupted = asyncio.run(running)
+
+    def judge(self) -> Judgement:
+        """Judge a run of which nothing is kept."""
+        return judge_unkept(self.emulation, self.wall_s)
+
+    def close(self, replay: str = "") -> tuple[Judgement, dict[str, Any]]:
+        """Write what is kept of the run and judge it; returns the judgement, and what verdict.json has.
+
+        `replay` says why no replay is warranted, if none is.
+        """
+        return conclude(self.emulation, self.wall_s, self.command, replay)
+
+    # Step by step, in lockstep, on a thread of its own. While the run is held, faults may be planned.
+
+    @property
+    def started(self) -> bool:
+        """Return whether `start` was called."""
+        return self._thread.ident is not None
+
+    def start(self) -> Future[None]:
+        """Get ready for time 0. The future, here and in `go`, is done when the run is held or over."""
+        self._thread.start()
+        return self.stands
+
+    def go(self, horizon_ns: int | None) -> Future[None]:
+        """Do all that happens before `horizon_ns`, or all to the end."""
+        assert self.stands.done() and not self.over
+        self.stands = Future()
+        self._went_at = time.monotonic()
+        self._give(horizon_ns)
+        return self.stands
+
+    def _run_held(self) -> None:
+        try:
+            if self.live is None:
+                simulate(self.emulation, self._hold)
+            else:
+                from emulator.drivers.live import run_live
+
+                asyncio.run(run_live(self.emulation, self.live, before_horizon=self._hold_live))
+        except BaseException as error:
+            self.over = True
+            self.stands.set_exception(error)
+        else:
+            self.over = True
+            self._stand()
+
+    def _hold(self, lockstep: Lockstep) -> None:
+        self._stand()
+        lockstep.horizon_ns = self._horizons.get()
+
+    async def _hold_live(self, lockstep: Lockstep) -> None:
+        loop = asyncio.get_running_loop()
+        horizon: asyncio.Future[int | None] = loop.create_future()
+        self._give = lambda horizon_ns: loop.call_soon_threadsafe(horizon.set_result, horizon_ns)
+        self._stand()
+        lockstep.horizon_ns = await horizon
+
+    def _stand(self) -> None:
+        if self._went_at is not None:
+            self.wall_s += time.monotonic() - self._went_at
+        self.stands.set_result(None)
+
+
+def _folder(folder: Folder, scenario: Scenario, world: World) -> RunFolder:
+    if folder is None or isinstance(folder, Path):
+        return RunFolder.prepare(folder, scenario)
+    return folder if isinstance(folder, RunFolder) else folder(scenario, world)
+
+
+def with_order_steps(scenario: Scenario) -> Scenario:
+    """Return a scenario that has `run.order_steps` if `run.order` is "pct": decisions of a vehicle in a FIFO run.
+
+    Raises KeyboardInterrupt, and VnetError if it cannot be simulated.
+    """
+    run = scenario.run
+    if run.order != "pct" or run.order_steps is not None:
+        return scenario
+    fifo = scenario.model_copy(update={"run": run.model_copy(update={"order": "fifo"})})
+    with TemporaryDirectory(prefix="vnet-order-") as name, redirect_stdout(StringIO()):
+        session = Session(fifo, Path(name) / "run").open()
+        session.emulation.orders.explores = True
+        session.run()
+    if session.interrupted:
+        raise KeyboardInterrupt
+    steps = max([1, *session.emulation.orders.steps.values()])
+    return scenario.model_copy(update={"run": run.model_copy(update={"order_steps": steps})})
