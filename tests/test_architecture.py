@@ -227,7 +227,7 @@ def test_no_public_name_of_the_emulator_is_a_submodule_too() -> None:
 def test_tests_mirror_the_packages() -> None:
     packages = {path.parent.relative_to(ROOT) for path in source_files().values()}
     folders = {p.parent.relative_to(ROOT / "tests") for p in (ROOT / "tests").glob("*/**/test_*.py")}
-    others = {Path(name) for name in ("benchmarks", "docs", "fuzz", "hunt", "system")}
+    others = {Path(name) for name in ("benchmarks", "docs", "fuzz", "golden", "hunt", "system")}
     assert folders - packages - others == set()
 
 

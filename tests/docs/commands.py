@@ -87,8 +87,8 @@ def run(words: Sequence[str], status: int, folder: Path) -> str | None:
         parse(words)
         return None
     if program == "vnet" and arguments[0] in HERE:
-        with _forgetting(folder):
-            text, ended = _captured(typer.main.get_command(APPS["vnet"]), arguments)
+        with forgetting(folder):
+            text, ended = captured(typer.main.get_command(APPS["vnet"]), arguments)
     else:
         text, ended = _process(process(words))
     if ended == UNKNOWN and "realtime" in arguments:
@@ -128,7 +128,7 @@ def parse(words: Sequence[str]) -> None:
         return
     command = typer.main.get_command(APPS[program])
     _disarm(command)
-    text, status = _captured(command, arguments)
+    text, status = captured(command, arguments)
     if status != 0:
         raise DocsError(f"{shlex.join(words)}: {text.strip()}")
 
@@ -154,7 +154,7 @@ def _nothing(*_: object, **__: object) -> None:
     """Run a disarmed command."""
 
 
-def _captured(command: Any, arguments: list[str]) -> tuple[str, int]:
+def captured(command: Any, arguments: list[str]) -> tuple[str, int]:
     """Return the output of a command, stdout before stderr, and its exit status."""
     out, error = io.StringIO(), io.StringIO()
     status: object = 0
@@ -173,7 +173,7 @@ def _process(words: list[str]) -> tuple[str, int]:
 
 
 @contextlib.contextmanager
-def _forgetting(folder: Path) -> Iterator[None]:
+def forgetting(folder: Path) -> Iterator[None]:
     """Leave nothing of the modules in `folder` in this process."""
     path = list(sys.path)
     importlib.invalidate_caches()

@@ -1,4 +1,4 @@
-"""Agents started by hand, and a separate router: the same run as in one process, as `vnet run` has it."""
+"""Agents started by hand with a separate router: the same run as in one process, as `vnet run` has it."""
 
 import re
 import socket
@@ -47,16 +47,6 @@ def start_emulator(stack: ExitStack, folder: Path, *options: str) -> tuple[subpr
         if found := re.search(r"listening at (\S+); waiting for 4 vehicles", line):
             return emulator, found[1]
     pytest.fail("the emulator ended early")
-
-
-def test_agents_started_by_hand_do_the_same_as_one_process(vnet: Vnet, tmp_path: Path) -> None:
-    with ExitStack() as stack:
-        folder = tmp_path / "by hand"
-        emulator, endpoint = start_emulator(stack, folder, "--listen", "tcp/127.0.0.1:0")
-        start_agents(stack, endpoint, folder / "access")
-        by_hand = finish(emulator, folder)
-    assert by_hand.status == 0, by_hand.stderr + by_hand.stdout
-    assert by_hand.fingerprint == vnet("simulate", SCENARIO, *OPTIONS).fingerprint
 
 
 def test_a_separate_router_changes_nothing(vnet: Vnet, tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 import tomli_w
 
-from emulator.scenario.scenario import dump_scenario
-from tests.emulator.world.maps.test_city_map import driving
 from tests.support.motion import Stay, along, still, write_trips
 from tests.support.paths import ROOT
 from tests.system.conftest import AGENT, TIMEOUT_S, VNET, Finished, Vnet, running_agents
@@ -95,12 +93,3 @@ def test_agents_started_by_hand_wait_until_they_enter(vnet: Vnet, scenario: str,
         assert {node: agent.wait(TIMEOUT_S) for node, agent in agents.items()} == dict.fromkeys(VEHICLES, 0)
     assert by_hand.status == 0, stderr + stdout
     assert by_hand.fingerprint == vnet("simulate", scenario).fingerprint
-
-
-def test_programs_that_know_the_roads_do_the_same_live_and_simulated(vnet: Vnet, tmp_path: Path) -> None:
-    """The map reaches processes bit by bit."""
-    path = tmp_path / "roads.toml"
-    path.write_text(dump_scenario(driving(tmp_path, seconds=3.0)))
-    live, simulated = (vnet(command, str(path)) for command in ("run", "simulate"))
-    assert live.status == simulated.status == 0, live.stderr + live.stdout
-    assert live.fingerprint == simulated.fingerprint

@@ -4,7 +4,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import tomli_w
 
 from tests.support.paths import ROOT
 from tests.system.conftest import TIMEOUT_S, VNET, Finished, Vnet, heard_by, run_until
@@ -25,22 +24,6 @@ def test_who_only_waits_does_the_same_live_and_simulated(vnet: Vnet) -> None:
     sent_again = {row["sent_ns"] for row in simulated.trace() if row["sent_ns"] > 0}
     assert sent_again
     assert sent_again <= arrivals, "packets reach who waits for them at the instant of their arrival"
-
-
-def test_what_behaves_is_valid_and_the_same_live_and_simulated(vnet: Vnet, tmp_path: Path) -> None:
-    """A vehicle for each manner of waiting and working."""
-    entries = [
-        f"tests.system.programs:{name}" for name in ("never_waits", "exits_early", "computes", "uses_executor")
-    ]
-    programs = [{"nodes": [f"v{n:02}"], "entry": entry} for n, entry in enumerate(entries, 1)]
-    scenario = tmp_path / "mixed.toml"
-    data = {"run": {"name": "mixed", "duration_s": 2.0}, "network": {"vehicles": 4}, "radio": {"range_m": 1e6}}
-    scenario.write_text(tomli_w.dumps({**data, "program": {"entry": entries[0], "exceptions": programs}}))
-    live, simulated = vnet("run", str(scenario)), vnet("simulate", str(scenario))
-    assert live.status == 0, live.stderr + live.stdout
-    heard_from = {row["sender"] for row in live.trace() if row["outcome"] == "delivered"}
-    assert heard_from == {"v01", "v02", "v03", "v04"}
-    assert live.fingerprint == simulated.fingerprint
 
 
 @pytest.mark.parametrize("command", ["run", "simulate"])

@@ -40,12 +40,6 @@ def test_a_live_run_beside_a_busy_machine_is_the_simulated_one(vnet: Vnet, simul
     assert busy.fingerprint == simulated.fingerprint
 
 
-def test_several_nodes_in_a_process_make_no_difference(vnet: Vnet, simulated: Finished) -> None:
-    together = vnet("run", SCENARIO, "--set", "run.nodes_per_process=5")
-    assert together.status == 0, together.stderr + together.stdout
-    assert together.fingerprint == simulated.fingerprint
-
-
 def test_a_runs_own_scenario_file_reproduces_it(vnet: Vnet) -> None:
     first = vnet("simulate", SCENARIO, "--seed", "7", "--duration", "2", "--set", "radio.loss=0.3")
     again = vnet("simulate", str(first.folder / "scenario.toml"))

@@ -1,6 +1,5 @@
 """Windows change nothing but the number of exchanges: traces, metrics, states and events are the same without."""
 
-import tomllib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,7 +16,6 @@ from emulator.scenario.scenario import Scenario
 from emulator.testing.strategies import faults as schedules
 from tests.support.motion import along, scenario_of_trips, still, write_trips
 from tests.support.multi_loop_driver import emulation_of, run_apart, run_forked, run_together, scenario_of
-from tests.support.paths import ROOT
 from vnet.transport import wire
 
 pytestmark = pytest.mark.slow
@@ -58,24 +56,6 @@ def with_windows(scenario: Scenario, windows: bool) -> Scenario:
 
 def simulated(scenario: Scenario, windows: bool) -> Emulation:
     return run_together(with_windows(scenario, windows))
-
-
-# The shipped scenarios.
-
-
-@pytest.mark.parametrize("name", ["quickstart", "beacon", "twelve", "faults", "80211p", "city", "dense"])
-def test_shipped_scenarios_are_the_same_with_and_without_windows(name: str) -> None:
-    """A moment of each, with a few of its vehicles and particles."""
-    text = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
-    data = {key: value for key, value in tomllib.loads(text).items() if key != "fault"}
-    data["run"] |= {"duration_s": 0.3, "settle_s": 0}
-    data["network"] = {**data["network"], "vehicles": 6}
-    if data["program"]["entry"] != "agents.beacon:main":
-        data["program"]["options"] = {**data["program"].get("options", {}), "particles": 20}
-    scenario = Scenario.model_validate(data)
-    reference = fingerprint(simulated(scenario, False))
-    assert same(fingerprint(simulated(scenario, True)), reference)
-    assert same(fingerprint(run_forked(scenario)), reference)
 
 
 # Random scenarios and programs.
