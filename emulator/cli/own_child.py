@@ -17,7 +17,7 @@ LONGEST_PATH = 4096
 """Bytes of the path of a run's folder."""
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
 FAULTS = (signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL)
-"""Signals of code that fails: they are a vehicle's death also where none was seen running, as in a thread of its own."""
+"""Signals of code that fails: a vehicle's death also where none was seen running, as in a thread of its own."""
 FROM_TERMINAL = 0x80
 """`si_code` of a signal that the kernel sends, as Ctrl-C does to all of the terminal's foreground (SI_KERNEL)."""
 
@@ -41,14 +41,13 @@ class OwnChild:
         sys.stderr.flush()
         in_foreground = _is_in_foreground()
         handled = (*FORWARDED, signal.SIGCHLD)
-        handler = signal.signal(signal.SIGCHLD, lambda number, frame: None)  # one that is ignored is not told
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # whoever started this may ignore it
         before = signal.pthread_sigmask(signal.SIG_BLOCK, handled)
         child = os.fork()
         if child == 0:
             if not in_foreground:  # what is sent to the parent's group would reach it twice
                 os.setpgid(0, 0)
             signal_at_parent_death(signal.SIGKILL)
-            signal.signal(signal.SIGCHLD, handler)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return None
         forwarded: set[int] = set()
@@ -59,7 +58,6 @@ class OwnChild:
                 if not in_foreground or told.si_code != FROM_TERMINAL:
                     os.kill(child, told.si_signo)
         forwarded |= signal.sigpending() & set(FORWARDED)
-        signal.signal(signal.SIGCHLD, handler)
         vehicle, folder = running_node.running.read(), os.fsdecode(self._folder[:].rstrip(b"\0"))
         ended = os.waitstatus_to_exitcode(waited[1])
         died = (vehicle and ended != -signal.SIGKILL) or (folder and -ended in FAULTS)  # KILL: memory is short
@@ -79,13 +77,10 @@ class OwnChild:
 def _is_in_foreground() -> bool:
     """Return whether this process may read from its terminal: Ctrl-C there is for its group."""
     try:
-        terminal = os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY)
+        with open("/dev/tty") as terminal:
+            return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
     except OSError:
         return False
-    try:
-        return os.tcgetpgrp(terminal) == os.getpgrp()
-    finally:
-        os.close(terminal)
 
 
 def may_fork() -> bool:

@@ -56,9 +56,9 @@ def simulate(
     Setting `stop` is like a first Ctrl-C, for runs on other threads than the main one. `on_interrupt` is called, on
     a thread of its own, at the first Ctrl-C. `debug` has a debugger stop in a program. With `processes` above 1 so
     many processes run the programs, and not this one; the vehicles of one that ends before its time have died.
-    `apart` is the vehicle that has ended the process of an earlier attempt, "" if unknown: each vehicle has a process
-    of its own (beyond `MOST_APART` others, these share so many), and what they print has been printed then. If none
-    dies now, that one has, at the end; raises VnetError if it is unknown.
+    `apart` is the vehicle that has ended the process of an earlier attempt, "" if unknown: each vehicle has a
+    process of its own (beyond `MOST_APART` others, these share so many), and what they print has been printed then.
+    If none dies now, that one has, at the end; raises VnetError if it is unknown.
     """
     node_ids = emulation.world.node_ids
     groups = split_evenly(node_ids, processes)

@@ -27,7 +27,7 @@ _begun: dict[int, subprocess.Popen[bytes]] = {}
 
 
 def watch(config: pytest.Config) -> None:
-    """Have a process print the line on pytest's own standard error if this process ends in the midst of a program."""
+    """Have a process print the line on pytest's own standard error if a program ends this one."""
     if os.getpid() in _begun or sys.platform != "linux":
         return
     capture = config.pluginmanager.getplugin("capturemanager")
