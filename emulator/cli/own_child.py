@@ -77,7 +77,7 @@ class OwnChild:
 def _is_in_foreground() -> bool:
     """Return whether this process may read from its terminal: Ctrl-C there is for its group."""
     try:
-        with open("/dev/tty") as terminal:
+        with Path("/dev/tty").open() as terminal:
             return os.tcgetpgrp(terminal.fileno()) == os.getpgrp()
     except OSError:
         return False
